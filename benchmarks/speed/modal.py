@@ -17,7 +17,12 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal import solve
 from metalens.modal.case import case_of
-from metalens.modal.engine import evaluate, geometry, kept, kept_long
+from metalens.modal.engine import (
+    cached_basis,
+    disc_geometry,
+    evaluate,
+    small_cached_basis,
+)
 from metalens.modal.ladder import RUNGS
 
 WAVELENGTH_UM = 0.85
@@ -66,7 +71,7 @@ def references(angle_deg: float) -> dict[tuple[float, str], complex]:
 
 def forget() -> None:
     """Whatever earlier solves left."""
-    for held in (geometry, kept, kept_long):
+    for held in (disc_geometry, cached_basis, small_cached_basis):
         held.cache_clear()
 
 

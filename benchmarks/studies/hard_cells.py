@@ -23,7 +23,7 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Index, Light
 from metalens.ground.errors import CellError
 from metalens.modal import RUNGS
-from metalens.modal.case import Case, case_of
+from metalens.modal.case import ModalCase, case_of
 from metalens.modal.engine import evaluate
 
 COUNT = 1000
@@ -124,7 +124,7 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
 }
 
 
-def referee(case: Case, bar: float) -> tuple[tuple[complex, complex], float]:
+def referee(case: ModalCase, bar: float) -> tuple[tuple[complex, complex], float]:
     """t and r on the coarsest of the finer meshes whose own estimate, the second value,
     is far below the bar.
     """

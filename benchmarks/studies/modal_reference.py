@@ -21,8 +21,8 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
-from metalens.modal.mesh import MeshPlan, build
-from metalens.modal.spaces import select
+from metalens.modal.mesh import MeshPlan, build_mesh
+from metalens.modal.spaces import select_functions
 
 FILE = Path(__file__).parents[1] / "results" / "reference_pillars.json"
 FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
@@ -130,12 +130,12 @@ def entry(
 
 def unknowns(plan: MeshPlan, angle: float) -> int:
     """Of one form on a mesh, mean of both."""
-    wall, phase = build(plan).vector_wall, 0.1 if angle else None
+    wall, phase = build_mesh(plan).vector_wall, 0.1 if angle else None
     if phase is None:
-        return select(wall, electric=False, half_phase_rad=None).size
+        return select_functions(wall, electric=False, half_phase_rad=None).size
     return (
         sum(
-            select(wall, electric=electric, half_phase_rad=phase).size
+            select_functions(wall, electric=electric, half_phase_rad=phase).size
             for electric in (True, False)
         )
         // 2

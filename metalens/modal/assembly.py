@@ -17,11 +17,11 @@ from functools import lru_cache
 import numpy as np
 
 from metalens.ground.errors import CellError
-from metalens.modal.mesh import Mesh, MeshPlan, Patch, build
+from metalens.modal.mesh import DiscMesh, MeshPatch, MeshPlan, build_mesh
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Part:
+class CellMatrices:
     """Mass, curl-curl and scalar mass matrices of a part of the cell."""
 
     mass: np.ndarray
@@ -30,7 +30,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Geometry:
+class AssembledDisc:
     """One disc in its cell, assembled: reused for every wavelength, height, index,
     angle and polarisation.
 
@@ -40,14 +40,14 @@ class Geometry:
     """
 
     rho: float
-    mesh: Mesh
-    cell: Part
-    disc: Part
+    mesh: DiscMesh
+    cell: CellMatrices
+    disc: CellMatrices
     gradient: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Metric:
+class JacobianMetric:
     """Products of the Jacobian at the points of a patch: contravariant metric times
     area, 1 / area, area.
     """
@@ -59,7 +59,7 @@ class Metric:
     area: np.ndarray
 
 
-def metric(patch: Patch, rho: float) -> Metric:
+def jacobian_metric(patch: MeshPatch, rho: float) -> JacobianMetric:
     """(elements, points) each; N_i·N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j)
     + eta_eta b_i b_j.
     """
@@ -68,11 +68,11 @@ def metric(patch: Patch, rho: float) -> Metric:
     g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
     area = np.abs(xi[..., 0] * eta[..., 1] - xi[..., 1] * eta[..., 0])
     inverse = 1 / area
-    return Metric(g22 * inverse, g11 * inverse, -g12 * inverse, inverse, area)
+    return JacobianMetric(g22 * inverse, g11 * inverse, -g12 * inverse, inverse, area)
 
 
 def element_matrices(
-    patch: Patch, m: Metric
+    patch: MeshPatch, m: JacobianMetric
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass, curl-curl and scalar mass of each element of a patch: (elements, functions,
     functions).
@@ -98,7 +98,7 @@ def element_matrices(
     return mass, curl, gram(b.scalar, m.area, b.scalar)
 
 
-def scatter(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
+def sum_blocks(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
     """Sum element blocks into an (n, n) matrix; numbers is (copies, elements,
     functions), blocks shared by copies.
     """
@@ -108,9 +108,9 @@ def scatter(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def gradient(plan: MeshPlan) -> np.ndarray:
+def gradient_matrix(plan: MeshPlan) -> np.ndarray:
     """Coefficients of the gradients of the scalar functions: topology alone."""
-    mesh = build(plan)
+    mesh = build_mesh(plan)
     out = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
     for patch in mesh.patches:
         rows, columns = np.nonzero(patch.basis.gradient)
@@ -120,7 +120,7 @@ def gradient(plan: MeshPlan) -> np.ndarray:
     return out
 
 
-def integrate(mesh: Mesh, rho: float) -> tuple[Part, Part]:
+def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMatrices]:
     """Matrices of the cell and of the disc."""
     nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
     sums = {
@@ -128,17 +128,19 @@ def integrate(mesh: Mesh, rho: float) -> tuple[Part, Part]:
         for inside in (True, False)
     }
     for patch in mesh.patches:
-        mass, curl, scalar = element_matrices(patch, metric(patch, rho))
+        mass, curl, scalar = element_matrices(patch, jacobian_metric(patch, rho))
         total = sums[patch.inside]
-        total[0] += scatter(patch.vector, mass, nv)
-        total[1] += scatter(patch.vector, curl, nv)
-        total[2] += scatter(patch.scalar, scalar, ns)
-    disc = Part(*sums[True])
+        total[0] += sum_blocks(patch.vector, mass, nv)
+        total[1] += sum_blocks(patch.vector, curl, nv)
+        total[2] += sum_blocks(patch.scalar, scalar, ns)
+    disc = CellMatrices(*sums[True])
     rest = sums[False]
-    return Part(disc.mass + rest[0], disc.curl + rest[1], disc.scalar + rest[2]), disc
+    return CellMatrices(
+        disc.mass + rest[0], disc.curl + rest[1], disc.scalar + rest[2]
+    ), disc
 
 
-def assemble(rho: float, plan: MeshPlan) -> Geometry:
+def assemble_disc(rho: float, plan: MeshPlan) -> AssembledDisc:
     """Integrate the matrices of a disc of radius ``rho`` half pitches.
 
     Raises:
@@ -150,5 +152,7 @@ def assemble(rho: float, plan: MeshPlan) -> Geometry:
             f"diameter = {rho:.6g} pitches: the elements that follow the disc need one above 0 and below 1; "
             "touching pillars are solved by metalens.rcwa"
         )
-    mesh = build(plan)
-    return Geometry(rho, mesh, *integrate(mesh, rho), gradient(plan))
+    mesh = build_mesh(plan)
+    return AssembledDisc(
+        rho, mesh, *integrate_matrices(mesh, rho), gradient_matrix(plan)
+    )

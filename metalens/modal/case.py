@@ -24,7 +24,7 @@ NORMAL_RAD = (
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class ModalCase:
     """One problem in half pitches: what the linear algebra needs.
 
     rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above:
@@ -79,7 +79,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
+class MeshSolution:
     """One rung's answer.
 
     matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of
@@ -114,7 +114,7 @@ class Solution:
         return self.waves + self.rim
 
 
-def film(case: Case) -> np.ndarray:
+def fresnel_scattering(case: ModalCase) -> np.ndarray:
     """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
     kz1, kz2 = (
         math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above)
@@ -124,7 +124,7 @@ def film(case: Case) -> np.ndarray:
     return np.array([[r, t], [t, -r]], complex)
 
 
-def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
+def case_of(cell: Cell, diameter_um: float, light: Light) -> ModalCase:
     """Check a case, and put it into half pitches.
 
     Raises:
@@ -143,7 +143,7 @@ def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
         abs(math.sin(light.angle_rad)),
     )
     bloch = k0 * sine * half
-    return Case(
+    return ModalCase(
         rho=diameter_um / cell.pitch_um,
         k0=k0 * half,
         height=cell.height_um / half,

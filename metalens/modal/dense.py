@@ -12,13 +12,13 @@ from scipy.linalg import blas, lapack
 UPPER, TRANSPOSED = 0, 1  # of LAPACK
 
 
-def added(matrix: np.ndarray, diagonal: np.ndarray | float) -> np.ndarray:
+def add_diagonal(matrix: np.ndarray, diagonal: np.ndarray | float) -> np.ndarray:
     """The matrix with a diagonal added in place."""
     matrix.ravel()[:: len(matrix) + 1] += diagonal
     return matrix
 
 
-def cholesky(definite: np.ndarray) -> np.ndarray:
+def cholesky_factor(definite: np.ndarray) -> np.ndarray:
     """Lower triangular factor, with zeros above.
 
     Raises:
@@ -31,7 +31,7 @@ def cholesky(definite: np.ndarray) -> np.ndarray:
     return lower
 
 
-def below(
+def solve_lower(
     lower: np.ndarray, right: np.ndarray, *, transposed: bool = False
 ) -> np.ndarray:
     """lower⁻¹ right, or lower⁻ᵀ right if ``transposed``; lower triangular with zeros
@@ -50,18 +50,18 @@ def definite_inverse(definite: np.ndarray) -> np.ndarray:
         LinAlgError: it is not definite.
     """
     inverse: np.ndarray = lapack.dpotri(
-        cholesky(definite).T, lower=UPPER, overwrite_c=1
+        cholesky_factor(definite).T, lower=UPPER, overwrite_c=1
     )[0].T
     return inverse
 
 
-def gram(matrix: np.ndarray) -> np.ndarray:
+def gram_matrix(matrix: np.ndarray) -> np.ndarray:
     """Lower triangle of matrixᵀ matrix, with zeros above."""
     product: np.ndarray = blas.dsyrk(1.0, matrix.T, lower=UPPER).T
     return product
 
 
-def congruent(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+def congruence_product(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which
     have no diagonal, are left out.
     """
@@ -71,7 +71,7 @@ def congruent(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     return product
 
 
-def eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def symmetric_eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values, rising, and vectors of a symmetric matrix.
 
     Raises:
@@ -92,22 +92,24 @@ def eigen_pairs(
     Raises:
         LinAlgError: ``definite`` is not positive definite.
     """
-    lower = cholesky(definite)
-    value, vectors = eigenvectors(
+    lower = cholesky_factor(definite)
+    value, vectors = symmetric_eigenvectors(
         lapack.dsygst(matrix.T, lower.T, itype=1, lower=UPPER)[0].T
     )
-    return value, below(lower, vectors, transposed=True)
+    return value, solve_lower(lower, vectors, transposed=True)
 
 
-def whitened(definite: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def whitened_levels(
+    definite: np.ndarray, inner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Levels of lowerᵀ inner lower with lower lowerᵀ = definite, and lower⁻ᵀ vectors
     sqrt(|level|).
 
     Raises:
         LinAlgError: ``definite`` is not positive definite.
     """
-    lower = cholesky(definite)
-    level, vectors = eigenvectors(
+    lower = cholesky_factor(definite)
+    level, vectors = symmetric_eigenvectors(
         lapack.dsygst(inner.T, lower.T, itype=2, lower=UPPER)[0].T
     )
-    return level, below(lower, vectors, transposed=True) * np.sqrt(np.abs(level))
+    return level, solve_lower(lower, vectors, transposed=True) * np.sqrt(np.abs(level))

@@ -11,25 +11,25 @@ import numpy as np
 from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
-from metalens.modal.assembly import Geometry, assemble
-from metalens.modal.case import Case, Solution, case_of, film
+from metalens.modal.assembly import AssembledDisc, assemble_disc
+from metalens.modal.case import MeshSolution, ModalCase, case_of, fresnel_scattering
 from metalens.modal.few_modes import few_modes
-from metalens.modal.homogeneous import Basis, modes
+from metalens.modal.homogeneous import HomogeneousBasis, homogeneous_modes
 from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
-from metalens.modal.layer import Medium, electric_modes, magnetic_modes
+from metalens.modal.layer import LayerMedium, electric_modes, magnetic_modes
 from metalens.modal.match import (
     CARRY,
     HalfSpace,
-    Match,
+    ScatteringMatch,
+    cutoff_proximity,
     few_scattering,
     half_space,
-    nearness,
-    scattering,
+    scattering_matrix,
     zero_order,
 )
 from metalens.modal.mesh import MeshPlan
-from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
-from metalens.modal.spaces import space, topology
+from metalens.modal.pencil import electric_pencil, is_lossless, magnetic_pencil
+from metalens.modal.spaces import build_symmetry_class, class_topology
 from metalens.rcwa import anchored
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
@@ -44,39 +44,41 @@ MOST = 8
 
 
 @lru_cache(maxsize=4)
-def geometry(rho: float, plan: MeshPlan) -> Geometry:
+def disc_geometry(rho: float, plan: MeshPlan) -> AssembledDisc:
     """Matrices of a disc ``rho`` pitches wide on a mesh, kept for the next call."""
-    return assemble(rho, plan)
+    return assemble_disc(rho, plan)
 
 
-def basis(
+def homogeneous_basis(
     rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False
-) -> Basis:
+) -> HomogeneousBasis:
     """Homogeneous modes of one symmetry class; reused while only wavelength, height and
     indices change.
 
     quick: as in ``modes``; nearly uniform gradients then need no care until later.
     """
-    small = topology(plan, electric, bloch or None).vectors.size <= SMALL
-    return (kept_long if small else kept)(rho, plan, electric, bloch, quick)
+    small = class_topology(plan, electric, bloch or None).vectors.size <= SMALL
+    return (small_cached_basis if small else cached_basis)(
+        rho, plan, electric, bloch, quick
+    )
 
 
 @lru_cache(
     maxsize=6
 )  # both classes of three diameters: the probes of a curve, for either polarisation
-def kept(
+def cached_basis(
     rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool
-) -> Basis:
+) -> HomogeneousBasis:
     """See ``basis``."""
-    symmetry_class = space(
-        geometry(rho, plan), electric=electric, half_phase_rad=bloch or None
+    symmetry_class = build_symmetry_class(
+        disc_geometry(rho, plan), electric=electric, half_phase_rad=bloch or None
     )
     careful = 0 < bloch < (QUICK_CAREFUL_RAD if quick else CAREFUL_RAD)
-    return modes(symmetry_class, careful=careful, quick=quick)
+    return homogeneous_modes(symmetry_class, careful=careful, quick=quick)
 
 
-kept_long = lru_cache(maxsize=24)(
-    kept.__wrapped__
+small_cached_basis = lru_cache(maxsize=24)(
+    cached_basis.__wrapped__
 )  # what one polarisation adds to a curve, 5 MB each
 
 
@@ -88,9 +90,9 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     nearly singular (a black layer)
     or the ratio has no principal root.
     """
-    if abs(determinant(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
+    if abs(determinant_2x2(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
         ratio = np.linalg.solve(first, second)
-        root = cmath.sqrt(determinant(ratio))
+        root = cmath.sqrt(determinant_2x2(ratio))
         trace = cmath.sqrt(ratio[0, 0] + ratio[1, 1] + 2 * root)
         if abs(trace) > 0.1:
             mean: np.ndarray = (second + root * first) / trace
@@ -99,14 +101,14 @@ def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return arithmetic
 
 
-def determinant(matrix: np.ndarray) -> complex:
+def determinant_2x2(matrix: np.ndarray) -> complex:
     """Of a 2 x 2 matrix."""
     (a, b), (c, d) = matrix.tolist()
     return complex(a * d - b * c)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Form:
+class FormSolution:
     """What one form gives: zero-order matrix (2, 2), power out per unit power in, size;
     and of the layer modes that
     travel, by falling axial wavenumber, q (m,) and, for the electric form, the
@@ -125,15 +127,15 @@ class Form:
 
 
 def layer_between(
-    b: Basis, case: Case, *, magnetic: bool, weak: float
-) -> tuple[np.ndarray, Callable[[HalfSpace, HalfSpace], Match], bool]:
+    b: HomogeneousBasis, case: ModalCase, *, magnetic: bool, weak: float
+) -> tuple[np.ndarray, Callable[[HalfSpace, HalfSpace], ScatteringMatch], bool]:
     """Axial wavenumbers of the carrying modes, the match between half-spaces, and
     whether it is of the dual unknown.
 
     Few modes where the layer is without loss and thick enough that few carry, else all.
     """
-    medium = Medium(case.k0, case.disc, case.around)
-    if lossless(medium):
+    medium = LayerMedium(case.k0, case.disc, case.around)
+    if is_lossless(medium):
         pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
         modes = few_modes(pencil, case.height, weak=weak)
         if modes is not None:
@@ -147,18 +149,18 @@ def layer_between(
     carry = np.flatnonzero(np.abs(np.exp(1j * layer.q * case.height)) > CARRY)
     return (
         layer.q[carry],
-        lambda foot, top: scattering(layer, case.height, foot, top),
+        lambda foot, top: scattering_matrix(layer, case.height, foot, top),
         False,
     )
 
 
 def solve_form(
-    case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY
-) -> Form:
+    case: ModalCase, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY
+) -> FormSolution:
     """One form on one mesh; ``weak`` as in ``evaluate``."""
     # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the
     # electric space
-    b = basis(
+    b = homogeneous_basis(
         case.rho,
         plan,
         case.p == magnetic if case.bloch else False,
@@ -175,7 +177,7 @@ def solve_form(
 
     def matched(
         bloch: float | None,
-    ) -> tuple[Match, int, list[int], tuple[HalfSpace, HalfSpace]]:
+    ) -> tuple[ScatteringMatch, int, list[int], tuple[HalfSpace, HalfSpace]]:
         below, above = (
             half_space(b, case.k0, e, magnetic=magnetic, bloch=bloch)
             for e in (case.below, case.above)
@@ -207,7 +209,7 @@ def solve_form(
         1j * case.height * match.travel[travelling]
     )
     moved = moved[:0] if magnetic else moved
-    return Form(
+    return FormSolution(
         matrix=matrix,
         energy=float((np.abs(match.matrix[:, foot]) ** 2).sum()),
         unknowns=b.size,
@@ -218,7 +220,7 @@ def solve_form(
     )
 
 
-def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
+def evaluate(case: ModalCase, plan: MeshPlan, *, weak: float = CARRY) -> MeshSolution:
     """Both forms on one mesh.
 
     weak: modes weaker than this over the height end at the interface they start from,
@@ -255,7 +257,7 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
     rest = first.matrix - second.matrix - explained.sum(0)
     dense = case.k0**2 * max(case.disc, case.around, key=lambda e: e.real)
     slack = np.abs(dense - first.q**2) / (2 * np.abs(first.q))
-    return Solution(
+    return MeshSolution(
         matrix=geometric_mean(first.matrix, second.matrix),
         waves=float(np.abs(explained).sum(0).max()) / 2,
         rim=float(np.abs(rest).max()) / 2,
@@ -266,7 +268,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         unknowns=first.unknowns + second.unknowns,
         grazing=max(first.grazing, second.grazing),
         beside=max(
-            nearness(case.k0**2 * e, case.bloch) for e in (case.below, case.above)
+            cutoff_proximity(case.k0**2 * e, case.bloch)
+            for e in (case.below, case.above)
         ),
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
@@ -290,17 +293,17 @@ def nearest_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Climb:
+class RefinementResult:
     """Where the ladder was left: the solution, its rung and error estimate, and why."""
 
-    solution: Solution
+    solution: MeshSolution
     rung: Rung
     error: float
     converged: bool
     reason: str
 
 
-def climb(case: Case, tolerance: float) -> Climb:
+def refine_mesh(case: ModalCase, tolerance: float) -> RefinementResult:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
 
     At sharp resonances both forms may lie together by accident, far from the truth:
@@ -310,8 +313,8 @@ def climb(case: Case, tolerance: float) -> Climb:
     lower, and how the answer settles from mesh to mesh counts (see ``ladder``); two
     meshes alone tell nothing of them.
     """
-    best: Climb | None = None
-    solved: list[Solution] = []
+    best: RefinementResult | None = None
+    solved: list[MeshSolution] = []
     begin = (
         first_rung(tolerance, case.rho) - COMPARED
         if case.strange
@@ -328,10 +331,10 @@ def climb(case: Case, tolerance: float) -> Climb:
         solved.append(solution)
         if error <= tolerance and known:
             reason = f"the {rung.name} mesh meets the tolerance"
-            return Climb(solution, rung, error, True, reason)
+            return RefinementResult(solution, rung, error, True, reason)
         if best is None or error < best.error:
             reason = f"the {rung.name} mesh leaves an estimated error of {error:.1e}, the least of all meshes"
-            best = Climb(solution, rung, error, False, reason)
+            best = RefinementResult(solution, rung, error, False, reason)
     if best is None:
         raise CellError(f"tolerance = {tolerance}: no mesh to try")
     return best
@@ -376,7 +379,7 @@ def solve(
         return _as_built(cell, float(diameter_um), light, tolerance)
     case = case_of(cell, diameter_um, light)
     if case.height == 0:
-        matrix = film(case)
+        matrix = fresnel_scattering(case)
         energy = float((np.abs(matrix[:, 0]) ** 2).sum())
         return Response(
             complex(matrix[1, 0]),
@@ -388,7 +391,7 @@ def solve(
             True,
             "closed form",
         )
-    end = climb(case, tolerance)
+    end = refine_mesh(case, tolerance)
     t, r = complex(end.solution.matrix[1, 0]), complex(end.solution.matrix[0, 0])
     unknowns, energy = end.solution.unknowns, end.solution.energy
     return Response(
@@ -400,7 +403,7 @@ def _as_built(
     cell: Cell, diameter_um: float, light: Light, tolerance: float
 ) -> Response:
     """A pillar with a tilted wall or films, from upright ones without."""
-    plain = anchored.plain(cell)
+    plain = anchored.upright_cell(cell)
     upright = [
         solve(
             plain,

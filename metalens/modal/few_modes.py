@@ -24,8 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.layer import axial
-from metalens.modal.pencil import Pencil
+from metalens.modal.layer import axial_wavenumber
+from metalens.modal.pencil import LayerPencil
 
 SPARE = (
     3.0  # low levels reach this many times the level of the weakest mode that carries
@@ -64,7 +64,7 @@ class FewModes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ritz:
+class RitzVectors:
     """Orthonormal trial vectors (levels, vectors) of both blocks, and the signs of
     growth on them.
     """
@@ -76,7 +76,7 @@ class Ritz:
 
 
 def solve_ritz(
-    pencil: Pencil, trial: Ritz, height: float, weak: float
+    pencil: LayerPencil, trial: RitzVectors, height: float, weak: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Levels (-q²) and vectors (a, c), (b, c) of the modes stronger than ``weak`` over
     the height.
@@ -85,19 +85,21 @@ def solve_ritz(
     sign = np.concatenate([trial.te_sign, trial.tm_sign])
     matrix = np.zeros((len(sign), len(sign)))
     matrix[:k, :k] = trial.te.T @ (
-        pencil.te_sign[:, None] * beside(pencil.te, pencil.te_rest, trial.te)
+        pencil.te_sign[:, None] * apply_shifted(pencil.te, pencil.te_rest, trial.te)
     )
     matrix[k:, k:] = trial.tm.T @ (
-        pencil.tm_sign[:, None] * beside(pencil.tm, pencil.tm_rest, trial.tm)
+        pencil.tm_sign[:, None] * apply_shifted(pencil.tm, pencil.tm_rest, trial.tm)
     )
     matrix[:k, k:] = trial.te.T @ (pencil.coupling @ trial.tm)
     matrix[k:, :k] = matrix[:k, k:].T
     level, vectors = np.linalg.eig(sign[:, None] * matrix)
-    carry = np.flatnonzero(np.abs(np.exp(1j * axial(-level) * height)) > weak)
+    carry = np.flatnonzero(
+        np.abs(np.exp(1j * axial_wavenumber(-level) * height)) > weak
+    )
     return level[carry], trial.te @ vectors[:k, carry], trial.tm @ vectors[k:, carry]
 
 
-def beside(
+def apply_shifted(
     level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray
 ) -> np.ndarray:
     """(diag(level) + rest) vectors."""
@@ -107,7 +109,7 @@ def beside(
     return out
 
 
-def enlarge(
+def enlarge_trial_space(
     trial: np.ndarray,
     sign: np.ndarray,
     low: np.ndarray,
@@ -135,8 +137,8 @@ def enlarge(
     )
 
 
-def carrying(
-    pencil: Pencil, height: float, weak: float, accuracy: float
+def carrying_modes(
+    pencil: LayerPencil, height: float, weak: float, accuracy: float
 ) -> tuple[np.ndarray, ...] | None:
     """Levels and vectors of the modes that carry, or None where they are too many to be
     few.
@@ -152,7 +154,7 @@ def carrying(
         or (pencil.te_sign[~low_te] < 0).any()
     ):
         return None
-    trial = Ritz(
+    trial = RitzVectors(
         np.eye(len(pencil.te))[:, low_te],
         np.eye(len(pencil.tm))[:, low_tm],
         pencil.te_sign[low_te],
@@ -174,9 +176,9 @@ def carrying(
             < accuracy
         ):
             return level, te, tm
-        te_block = enlarge(trial.te, trial.te_sign, low_te, off_te, 1.0)
-        tm_block = enlarge(trial.tm, trial.tm_sign, low_tm, off_tm, -1.0)
-        trial = Ritz(te_block[0], tm_block[0], te_block[1], tm_block[1])
+        te_block = enlarge_trial_space(trial.te, trial.te_sign, low_te, off_te, 1.0)
+        tm_block = enlarge_trial_space(trial.tm, trial.tm_sign, low_tm, off_tm, -1.0)
+        trial = RitzVectors(te_block[0], tm_block[0], te_block[1], tm_block[1])
         if len(trial.te_sign) + len(trial.tm_sign) > 0.8 * (
             len(pencil.te) + len(pencil.tm)
         ):
@@ -184,7 +186,7 @@ def carrying(
     return None
 
 
-def root(
+def matrix_root(
     square: np.ndarray, signs: np.ndarray, least: float, accuracy: float
 ) -> np.ndarray | None:
     """X with X² = square and eigenvalues in the right half plane, near the root of its
@@ -204,10 +206,12 @@ def root(
     rest.ravel()[:: n + 1] -= diagonal / 2
     aim = max(accuracy * diagonal[0], ROUNDING * diagonal[-1])
     rough = rest.astype(np.float32), weight.astype(np.float32)
-    near = settled(rough[0], rough, ordered, max(aim, ROUGH * diagonal[0]), whole=WHOLE)
+    near = fixed_point(
+        rough[0], rough, ordered, max(aim, ROUGH * diagonal[0]), whole=WHOLE
+    )
     e = None if near is None else near.astype(float)
     if e is not None and accuracy < SINGLE:
-        e = settled(e, (rest, weight), ordered, aim, whole=1)
+        e = fixed_point(e, (rest, weight), ordered, aim, whole=1)
     if e is None:
         return None
     e.ravel()[:: n + 1] += diagonal
@@ -215,7 +219,7 @@ def root(
     return np.asarray(e.take(back, 0).take(back, 1))
 
 
-def settled(
+def fixed_point(
     e: np.ndarray,
     fixed: tuple[np.ndarray, np.ndarray],
     signs: np.ndarray,
@@ -236,13 +240,13 @@ def settled(
     change, first, last = np.inf, np.inf, np.inf
     for step in range(STEPS):
         if step < whole or change < max(aim, SETTLED * last):
-            after = squared(e, signs)
+            after = symmetric_square(e, signs)
             after *= weight
             np.subtract(rest, after, out=after)
             last = change = float(np.abs(after[:slow] - e[:slow]).max())
             e = after
             if change < aim:
-                return even(e, signs)
+                return symmetrised(e, signs)
         else:
             rows = e[:slow] @ e
             rows *= weight[:slow]
@@ -255,7 +259,7 @@ def settled(
     return None
 
 
-def even(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
+def symmetrised(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     """A matrix made symmetric with respect to the signs to the last bit: products of
     some processors are not, and what
     is left of the difference is light that is lost."""
@@ -263,7 +267,7 @@ def even(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     return np.asarray((e + mirror) / 2)
 
 
-def squared(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
+def symmetric_square(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     """e @ e of a matrix that is symmetric with respect to the signs: strips of rows
     from the diagonal on, and their
     mirror images."""
@@ -280,13 +284,13 @@ def squared(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     return found
 
 
-def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
+def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | None:
     """Modes stronger than ``weak`` over the height, and the admittance of the rest;
     None where they are not few.
 
     weak: the accuracy asked for, relative.
     """
-    found = carrying(pencil, height, weak, 0.1 * math.sqrt(weak))
+    found = carrying_modes(pencil, height, weak, 0.1 * math.sqrt(weak))
     if found is None:
         return None
     level, te, tm = found
@@ -305,9 +309,13 @@ def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
     common = max(float(np.abs(level).max(initial=0.0)), 1.0)
     norm = np.einsum("ij,ij->j", partner, field)
     square += ((field * ((common - level) / norm)) @ partner.T).real
-    near = root(square, sign, common, weak)
+    near = matrix_root(square, sign, common, weak)
     if near is None:
         return None
     return FewModes(
-        axial(-level), field, partner, -sign[:, None] * near, -np.sqrt(common)
+        axial_wavenumber(-level),
+        field,
+        partner,
+        -sign[:, None] * near,
+        -np.sqrt(common),
     )

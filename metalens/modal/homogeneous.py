@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from metalens.modal.dense import congruent, eigen_pairs, gram
-from metalens.modal.spaces import Space
+from metalens.modal.dense import congruence_product, eigen_pairs, gram_matrix
+from metalens.modal.spaces import SymmetryClass
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Basis:
+class HomogeneousBasis:
     """Mass-orthonormal modes of the empty cell, lengths in half pitches.
 
     te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise. te_exact,
@@ -55,7 +55,7 @@ class Basis:
         return len(self.te) + len(self.tm)
 
 
-def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
+def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
     """Discrete wavenumbers squared with the zero order's, where this family has it, set
     to its exact value.
     """
@@ -66,8 +66,8 @@ def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
     return out
 
 
-def gradients(
-    space: Space, lower: np.ndarray, *, careful: bool
+def gradient_modes(
+    space: SymmetryClass, lower: np.ndarray, *, careful: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transverse wavenumbers squared and scalar fields of the gradients, and a full
     orthogonal basis, gradients first.
@@ -100,14 +100,16 @@ def gradients(
     return tm, scalar, q
 
 
-def modes(space: Space, *, careful: bool = False, quick: bool = False) -> Basis:
+def homogeneous_modes(
+    space: SymmetryClass, *, careful: bool = False, quick: bool = False
+) -> HomogeneousBasis:
     """TM modes from the gradients, TE modes from their complement; ``careful`` as in
     ``gradients``, quick as in
     ``quick_modes``."""
     if quick and not careful:
         return quick_modes(space)
     lower = np.linalg.cholesky(space.cell.mass)
-    tm, scalar, orthogonal = gradients(space, lower, careful=careful)
+    tm, scalar, orthogonal = gradient_modes(space, lower, careful=careful)
     vector = sl.solve_triangular(
         lower, orthogonal, trans="T", lower=True, check_finite=False
     )
@@ -115,11 +117,14 @@ def modes(space: Space, *, careful: bool = False, quick: bool = False) -> Basis:
     te, mix = np.linalg.eigh(rest.T @ space.cell.curl @ rest)
     rest = rest @ mix
     vector = np.concatenate([rest, vector[:, : len(tm)]], 1)
-    disc = congruent(space.disc.mass, vector), congruent(space.disc.curl, rest)
-    return made(space, te, tm, lambda: vector, scalar, disc)
+    disc = (
+        congruence_product(space.disc.mass, vector),
+        congruence_product(space.disc.curl, rest),
+    )
+    return assemble_basis(space, te, tm, lambda: vector, scalar, disc)
 
 
-def quick_modes(space: Space) -> Basis:
+def quick_modes(space: SymmetryClass) -> HomogeneousBasis:
     """In the basis of cotree unknowns and gradients, where the curl knows the first
     alone: problems of half the size.
 
@@ -136,7 +141,9 @@ def quick_modes(space: Space) -> Basis:
     tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
     unit = scalar / np.sqrt(tm)
     inner = unit.T @ mass[c].T
-    te, x = eigen_pairs(space.cell.curl[corner], space.cell.mass[corner] - gram(inner))
+    te, x = eigen_pairs(
+        space.cell.curl[corner], space.cell.mass[corner] - gram_matrix(inner)
+    )
     down = inner @ x
     inside, few = np.flatnonzero(space.disc.mass.diagonal()[c]), unit[space.within]
     disc = (space.within_transposed @ space.disc.mass).T
@@ -144,7 +151,7 @@ def quick_modes(space: Space) -> Basis:
     low = few.T @ (space.within_transposed @ disc) @ few
     drawn = (low @ down).T
     mixed = (across - drawn / 2) @ down
-    high = congruent(space.disc.mass[corner], x) - mixed - mixed.T
+    high = congruence_product(space.disc.mass[corner], x) - mixed - mixed.T
     across -= drawn
     a, gradient = len(te), space.gradient
     disc_mass = np.empty((a + len(tm), a + len(tm)))
@@ -161,33 +168,33 @@ def quick_modes(space: Space) -> Basis:
         rest[c] += x
         return np.concatenate([rest, gradients], 1)
 
-    return made(
+    return assemble_basis(
         space,
         te,
         tm,
         vector,
         scalar,
-        (disc_mass, congruent(space.disc.curl[corner], x)),
+        (disc_mass, congruence_product(space.disc.curl[corner], x)),
     )
 
 
-def made(
-    space: Space,
+def assemble_basis(
+    space: SymmetryClass,
     te: np.ndarray,
     tm: np.ndarray,
     vector: Callable[[], np.ndarray],
     scalar: np.ndarray,
     disc: tuple[np.ndarray, np.ndarray],
-) -> Basis:
+) -> HomogeneousBasis:
     """The basis, from its parts; disc: mass and curl of the disc."""
-    return Basis(
+    return HomogeneousBasis(
         te=np.maximum(te, 0.0),
         tm=tm,
-        te_exact=corrected(te, space.half_phase_rad),
-        tm_exact=corrected(tm, space.half_phase_rad),
+        te_exact=exact_zero_order(te, space.half_phase_rad),
+        tm_exact=exact_zero_order(tm, space.half_phase_rad),
         make_vector=vector,
         scalar=scalar,
         disc_mass=disc[0],
         disc_curl=disc[1],
-        disc_scalar=congruent(space.disc.scalar, scalar),
+        disc_scalar=congruence_product(space.disc.scalar, scalar),
     )

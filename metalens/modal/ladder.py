@@ -86,12 +86,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from metalens.modal.case import RARER, Solution
+from metalens.modal.case import RARER, MeshSolution
 from metalens.modal.mesh import MeshPlan
 
 
 @dataclass(frozen=True, slots=True)
-class Factors:
+class ErrorFactors:
     """Of the parts of an error estimate, see the module; zeros are left out.
 
     rim, waves: of both halves of the forms' difference. flat, steep, oblique: relative
@@ -115,7 +115,7 @@ class Factors:
     at_cutoff: float = 2.6
     grazing: float = 0.15
 
-    def bound(self, found: Solution, before: Sequence[Solution] = ()) -> float:
+    def bound(self, found: MeshSolution, before: Sequence[MeshSolution] = ()) -> float:
         """Error estimate of a solution, after the meshes ``before``."""
         near = self.at_cutoff * found.beside
         waves = max(self.waves, near, self.slanted if found.bloch > 0 else 0.0)
@@ -125,15 +125,15 @@ class Factors:
             max(self.rim, near) * found.rim + waves * found.waves + shared * found.drift
         )
         change = self.moved * max(
-            (settled(found, one) for one in before[-COMPARED:]), default=0.0
+            (damped_change(found, one) for one in before[-COMPARED:]), default=0.0
         )
         if before and found.strange >= RARER:
-            change = max(change, ALIKE * found.beside * moved(found, before[-1]))
+            change = max(change, ALIKE * found.beside * mesh_change(found, before[-1]))
         return parts + self.grazing * found.grazing + change
 
 
 @dataclass(frozen=True, slots=True)
-class Settling:
+class DampedEstimate:
     """Of the estimate after two meshes for cells unlike those of lenses whose waves are
     all damped.
 
@@ -146,21 +146,21 @@ class Settling:
     forms: float
     shared: float
 
-    def bound(self, found: Solution, before: Sequence[Solution]) -> float:
+    def bound(self, found: MeshSolution, before: Sequence[MeshSolution]) -> float:
         """Error estimate; infinite where it does not apply."""
         meshes = (*before[-COMPARED:], found)
         damped = min(one.damping for one in meshes) >= DAMPED
         beyond_it = found.bloch > 0 or found.strange >= RARER or found.size > MOST_WAVES
         if len(meshes) <= COMPARED or not damped or beyond_it or found.beside > NEAREST:
             return math.inf
-        change = max(drawn(found, one) for one in meshes[:-1])
+        change = max(contracted_change(found, one) for one in meshes[:-1])
         return (
             self.moved * change + self.forms * found.spread + self.shared * found.drift
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class MeshChoice:
     """A mesh for discs up to ``up_to`` pitches wide, and the factors of its estimate;
     after: in place of them with the
     change from meshes before, for cells unlike those of lenses. usual: in place of that
@@ -168,8 +168,8 @@ class Choice:
 
     plan: MeshPlan
     up_to: float
-    factors: Factors
-    after: Factors
+    factors: ErrorFactors
+    after: ErrorFactors
     usual: float | None = None
 
 
@@ -184,10 +184,10 @@ class Rung:
     """
 
     name: str
-    choices: tuple[Choice, ...]
+    choices: tuple[MeshChoice, ...]
     usual: float
-    alone: Factors
-    settling: Settling | None = None
+    alone: ErrorFactors
+    settling: DampedEstimate | None = None
 
     @property
     def weak(self) -> float:
@@ -196,17 +196,17 @@ class Rung:
         """
         return float(max(1e-13, 1e-3 * self.usual**1.1))
 
-    def choice(self, rho: float) -> Choice:
+    def choice(self, rho: float) -> MeshChoice:
         """The mesh for a disc of ``rho`` pitches."""
         return next(c for c in self.choices if rho <= c.up_to)
 
     def error(
         self,
-        found: Solution,
+        found: MeshSolution,
         rho: float,
-        before: Sequence[Solution] = (),
+        before: Sequence[MeshSolution] = (),
         *,
-        mesh: Choice | None = None,
+        mesh: MeshChoice | None = None,
     ) -> float:
         """Error estimate of the mean of both forms.
 
@@ -225,11 +225,11 @@ class Rung:
             own = self.choice(rho)
             judges = (own, mesh) if mesh and mesh.plan != own.plan else (own,)
             bound = max(one.factors.bound(found) for one in judges)
-            bound = beyond(bound)
+            bound = second_order_bound(bound)
         return bound + UNSEEN * self.usual * (found.bloch > 0) + 1e-12
 
 
-def beyond(first: float) -> float:
+def second_order_bound(first: float) -> float:
     """An estimate of first order with the orders beyond it: at most twice as much, or
     twice ``RESONANT``.
 
@@ -242,21 +242,23 @@ def beyond(first: float) -> float:
     return max(first, min(whole, 2 * RESONANT))
 
 
-def settled(found: Solution, before: Solution) -> float:
-    """:func:`drawn` over the damping: at most ``AMPLIFIED`` times the change."""
-    most = AMPLIFIED * moved(found, before)
-    return min(most, drawn(found, before) / min(1.0, max(found.damping, 1e-9)))
+def damped_change(found: MeshSolution, before: MeshSolution) -> float:
+    """:func:`contracted_change` over the damping: at most ``AMPLIFIED`` times the change."""
+    most = AMPLIFIED * mesh_change(found, before)
+    return min(
+        most, contracted_change(found, before) / min(1.0, max(found.damping, 1e-9))
+    )
 
 
-def drawn(found: Solution, before: Solution) -> float:
+def contracted_change(found: MeshSolution, before: MeshSolution) -> float:
     """Change since a mesh before, times the root of how far the forms have drawn
     together since.
     """
     together = min(1.0, found.spread / before.spread) if before.spread > 0 else 1.0
-    return moved(found, before) * math.sqrt(together)
+    return mesh_change(found, before) * math.sqrt(together)
 
 
-def moved(found: Solution, before: Solution) -> float:
+def mesh_change(found: MeshSolution, before: MeshSolution) -> float:
     """Largest change of an element of the matrix since a mesh before."""
     return float(np.abs(found.matrix - before.matrix).max())
 
@@ -319,25 +321,25 @@ FAIR, FAIR_WIDE = (
 )
 EVEN = MeshPlan(4, 4, 4, BOTH)
 SETTLED, WIDE = (
-    Factors(0.6, 2.0, moved=0.31, at_cutoff=1.0),
-    Factors(2.5, 1.8, moved=0.33),
+    ErrorFactors(0.6, 2.0, moved=0.31, at_cutoff=1.0),
+    ErrorFactors(2.5, 1.8, moved=0.33),
 )
-UNSETTLED = Factors(9.0, 9.0, moved=0.33)  # of elements of degree three and four
-SLIM_FACTORS = Factors(
+UNSETTLED = ErrorFactors(9.0, 9.0, moved=0.33)  # of elements of degree three and four
+SLIM_FACTORS = ErrorFactors(
     0.9, 0.08, 4e-9, 4e-8, oblique=1.5e-7, slanted=1.7, at_cutoff=1.0
 )
-SLIM_GOOD = Choice(GOOD, SLIM, SLIM_FACTORS, SETTLED, usual=1.2e-5)
+SLIM_GOOD = MeshChoice(GOOD, SLIM, SLIM_FACTORS, SETTLED, usual=1.2e-5)
 ON_GOOD = (  # discs that leave a wide or a narrow gap
-    Choice(
+    MeshChoice(
         GOOD_WIDE,
         NARROW,
-        Factors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
+        ErrorFactors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
         WIDE,
     ),
-    Choice(
+    MeshChoice(
         GOOD_WIDE,
         1.0,
-        Factors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
+        ErrorFactors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
         WIDE,
     ),
 )
@@ -345,26 +347,26 @@ ON_GOOD = (  # discs that leave a wide or a narrow gap
 
 def _finer(
     plan: MeshPlan, safety: float, flat: float, oblique: float = 0.0
-) -> tuple[Choice, ...]:
+) -> tuple[MeshChoice, ...]:
     """One mesh for all discs, with factors of the worst cells: too few were solved on
     finer ones to tell them apart.
     """
-    usually = Factors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique)
-    wide = Factors(2 * safety, 2 * safety, flat, flat, oblique=oblique)
-    narrow = Factors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique)
-    after = Factors(3.0, 3.0, moved=0.33)
+    usually = ErrorFactors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique)
+    wide = ErrorFactors(2 * safety, 2 * safety, flat, flat, oblique=oblique)
+    narrow = ErrorFactors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique)
+    after = ErrorFactors(3.0, 3.0, moved=0.33)
     ends = (0.7, usually), (NARROW, wide), (1.0, narrow)
-    return tuple(Choice(plan, end, factors, after) for end, factors in ends)
+    return tuple(MeshChoice(plan, end, factors, after) for end, factors in ends)
 
 
-def _alone(safety: float, flat: float, oblique: float = 0.0) -> Factors:
-    return Factors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique)
+def _alone(safety: float, flat: float, oblique: float = 0.0) -> ErrorFactors:
+    return ErrorFactors(5 * safety, 5 * safety, 5 * flat, 5 * flat, oblique=5 * oblique)
 
 
 ON_FINER = _finer(FINER, 0.5, 4e-8, 1e-7)
 
 
-def _rough(*choices: Choice) -> tuple[Choice, ...]:
+def _rough(*choices: MeshChoice) -> tuple[MeshChoice, ...]:
     """Near a cutoff both forms err alike, and the more the fewer elements there are."""
     return tuple(
         replace(one, factors=replace(one.factors, at_cutoff=4.6)) for one in choices
@@ -375,116 +377,133 @@ RUNGS = (
     Rung(
         "coarse",
         _rough(
-            Choice(
-                COARSE, TINY, Factors(1.2, 1.2, 1e-5, 1e-5, oblique=2e-4), UNSETTLED
+            MeshChoice(
+                COARSE,
+                TINY,
+                ErrorFactors(1.2, 1.2, 1e-5, 1e-5, oblique=2e-4),
+                UNSETTLED,
             ),
-            Choice(
+            MeshChoice(
                 COARSE,
                 SLIM,
-                Factors(1.05, 0.12, 6.3e-7, 2.5e-6, oblique=4.4e-5, slanted=1.7),
+                ErrorFactors(1.05, 0.12, 6.3e-7, 2.5e-6, oblique=4.4e-5, slanted=1.7),
                 UNSETTLED,
                 3e-4,
             ),
-            Choice(
+            MeshChoice(
                 COARSE,
                 THIN,
-                Factors(0.5, 0.62, 6.3e-6, 2.5e-5, oblique=3.8e-5, slanted=1.7),
+                ErrorFactors(0.5, 0.62, 6.3e-6, 2.5e-5, oblique=3.8e-5, slanted=1.7),
                 UNSETTLED,
                 usual=1e-3,
             ),
-            Choice(
-                COARSE, 0.6, Factors(0.5, 3.1, 3.8e-6, 5e-4, oblique=3.8e-5), UNSETTLED
-            ),
-            Choice(
+            MeshChoice(
                 COARSE,
-                0.7,
-                Factors(3.8, 1.2, 3.8e-5, 1.9e-4, oblique=3.8e-5),
+                0.6,
+                ErrorFactors(0.5, 3.1, 3.8e-6, 5e-4, oblique=3.8e-5),
                 UNSETTLED,
             ),
-            Choice(COARSE_WIDE, NARROW, Factors(0.5, 1.0, 4.4e-5, 3.8e-5), UNSETTLED),
-            Choice(COARSE_WIDE, 1.0, Factors(0.62, 5.6, 4.4e-5, 3.8e-5), UNSETTLED),
+            MeshChoice(
+                COARSE,
+                0.7,
+                ErrorFactors(3.8, 1.2, 3.8e-5, 1.9e-4, oblique=3.8e-5),
+                UNSETTLED,
+            ),
+            MeshChoice(
+                COARSE_WIDE, NARROW, ErrorFactors(0.5, 1.0, 4.4e-5, 3.8e-5), UNSETTLED
+            ),
+            MeshChoice(
+                COARSE_WIDE, 1.0, ErrorFactors(0.62, 5.6, 4.4e-5, 3.8e-5), UNSETTLED
+            ),
         ),
         2e-3,
-        alone=Factors(7.0, 7.0, 3e-4, 3e-4, oblique=1e-3),
+        alone=ErrorFactors(7.0, 7.0, 3e-4, 3e-4, oblique=1e-3),
     ),
     Rung(
         "fair",
         _rough(
-            Choice(FAIR, TINY, Factors(1.2, 1.2, 3e-6, 8e-6, oblique=1e-5), UNSETTLED),
-            Choice(
+            MeshChoice(
+                FAIR, TINY, ErrorFactors(1.2, 1.2, 3e-6, 8e-6, oblique=1e-5), UNSETTLED
+            ),
+            MeshChoice(
                 FAIR,
                 SLIM,
-                Factors(0.95, 0.09, 1e-7, 1e-6, oblique=1e-6, slanted=1.7),
+                ErrorFactors(0.95, 0.09, 1e-7, 1e-6, oblique=1e-6, slanted=1.7),
                 UNSETTLED,
                 8e-5,
             ),
-            Choice(
+            MeshChoice(
                 FAIR,
                 THIN,
-                Factors(0.81, 0.62, 1e-6, 1e-5, slanted=1.7),
+                ErrorFactors(0.81, 0.62, 1e-6, 1e-5, slanted=1.7),
                 UNSETTLED,
                 usual=2e-4,
             ),
-            Choice(FAIR, 0.6, Factors(0.44, 1.0, 1.2e-6, 1.3e-4), UNSETTLED),
-            Choice(
-                FAIR, 0.7, Factors(0.8, 1.3, 1.3e-5, 3.2e-5, oblique=1.4e-5), UNSETTLED
-            ),
-            Choice(
-                FAIR_WIDE,
-                NARROW,
-                Factors(1.1, 1.0, 1.8e-5, 1.3e-5, oblique=1.1e-5),
+            MeshChoice(FAIR, 0.6, ErrorFactors(0.44, 1.0, 1.2e-6, 1.3e-4), UNSETTLED),
+            MeshChoice(
+                FAIR,
+                0.7,
+                ErrorFactors(0.8, 1.3, 1.3e-5, 3.2e-5, oblique=1.4e-5),
                 UNSETTLED,
             ),
-            Choice(
+            MeshChoice(
+                FAIR_WIDE,
+                NARROW,
+                ErrorFactors(1.1, 1.0, 1.8e-5, 1.3e-5, oblique=1.1e-5),
+                UNSETTLED,
+            ),
+            MeshChoice(
                 FAIR_WIDE,
                 1.0,
-                Factors(5.6, 3.8, 3.8e-5, 1.3e-5, oblique=1.1e-5),
+                ErrorFactors(5.6, 3.8, 3.8e-5, 1.3e-5, oblique=1.1e-5),
                 UNSETTLED,
             ),
         ),
         4e-4,
-        alone=Factors(7.0, 7.0, 1e-4, 1e-4, oblique=5e-5),
+        alone=ErrorFactors(7.0, 7.0, 1e-4, 1e-4, oblique=5e-5),
     ),
     Rung(
         "even",
         (
-            Choice(EVEN, TINY, Factors(0.6, 0.6, 1e-6, 2e-6, oblique=4e-6), UNSETTLED),
-            Choice(
+            MeshChoice(
+                EVEN, TINY, ErrorFactors(0.6, 0.6, 1e-6, 2e-6, oblique=4e-6), UNSETTLED
+            ),
+            MeshChoice(
                 EVEN,
                 SLIM,
-                Factors(0.95, 0.13, 2.5e-8, 2.5e-7, oblique=2.3e-7, slanted=1.7),
+                ErrorFactors(0.95, 0.13, 2.5e-8, 2.5e-7, oblique=2.3e-7, slanted=1.7),
                 UNSETTLED,
                 2.5e-5,
             ),
-            Choice(
+            MeshChoice(
                 EVEN,
                 THIN,
-                Factors(0.69, 0.62, 2.5e-7, 2.5e-6, slanted=1.7),
+                ErrorFactors(0.69, 0.62, 2.5e-7, 2.5e-6, slanted=1.7),
                 UNSETTLED,
                 usual=5e-5,
             ),
-            Choice(EVEN, 0.6, Factors(0.5, 3.2, 1.6e-6, 1e-5), UNSETTLED),
-            Choice(EVEN, 0.7, Factors(0.62, 5.4, 6.3e-6, 5e-6), UNSETTLED),
+            MeshChoice(EVEN, 0.6, ErrorFactors(0.5, 3.2, 1.6e-6, 1e-5), UNSETTLED),
+            MeshChoice(EVEN, 0.7, ErrorFactors(0.62, 5.4, 6.3e-6, 5e-6), UNSETTLED),
             *ON_GOOD,
         ),
         2.5e-4,
-        alone=Factors(9.0, 9.0, 3e-5, 3e-5, oblique=2e-5),
-        settling=Settling(moved=1.05, forms=1.05, shared=4.5e-6),
+        alone=ErrorFactors(9.0, 9.0, 3e-5, 3e-5, oblique=2e-5),
+        settling=DampedEstimate(moved=1.05, forms=1.05, shared=4.5e-6),
     ),
     Rung(
         "good",
         (
-            Choice(
+            MeshChoice(
                 GOOD,
                 TINY,
-                Factors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7, at_cutoff=1.0),
+                ErrorFactors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7, at_cutoff=1.0),
                 SETTLED,
             ),
             SLIM_GOOD,
-            Choice(
+            MeshChoice(
                 GOOD,
                 THIN,
-                Factors(
+                ErrorFactors(
                     0.69,
                     0.62,
                     3.7e-8,
@@ -496,22 +515,22 @@ RUNGS = (
                 SETTLED,
                 usual=2.5e-5,
             ),
-            Choice(
+            MeshChoice(
                 GOOD_MIDDLE,
                 0.6,
-                Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
+                ErrorFactors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
                 SETTLED,
             ),
-            Choice(
+            MeshChoice(
                 GOOD_WIDE,
                 0.7,
-                Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
+                ErrorFactors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
                 SETTLED,
             ),
             *ON_GOOD,
         ),
         1e-4,
-        alone=Factors(3.0, 3.0, 1e-6, 1e-6, oblique=1.5e-6),
+        alone=ErrorFactors(3.0, 3.0, 1e-6, 1e-6, oblique=1.5e-6),
     ),
     # what "fine" adds to "good" is lost on wide discs, whose gap it does not divide:
     # they go on to "finer"

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.homogeneous import Basis
+from metalens.modal.homogeneous import HomogeneousBasis
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Medium:
+class LayerMedium:
     """Numbers of one case in half pitches: k0 and the permittivities of disc and
     surroundings.
     """
@@ -55,14 +55,14 @@ class LayerModes:
     partner: np.ndarray
 
 
-def axial(square: np.ndarray) -> np.ndarray:
+def axial_wavenumber(square: np.ndarray) -> np.ndarray:
     """The root of q² that decays upwards, or goes up where it does neither."""
     q = np.sqrt(square + 0j)
     flip = (q.imag < 0) | ((np.abs(q.imag) <= 1e-9 * np.abs(q)) & (q.real < 0))
     return np.where(flip, -q, q)
 
 
-def electric_modes(basis: Basis, medium: Medium) -> LayerModes:
+def electric_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
     """Layer modes for u = E_t."""
     disc, around = medium.permittivities()
     n, a, k0 = basis.size, len(basis.te), medium.k0
@@ -84,11 +84,11 @@ def electric_modes(basis: Basis, medium: Medium) -> LayerModes:
     partner = vectors.copy()
     partner[a:] = -shrink @ vectors[a:]
     return LayerModes(
-        axial(-1 / value), vectors / both[:, None], partner * both[:, None]
+        axial_wavenumber(-1 / value), vectors / both[:, None], partner * both[:, None]
     )
 
 
-def magnetic_modes(basis: Basis, medium: Medium) -> LayerModes:
+def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
     """Layer modes for u = H_t."""
     disc, around = (1 / e for e in medium.permittivities())
     n, a, k0 = basis.size, len(basis.te), medium.k0
@@ -109,5 +109,7 @@ def magnetic_modes(basis: Basis, medium: Medium) -> LayerModes:
     problem[a:] = -((scale / k0) ** 2)[:, None] * growth[a:]
     value, vectors = np.linalg.eig(problem)
     return LayerModes(
-        axial(-1 / value), vectors / both[:, None], both[:, None] * (growth @ vectors)
+        axial_wavenumber(-1 / value),
+        vectors / both[:, None],
+        both[:, None] * (growth @ vectors),
     )

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.dense import below, cholesky
+from metalens.modal.dense import cholesky_factor, solve_lower
 from metalens.modal.few_modes import FewModes
-from metalens.modal.homogeneous import Basis
-from metalens.modal.layer import LayerModes, axial
-from metalens.modal.pencil import Pencil
+from metalens.modal.homogeneous import HomogeneousBasis
+from metalens.modal.layer import LayerModes, axial_wavenumber
+from metalens.modal.pencil import LayerPencil
 
 # relative distance of k² from its cutoff within which an order takes its exact
 # wavenumber
@@ -41,7 +41,7 @@ class HalfSpace:
 
 
 def half_space(
-    basis: Basis,
+    basis: HomogeneousBasis,
     k0: float,
     permittivity: float,
     *,
@@ -59,7 +59,7 @@ def half_space(
     square = np.concatenate([basis.te_exact, basis.tm_exact])
     if bloch is not None:
         square = near_cutoff(square, k0**2 * permittivity, bloch)
-    kz = axial(k0**2 * permittivity - square)
+    kz = axial_wavenumber(k0**2 * permittivity - square)
     kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
     a = len(basis.te)
     te, tm = (1 / permittivity, 1.0) if magnetic else (1.0, permittivity)
@@ -81,7 +81,7 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     )
     if not len(close):
         return square
-    exact = lattice(cutoff, bloch)
+    exact = lattice_wavenumbers(cutoff, bloch)
     nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
     known = np.abs(nearest - square[close]) < KNOWN * nearest
     out = square.copy()
@@ -89,19 +89,19 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     return out
 
 
-def nearness(cutoff: float, bloch: float) -> float:
+def cutoff_proximity(cutoff: float, bloch: float) -> float:
     """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over
     the distance, to 0 at ``NEAR``.
 
     An admittance answers to the error of a wavenumber squared as one over its distance
     from the cutoff.
     """
-    exact = lattice(cutoff, bloch)
+    exact = lattice_wavenumbers(cutoff, bloch)
     apart = float(np.abs(exact[exact > bloch**2 * (1 + 1e-9)] / cutoff - 1).min())
     return min(1.0, max(0.0, (NEAR / max(apart, AT) - 1) / (NEAR / AT - 1)))
 
 
-def lattice(cutoff: float, bloch: float) -> np.ndarray:
+def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
     """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
     reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
     along, across = (
@@ -113,7 +113,7 @@ def lattice(cutoff: float, bloch: float) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Interface:
+class LayerInterface:
     """One end of the layer, seen by its carrying modes and by the propagating orders
     (power-normalised).
 
@@ -131,7 +131,9 @@ class Interface:
     inward: np.ndarray
 
 
-def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interface:
+def layer_interface(
+    layer: LayerModes, carry: np.ndarray, half: HalfSpace
+) -> LayerInterface:
     """Blocks at a half-space, from all modes of the layer."""
     admittance, ports = half.admittance, half.ports
     rate, c = 1j * layer.q, len(carry)
@@ -140,24 +142,26 @@ def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interfac
     )
     real = np.isrealobj(layer.field)
     near_rate = -np.abs(rate) if real else rate
-    near = decaying(admittance) if real else admittance
+    near = real_admittance(admittance) if real else admittance
     inward = np.linalg.solve(
         layer.partner * near_rate + near[:, None] * layer.field, columns
     )
-    return mended(
+    return correct_stand_ins(
         columns.T @ (layer.field @ inward),
         inward,
         columns[:, :c].T @ layer.field[:, carry],
-        Rates(rate[carry], near_rate[carry], admittance[ports], near[ports]),
+        InterfaceRates(rate[carry], near_rate[carry], admittance[ports], near[ports]),
     )
 
 
-def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface:
+def few_interface(
+    pencil: LayerPencil, modes: FewModes, half: HalfSpace
+) -> LayerInterface:
     """Blocks at a half-space, from the modes that carry and the real admittance of all
     others.
     """
     admittance = 1 / half.admittance if pencil.dual else half.admittance
-    near, ports = decaying(admittance, dual=pencil.dual), half.ports
+    near, ports = real_admittance(admittance, dual=pencil.dual), half.ports
     a, c = len(pencil.te), len(modes.q)
     operator = modes.near.copy()
     pencil.te_turn.onto(operator[:a, :a], near[:a])
@@ -171,7 +175,7 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
     partner = modes.partner
     parts = [partner.real, partner.imag] if np.iscomplexobj(partner) else [partner]
     columns = np.concatenate([*parts, fed], 1)
-    found = eliminated(operator, a, columns, first=not pencil.dual)
+    found = solve_symmetric(operator, a, columns, first=not pencil.dual)
     green = columns.T @ found
     if len(parts) == 2:
         whole = np.zeros((2 * c + len(ports), c + len(ports)), complex)
@@ -181,17 +185,17 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
             np.eye(len(ports)),
         )
         green, found = whole.T @ green @ whole, found @ whole
-    return mended(
+    return correct_stand_ins(
         green,
         found,
         partner.T @ modes.field,
-        Rates(
+        InterfaceRates(
             1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]
         ),
     )
 
 
-def eliminated(
+def solve_symmetric(
     operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool
 ) -> np.ndarray:
     """operator⁻¹ columns, symmetric: the definite block goes first, in three quarters
@@ -202,19 +206,26 @@ def eliminated(
     """
     if not first:
         swapped, fed = np.roll(-operator, (-a, -a), (0, 1)), np.roll(-columns, -a, 0)
-        return np.roll(eliminated(swapped, len(operator) - a, fed, first=True), a, 0)
+        return np.roll(
+            solve_symmetric(swapped, len(operator) - a, fed, first=True), a, 0
+        )
     try:
-        lower = cholesky(-operator[:a, :a])
+        lower = cholesky_factor(-operator[:a, :a])
     except np.linalg.LinAlgError:
         return np.linalg.solve(operator, columns)
-    across, fed = below(lower, operator[:a, a:]), below(lower, columns[:a])
+    across, fed = (
+        solve_lower(lower, operator[:a, a:]),
+        solve_lower(lower, columns[:a]),
+    )
     rest = np.linalg.solve(
         operator[a:, a:] + across.T @ across, columns[a:] + across.T @ fed
     )
-    return np.concatenate([below(lower, across @ rest - fed, transposed=True), rest])
+    return np.concatenate(
+        [solve_lower(lower, across @ rest - fed, transposed=True), rest]
+    )
 
 
-def decaying(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
+def real_admittance(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
     """Real stand-in: the admittances that decay, and for those that propagate their
     size with the sign that the
     stand-in of a travelling layer mode has, so that the two cannot cancel: plus in the
@@ -225,7 +236,7 @@ def decaying(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rates:
+class InterfaceRates:
     """i q of the carrying modes and the admittances of the ports: true, and as the
     operator holds them.
     """
@@ -236,9 +247,9 @@ class Rates:
     near_port: np.ndarray
 
 
-def mended(
-    green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: Rates
-) -> Interface:
+def correct_stand_ins(
+    green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: InterfaceRates
+) -> LayerInterface:
     """Blocks from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports,
     its stand-ins put right.
 
@@ -257,7 +268,7 @@ def mended(
     root = np.sqrt(rates.port)
     weight = 2 * np.concatenate([rates.mode, root])
     arrive = np.linalg.solve(norm, green[:c]) * weight
-    return Interface(
+    return LayerInterface(
         reflect=arrive[:, :c] - np.eye(c),
         enter=arrive[:, c:],
         leave=root[:, None] * green[c:, :c] * weight[:c],
@@ -267,7 +278,7 @@ def mended(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Match:
+class ScatteringMatch:
     """Scattering matrix over the ports of both sides, below first, and what it was made
     from.
 
@@ -281,8 +292,8 @@ class Match:
     matrix: np.ndarray
     carry: np.ndarray
     travel: np.ndarray
-    foot: Interface
-    top: Interface
+    foot: LayerInterface
+    top: LayerInterface
     round_trip: np.ndarray
     amplitude: np.ndarray
 
@@ -311,7 +322,7 @@ class Match:
         return out
 
 
-def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
+def exchange_waves(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
     """[[0, foot x], [top x, 0]]: waves that crossed the layer meet the other end."""
     c = len(x)
     out = np.zeros((len(foot) + len(top), 2 * c), complex)
@@ -319,48 +330,58 @@ def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
     return out
 
 
-def scattering(
+def scattering_matrix(
     layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
-) -> Match:
+) -> ScatteringMatch:
     """Match both ends of all modes: the matrix is symmetric, and unitary where
     lossless.
     """
     travel = np.exp(1j * layer.q * height)
     carry = np.flatnonzero(np.abs(travel) > CARRY)
-    return joined(
-        interface(layer, carry, below),
-        interface(layer, carry, above),
+    return join_interfaces(
+        layer_interface(layer, carry, below),
+        layer_interface(layer, carry, above),
         carry,
         travel[carry],
     )
 
 
 def few_scattering(
-    pencil: Pencil, modes: FewModes, height: float, below: HalfSpace, above: HalfSpace
-) -> Match:
+    pencil: LayerPencil,
+    modes: FewModes,
+    height: float,
+    below: HalfSpace,
+    above: HalfSpace,
+) -> ScatteringMatch:
     """As ``scattering``, from few modes; ``carry`` counts them, and ``inward`` is in
     the pencil's coordinates.
     A dual unknown inverts the admittances of the half-spaces, and the reflection
     changes its sign.
     """
     foot, top = few_interface(pencil, modes, below), few_interface(pencil, modes, above)
-    return joined(foot, top, np.arange(len(modes.q)), np.exp(1j * modes.q * height))
+    return join_interfaces(
+        foot, top, np.arange(len(modes.q)), np.exp(1j * modes.q * height)
+    )
 
 
-def joined(foot: Interface, top: Interface, carry: np.ndarray, x: np.ndarray) -> Match:
+def join_interfaces(
+    foot: LayerInterface, top: LayerInterface, carry: np.ndarray, x: np.ndarray
+) -> ScatteringMatch:
     """Round trips of the carrying modes, with factors x, between both interfaces."""
     c, n = len(carry), len(foot.back)
-    round_trip = np.eye(2 * c) - swap(foot.reflect, top.reflect, x)
+    round_trip = np.eye(2 * c) - exchange_waves(foot.reflect, top.reflect, x)
     source = np.zeros((2 * c, n + len(top.back)), complex)
     source[:c, :n], source[c:, n:] = foot.enter, top.enter
     amplitude = np.linalg.solve(round_trip, source)
-    matrix = swap(foot.leave, top.leave, x) @ amplitude
+    matrix = exchange_waves(foot.leave, top.leave, x) @ amplitude
     matrix[:n, :n] += foot.back
     matrix[n:, n:] += top.back
-    return Match(matrix, carry, x, foot, top, round_trip, amplitude)
+    return ScatteringMatch(matrix, carry, x, foot, top, round_trip, amplitude)
 
 
-def zero_order(basis: Basis, half: HalfSpace, wavenumber: float, *, te: bool) -> int:
+def zero_order(
+    basis: HomogeneousBasis, half: HalfSpace, wavenumber: float, *, te: bool
+) -> int:
     """Position among the ports of the order with the given transverse wavenumber."""
     a = len(basis.te)
     family = basis.te_exact if te else basis.tm_exact

@@ -21,7 +21,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.modal.shapes import Interval, Square, plain, rim, square
+from metalens.modal.shapes import (
+    IntervalBasis,
+    SquareBasis,
+    polynomial_interval,
+    rim_interval,
+    square_basis,
+)
 
 X0, X1, Y0, Y1 = (
     1,
@@ -55,7 +61,7 @@ class MeshPlan:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Patch:
+class MeshPatch:
     """Elements that share one reference basis. Jacobians are (elements, points, 2)
     arrays of (x, y).
 
@@ -65,7 +71,7 @@ class Patch:
     vector, scalar: (copies, elements, functions) global numbers of the functions.
     """
 
-    basis: Square
+    basis: SquareBasis
     inside: bool
     rho_xi: np.ndarray
     rho_eta: np.ndarray
@@ -76,13 +82,13 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mesh:
+class DiscMesh:
     """Patches and the global numbering; ``vector_wall`` and ``scalar_wall`` hold the
     wall bits of each function.
     """
 
     plan: MeshPlan
-    patches: tuple[Patch, ...]
+    patches: tuple[MeshPatch, ...]
     vector_wall: np.ndarray
     scalar_wall: np.ndarray
 
@@ -90,7 +96,7 @@ class Mesh:
 Vertex = tuple[str, int, int]
 
 
-class Numbering:
+class FunctionNumbering:
     """Hands out global numbers for functions on vertices, edges and interiors; records
     the walls they lie on.
     """
@@ -191,7 +197,7 @@ def ring_vertex(side: str, ring: int, j: int, n: int) -> Vertex:
     return ("diagonal", ring, 0) if j == n else (side, ring, j)
 
 
-def core_patch(plan: MeshPlan, numbers: Numbering) -> Patch:
+def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
     """Bilinear quadrilateral with corners (0, 0), (a, 0), (c, c), (0, a), cut along
     both parameters.
     """
@@ -199,7 +205,7 @@ def core_patch(plan: MeshPlan, numbers: Numbering) -> Patch:
     excess = 0.8 * a - a
     cuts = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
-    line = plain(plan.angular, plan.angular + 4)
+    line = polynomial_interval(plan.angular, plan.angular + 4)
     s = line.point
     along_u, along_v, vectors, scalars = [], [], [], []
     for i in range(n):
@@ -220,8 +226,8 @@ def core_patch(plan: MeshPlan, numbers: Numbering) -> Patch:
             scalars.append(numbered[1])
     xi, eta = np.array(along_u), np.array(along_v)
     zero = np.zeros_like(xi)
-    return Patch(
-        square(line, line),
+    return MeshPatch(
+        square_basis(line, line),
         True,
         xi,
         eta,
@@ -250,8 +256,13 @@ def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray
 
 
 def ring_patch(
-    plan: MeshPlan, numbers: Numbering, rings: range, *, inside: bool, radial: Interval
-) -> Patch:
+    plan: MeshPlan,
+    numbers: FunctionNumbering,
+    rings: range,
+    *,
+    inside: bool,
+    radial: IntervalBasis,
+) -> MeshPatch:
     """Elements of the given rings (counted from the core), both sides; the Jacobians
     are those of side A.
     """
@@ -259,7 +270,7 @@ def ring_patch(
     first = 0 if inside else len(plan.inner)
     cuts = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
-    angular = plain(plan.angular, plan.angular + 5)
+    angular = polynomial_interval(plan.angular, plan.angular + 5)
     jacobians: list[tuple[np.ndarray, ...]] = []
     vectors: list[list[list[int]]] = [[], []]
     scalars: list[list[list[int]]] = [[], []]
@@ -298,8 +309,8 @@ def ring_patch(
                 vectors[copy].append(numbered[0])
                 scalars[copy].append(numbered[1])
     parts = [np.array(part) for part in zip(*jacobians, strict=True)]
-    return Patch(
-        square(radial, angular),
+    return MeshPatch(
+        square_basis(radial, angular),
         inside,
         parts[0],
         parts[1],
@@ -311,33 +322,33 @@ def ring_patch(
 
 
 @lru_cache(maxsize=32)
-def build(plan: MeshPlan) -> Mesh:
+def build_mesh(plan: MeshPlan) -> DiscMesh:
     """All patches of a plan; cached, as they do not depend on the diameter."""
     inner, outer = len(plan.inner), len(plan.outer)
-    numbers = Numbering(inner + outer, len(plan.sectors))
+    numbers = FunctionNumbering(inner + outer, len(plan.sectors))
     points = plan.radial + 24  # of the graded rule: masses to 1e-13
-    smooth = plain(plan.radial, plan.radial + 5)
+    smooth = polynomial_interval(plan.radial, plan.radial + 5)
     patches = [core_patch(plan, numbers)]
     if inner > 1:
         patches.append(
             ring_patch(plan, numbers, range(inner - 1), inside=True, radial=smooth)
         )
-    towards = rim(plan.radial, points, plan.exponents, True)
+    towards = rim_interval(plan.radial, points, plan.exponents, True)
     patches.append(
         ring_patch(plan, numbers, range(inner - 1, inner), inside=True, radial=towards)
     )
-    away = rim(plan.outside, points, plan.exponents, False)
+    away = rim_interval(plan.outside, points, plan.exponents, False)
     patches.append(
         ring_patch(plan, numbers, range(inner, inner + 1), inside=False, radial=away)
     )
     if outer > 1:
-        far = plain(plan.outside, plan.outside + 5)
+        far = polynomial_interval(plan.outside, plan.outside + 5)
         patches.append(
             ring_patch(
                 plan, numbers, range(inner + 1, inner + outer), inside=False, radial=far
             )
         )
-    return Mesh(
+    return DiscMesh(
         plan,
         tuple(patches),
         np.array(numbers.vector_wall),

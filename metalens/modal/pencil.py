@@ -26,16 +26,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.modal.dense import (
-    added,
-    below,
-    cholesky,
+    add_diagonal,
+    cholesky_factor,
     definite_inverse,
-    eigenvectors,
-    gram,
-    whitened,
+    gram_matrix,
+    solve_lower,
+    symmetric_eigenvectors,
+    whitened_levels,
 )
-from metalens.modal.homogeneous import Basis
-from metalens.modal.layer import Medium
+from metalens.modal.homogeneous import HomogeneousBasis
+from metalens.modal.layer import LayerMedium
 
 # levels up to this many times the most that permittivities add to a diagonal are
 # diagonalised
@@ -43,7 +43,7 @@ LOW = 32.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Turn:
+class CoordinateTurn:
     """Fields of y in the homogeneous basis, square: of the first alone ``low`` (m, m),
     of each other ``beyond`` times
     itself; size: of all."""
@@ -81,7 +81,7 @@ class Turn:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pencil:
+class LayerPencil:
     """Real and symmetric; see the module.
 
     te (a,), tm (b,): levels. te_sign, tm_sign: of growth. coupling: (a, b).
@@ -96,14 +96,14 @@ class Pencil:
     te_sign: np.ndarray
     tm_sign: np.ndarray
     coupling: np.ndarray
-    te_turn: Turn
-    tm_turn: Turn
+    te_turn: CoordinateTurn
+    tm_turn: CoordinateTurn
     te_rest: np.ndarray | None
     tm_rest: np.ndarray | None
     dual: bool
 
 
-def lossless(medium: Medium) -> bool:
+def is_lossless(medium: LayerMedium) -> bool:
     """Whether the layer is one of positive real permittivities, as the definite blocks
     need.
     """
@@ -121,7 +121,7 @@ def low_levels(
     square: rising. Of the matrix the lower triangle counts.
     """
     m, n = max(1, int(np.searchsorted(square, LOW * most))), len(square)
-    low, vectors = eigenvectors(matrix[:m, :m])
+    low, vectors = symmetric_eigenvectors(matrix[:m, :m])
     level = np.concatenate([low, matrix.diagonal()[m:]])
     rest = np.zeros((n, n))
     rest[m:, :m] = matrix[m:, :m] @ vectors
@@ -129,7 +129,7 @@ def low_levels(
     return level, vectors, rest + rest.T
 
 
-def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
+def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil:
     """u = E_t: growth = diag(1, (scalar_eps⁻¹ tm / k0² - 1)⁻¹ negative), stiffness =
     curl - k0² mass_eps.
     """
@@ -140,48 +140,48 @@ def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
         medium.k0**2,
         float((medium.disc - medium.around).real),
     )
-    first = added(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
+    first = add_diagonal(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
     te, te_low, rest = low_levels(first, basis.te, k2 * abs(step))
-    second = added(k2 * step * basis.disc_mass[a:, a:], k2 * around)
-    scalar = cholesky(added(step * basis.disc_scalar, around))
-    rise = below(scalar, np.diag(np.sqrt(basis.tm / k2)))
-    tm, tm_turn = whitened(second, added(gram(rise), -1.0))
-    turn = Turn(te_low, a)
+    second = add_diagonal(k2 * step * basis.disc_mass[a:, a:], k2 * around)
+    scalar = cholesky_factor(add_diagonal(step * basis.disc_scalar, around))
+    rise = solve_lower(scalar, np.diag(np.sqrt(basis.tm / k2)))
+    tm, tm_turn = whitened_levels(second, add_diagonal(gram_matrix(rise), -1.0))
+    turn = CoordinateTurn(te_low, a)
     coupling = turn.down(-k2 * step * basis.disc_mass[:a, a:] @ tm_turn)
-    return Pencil(
+    return LayerPencil(
         te,
         tm,
         np.ones(a),
         -np.sign(tm),
         coupling,
         turn,
-        Turn(tm_turn, b),
+        CoordinateTurn(tm_turn, b),
         rest,
         None,
         dual=False,
     )
 
 
-def magnetic_pencil(basis: Basis, medium: Medium) -> Pencil:
+def magnetic_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil:
     """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ -
     diag(0, tm / k0²).
     """
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
     a, b, k2 = len(basis.te), len(basis.tm), medium.k0**2
-    weighted = definite_inverse(added((disc - around) * basis.disc_mass, around))
-    curl = added((disc - around) * basis.disc_curl, around * basis.te - k2)
-    te, te_turn = whitened(weighted[:a, :a], curl)
-    second = added(-k2 * weighted[a:, a:], basis.tm)
+    weighted = definite_inverse(add_diagonal((disc - around) * basis.disc_mass, around))
+    curl = add_diagonal((disc - around) * basis.disc_curl, around * basis.te - k2)
+    te, te_turn = whitened_levels(weighted[:a, :a], curl)
+    second = add_diagonal(-k2 * weighted[a:, a:], basis.tm)
     tm, tm_low, rest = low_levels(second, basis.tm, k2 * abs(1 / disc - 1 / around))
-    turn = Turn(tm_low * medium.k0, b, medium.k0)
+    turn = CoordinateTurn(tm_low * medium.k0, b, medium.k0)
     coupling = turn.down(weighted[a:, :a] @ te_turn).T
-    return Pencil(
+    return LayerPencil(
         te,
         tm,
         np.sign(te),
         -np.ones(b),
         coupling,
-        Turn(te_turn, a),
+        CoordinateTurn(te_turn, a),
         turn,
         None,
         rest,

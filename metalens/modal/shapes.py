@@ -27,7 +27,7 @@ RIM_POWER = 10
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Interval:
+class IntervalBasis:
     """Functions of one element axis at quadrature points.
 
     point, weight: (n,) of the rule on [0, 1].
@@ -46,21 +46,21 @@ class Interval:
         return len(self.slope)
 
 
-def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+def gauss_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre points and weights on [0, 1]."""
     x, w = np.polynomial.legendre.leggauss(n)
     return (x + 1) / 2, w / 2
 
 
-def graded(n: int) -> tuple[np.ndarray, np.ndarray]:
+def graded_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
     """A rule on [0, 1] for integrands that are polynomials of ``s**(1 / RIM_POWER)``
     and vary smoothly in s.
     """
-    t, w = gauss(n)
+    t, w = gauss_rule(n)
     return t**RIM_POWER, w * RIM_POWER * t ** (RIM_POWER - 1)
 
 
-def polynomials(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def polynomial_basis(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (degree + 1, n) and slopes (degree, n) of the polynomial basis at points
     s.
     """
@@ -73,26 +73,26 @@ def polynomials(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=64)
-def plain(degree: int, points: int) -> Interval:
+def polynomial_interval(degree: int, points: int) -> IntervalBasis:
     """Polynomials only, on a Gauss rule."""
-    s, w = gauss(points)
-    return Interval(s, w, *polynomials(degree, s))
+    s, w = gauss_rule(points)
+    return IntervalBasis(s, w, *polynomial_basis(degree, s))
 
 
 @lru_cache(maxsize=64)
-def rim(
+def rim_interval(
     degree: int, points: int, exponents: tuple[float, ...], at_end: bool
-) -> Interval:
+) -> IntervalBasis:
     """Polynomials and rim bubbles ``d**tau - d``, d the distance to s = 0, or to s = 1
     if ``at_end``.
 
     The slope of each bubble is made orthonormal to the slopes before it, which keeps
     the matrices well conditioned.
     """
-    d, w = graded(points)
-    value, slope = polynomials(degree, 1 - d if at_end else d)
-    fine, fine_weight = graded(80)
-    fine_slope = polynomials(degree, 1 - fine if at_end else fine)[1]
+    d, w = graded_rule(points)
+    value, slope = polynomial_basis(degree, 1 - d if at_end else d)
+    fine, fine_weight = graded_rule(80)
+    fine_slope = polynomial_basis(degree, 1 - fine if at_end else fine)[1]
     side = -1.0 if at_end else 1.0
     for tau in exponents:
         bubble, rate = d**tau - d, side * (tau * d ** (tau - 1) - 1)
@@ -110,11 +110,11 @@ def rim(
             np.vstack([slope, rate / norm]),
         )
         fine_slope = np.vstack([fine_slope, fine_rate / norm])
-    return Interval(1 - d if at_end else d, w, value, slope)
+    return IntervalBasis(1 - d if at_end else d, w, value, slope)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Square:
+class SquareBasis:
     """Tensor products on the unit square, flattened: functions first, then quadrature
     points (xi slow, eta fast).
 
@@ -134,7 +134,7 @@ class Square:
     gradient: np.ndarray
 
 
-def difference(degree: int) -> np.ndarray:
+def derivative_matrix(degree: int) -> np.ndarray:
     """(degree, degree + 1): derivative of values in terms of slopes."""
     d = np.zeros((degree, degree + 1))
     d[0, 0] = -1.0
@@ -143,7 +143,7 @@ def difference(degree: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def square(xi: Interval, eta: Interval) -> Square:
+def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
     """The element basis made of two interval bases; vector functions along xi come
     first.
     """
@@ -153,8 +153,13 @@ def square(xi: Interval, eta: Interval) -> Square:
         return flat
 
     px, py = xi.degree, eta.degree
-    dx, dy, one_x, one_y = difference(px), difference(py), np.eye(px), np.eye(py)
-    return Square(
+    dx, dy, one_x, one_y = (
+        derivative_matrix(px),
+        derivative_matrix(py),
+        np.eye(px),
+        np.eye(py),
+    )
+    return SquareBasis(
         weight=np.outer(xi.weight, eta.weight).ravel(),
         along_xi=product(xi.slope, eta.value),
         along_eta=product(xi.value, eta.slope),

@@ -21,15 +21,20 @@ import numpy as np
 import scipy.linalg as sl
 import scipy.sparse
 
-from metalens.modal.assembly import Geometry, Part, assemble, gradient
-from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build
+from metalens.modal.assembly import (
+    AssembledDisc,
+    CellMatrices,
+    assemble_disc,
+    gradient_matrix,
+)
+from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build_mesh
 
 PHASE_STEP = 0.25  # rad: phases that share a choice of cotree
 TYPICAL = 0.5  # pitches: disc whose mass weighs the choice
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Selection:
+class FunctionSelection:
     """Which quarter-cell functions carry the unknowns, for the real and the imaginary
     part.
 
@@ -67,9 +72,9 @@ class Selection:
         return np.concatenate([picked[:first], second, picked[first:]])
 
 
-def select(
+def select_functions(
     wall: np.ndarray, *, electric: bool, half_phase_rad: float | None
-) -> Selection:
+) -> FunctionSelection:
     """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with
     electric x walls for None.
     """
@@ -77,10 +82,10 @@ def select(
     at_start, at_end = (wall & X0) != 0, (wall & X1) != 0
     inside = np.flatnonzero(free & ~at_start & ~at_end)
     if half_phase_rad is None:
-        return Selection(inside, len(inside), 0, 0, 0.0, 1.0)
+        return FunctionSelection(inside, len(inside), 0, 0, 0.0, 1.0)
     start, end = np.flatnonzero(free & at_start), np.flatnonzero(free & at_end)
     order = np.concatenate([inside, start, end])
-    return Selection(
+    return FunctionSelection(
         order,
         len(inside),
         len(start),
@@ -90,7 +95,9 @@ def select(
     )
 
 
-def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndarray:
+def restrict_matrix(
+    matrix: np.ndarray, rows: FunctionSelection, columns: FunctionSelection
+) -> np.ndarray:
     """The quarter-cell matrix acting on the real and imaginary parts of the unknowns.
 
     The half phase enters by the weights at x = pitch / 2.
@@ -113,7 +120,7 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndar
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Space:
+class SymmetryClass:
     """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase
     over half a pitch.
 
@@ -124,8 +131,8 @@ class Space:
     within_transposed: their rows of ``transposed``.
     """
 
-    cell: Part
-    disc: Part
+    cell: CellMatrices
+    disc: CellMatrices
     gradient: np.ndarray
     electric: bool
     half_phase_rad: float | None
@@ -136,13 +143,13 @@ class Space:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Topology:
+class ClassTopology:
     """What a symmetry class has for all diameters: its unknowns, and the rest as in
     ``Space``.
     """
 
-    vectors: Selection
-    scalars: Selection
+    vectors: FunctionSelection
+    scalars: FunctionSelection
     gradient: np.ndarray
     transposed: scipy.sparse.csr_array
     within: np.ndarray
@@ -150,48 +157,60 @@ class Topology:
 
 
 @lru_cache(maxsize=32)
-def topology(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> Topology:
+def class_topology(
+    plan: MeshPlan, electric: bool, half_phase_rad: float | None
+) -> ClassTopology:
     """See ``Topology``; cached, as it does not depend on the diameter."""
-    mesh = build(plan)
-    vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
-    scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
-    dense = restrict(gradient(plan), vectors, scalars)
+    mesh = build_mesh(plan)
+    vectors = select_functions(
+        mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad
+    )
+    scalars = select_functions(
+        mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad
+    )
+    dense = restrict_matrix(gradient_matrix(plan), vectors, scalars)
     reaches = np.zeros(len(mesh.scalar_wall), bool)
     for patch in mesh.patches:
         reaches[patch.scalar] |= patch.inside
     within = np.flatnonzero(scalars.unknowns(reaches))
     down_to = scipy.sparse.csr_array(dense.T)
-    return Topology(vectors, scalars, dense, down_to, within, down_to[within])
+    return ClassTopology(vectors, scalars, dense, down_to, within, down_to[within])
 
 
 @lru_cache(maxsize=32)
-def cotree(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> np.ndarray:
+def cotree_functions(
+    plan: MeshPlan, electric: bool, half_phase_rad: float | None
+) -> np.ndarray:
     """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a
     phase.
     """
-    known = topology(plan, electric, half_phase_rad)
+    known = class_topology(plan, electric, half_phase_rad)
     size = np.sqrt(
         np.diag(
-            restrict(assemble(TYPICAL, plan).cell.mass, known.vectors, known.vectors)
+            restrict_matrix(
+                assemble_disc(TYPICAL, plan).cell.mass, known.vectors, known.vectors
+            )
         )
     )
     pivots = sl.qr((size[:, None] * known.gradient).T, mode="r", pivoting=True)[1]
     return np.sort(pivots[known.scalars.size :])
 
 
-def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> Space:
+def build_symmetry_class(
+    geometry: AssembledDisc, *, electric: bool, half_phase_rad: float | None
+) -> SymmetryClass:
     """The symmetry class with electric or natural y walls, and the given Bloch phase
     over half a pitch.
     """
     plan = geometry.mesh.plan
-    known = topology(plan, electric, half_phase_rad)
+    known = class_topology(plan, electric, half_phase_rad)
     vectors, scalars = known.vectors, known.scalars
 
-    def part(p: Part) -> Part:
-        return Part(
-            restrict(p.mass, vectors, vectors),
-            restrict(p.curl, vectors, vectors),
-            restrict(p.scalar, scalars, scalars),
+    def part(p: CellMatrices) -> CellMatrices:
+        return CellMatrices(
+            restrict_matrix(p.mass, vectors, vectors),
+            restrict_matrix(p.curl, vectors, vectors),
+            restrict_matrix(p.scalar, scalars, scalars),
         )
 
     step = (
@@ -199,13 +218,13 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
         if half_phase_rad is None
         else (math.floor(half_phase_rad / PHASE_STEP) + 0.5) * PHASE_STEP
     )
-    return Space(
+    return SymmetryClass(
         part(geometry.cell),
         part(geometry.disc),
         known.gradient,
         electric,
         half_phase_rad,
-        cotree(plan, electric, step),
+        cotree_functions(plan, electric, step),
         known.transposed,
         known.within,
         known.within_transposed,

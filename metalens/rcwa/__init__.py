@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from metalens.rcwa.near import near_field as near_field
     from metalens.rcwa.near import near_fields as near_fields
     from metalens.rcwa.rates.verb import JonesDerivatives as JonesDerivatives
-    from metalens.rcwa.rates.verb import Rate as Rate
+    from metalens.rcwa.rates.verb import ParameterDerivative as ParameterDerivative
     from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
     from metalens.rcwa.reference import OrderResponse as OrderResponse
     from metalens.rcwa.reference import solve_textbook_rcwa as solve_textbook_rcwa
-    from metalens.rcwa.supercell import Row as Row
+    from metalens.rcwa.supercell import RowResponse as RowResponse
     from metalens.rcwa.supercell import block_of as block_of
     from metalens.rcwa.supercell import solve_row as solve_row
     from metalens.rcwa.verbs import solve as solve
@@ -58,10 +58,10 @@ __getattr__, __dir__, __all__ = attach(
         "jones": "any_shape",
         "jones_derivatives": "metalens.rcwa.rates.verb",
         "JonesDerivatives": "metalens.rcwa.rates.verb",
-        "Rate": "metalens.rcwa.rates.verb",
+        "ParameterDerivative": "metalens.rcwa.rates.verb",
         "NearField": "near",
         "most_harmonics": "any_shape",
-        "Row": "supercell",
+        "RowResponse": "supercell",
         "block_of": "supercell",
         "near_field": "near",
         "near_fields": "near",

@@ -26,8 +26,8 @@ import numpy as np
 
 from metalens.cell import Cell, Light, Response
 from metalens.ground.arrays import Array
-from metalens.rcwa.conditions import Case, case, check_diameter
-from metalens.rcwa.solver import farthest, truncated, wall_stages
+from metalens.rcwa.conditions import DiscCase, check_diameter, disc_case
+from metalens.rcwa.solver import largest_error, solve_truncated, wall_stages
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4
@@ -40,7 +40,7 @@ SHARE = 0.2  # of the tolerance, for the modal solves
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Anchors:
+class ReferencePillars:
     """Upright pillars without films: diameters (k,), (k, 2) t and r, and the largest
     error of them.
     """
@@ -51,7 +51,7 @@ class Anchors:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Shift:
+class DiameterShift:
     """Solution of (1) at one truncation: polynomial over the nodes, and what it leaves
     unexplained
     of t, root mean square."""
@@ -82,9 +82,9 @@ def solve_anchored(
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
     """
-    this, bare = (case(made, light) for made in (cell, plain(cell)))
+    this, bare = (disc_case(made, light) for made in (cell, upright_cell(cell)))
     nodes = node_diameters(cell, diameter_um)
-    anchors = Anchors(
+    anchors = ReferencePillars(
         np.array(nodes),
         np.array([(found.t, found.r) for found in upright]),
         max(found.t_error for found in upright),
@@ -92,8 +92,8 @@ def solve_anchored(
     stages, cut = wall_stages(this, np.array([diameter_um]), tolerance)
     found, left = [], []
     for reach in reaches:
-        shift = shifted(bare, anchors, reach)
-        one = truncated(this, np.array([diameter_um]), reach, stages, moved=shift)
+        shift = fit_diameter_shift(bare, anchors, reach)
+        one = solve_truncated(this, np.array([diameter_um]), reach, stages, moved=shift)
         found.append((one.t[0], one.r[0], one.energy[0]))
         left.append(shift.left)
         if len(found) < COMPARED:
@@ -113,7 +113,7 @@ def solve_anchored(
             np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
         )
     )
-    error = min(error, float(farthest(np.array([t, r]))))
+    error = min(error, float(largest_error(np.array([t, r]))))
     return Response(
         complex(t),
         complex(r),
@@ -126,7 +126,7 @@ def solve_anchored(
     )
 
 
-def plain(cell: Cell) -> Cell:
+def upright_cell(cell: Cell) -> Cell:
     """The cell with an upright wall, without films."""
     return dataclasses.replace(cell, sidewall_rad=0.0, under=(), over=())
 
@@ -146,7 +146,9 @@ def node_diameters(cell: Cell, diameter_um: float) -> tuple[float, ...]:
     return tuple((diameter_um + half * places).tolist())
 
 
-def shifted(bare: Case, anchors: Anchors, reach: int) -> Shift:
+def fit_diameter_shift(
+    bare: DiscCase, anchors: ReferencePillars, reach: int
+) -> DiameterShift:
     """(1) at every node."""
     shift = np.zeros_like(anchors.diameter_um)
     for _ in range(STEPS):
@@ -168,9 +170,9 @@ def shifted(bare: Case, anchors: Anchors, reach: int) -> Shift:
         if degree
         else np.polynomial.Polynomial(shift)
     )
-    return Shift(at, float(np.sqrt((left**2).mean())))
+    return DiameterShift(at, float(np.sqrt((left**2).mean())))
 
 
-def _amplitudes(bare: Case, diameter_um: Array, reach: int) -> Array:
-    found = truncated(bare, diameter_um, reach)
+def _amplitudes(bare: DiscCase, diameter_um: Array, reach: int) -> Array:
+    found = solve_truncated(bare, diameter_um, reach)
     return np.stack([found.t, found.r], axis=1)

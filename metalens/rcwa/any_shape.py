@@ -15,19 +15,25 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern, wall
-from metalens.rcwa.conditions import direction
+from metalens.rcwa.conditions import incidence_of
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import Operation
-from metalens.rcwa.problem import Problem, classes, problem, tangent, waves_of
+from metalens.rcwa.problem import (
+    CellProblem,
+    cell_problem,
+    symmetry_classes,
+    tangential_wave,
+    waves_of,
+)
 from metalens.rcwa.solver import (
     MOST_COMPARED,
     NARROWEST,
-    compared,
-    crowding,
-    farthest,
-    safety,
+    compared_truncations,
+    gap_factor,
+    largest_error,
+    safety_factor,
 )
-from metalens.rcwa.stack import respond
+from metalens.rcwa.stack import scatter_zero_order
 
 _FIRST = 3  # orders of the first truncation
 _LAST = {4: 15, 2: 10, 1: 9}  # by the number of operations: about a second a solve
@@ -37,7 +43,7 @@ _TILTED = {
     1: 6,
 }  # of tilted walls, whose collocation costs some hundred times as much: some seconds
 _COMPARED = 4
-SAFETY = 7.0  # the most that :func:`metalens.rcwa.solver.safety` gives
+SAFETY = 7.0  # the most that :func:`metalens.rcwa.solver.safety_factor` gives
 _ROUNDING = 1e-13
 _THIN = 1.0  # times more for walls of no width
 _COARSE = 3  # orders that suffice to see what the collocation of a tilted wall leaves
@@ -112,14 +118,16 @@ def jones(
         MaterialError: a wavelength outside the range of a material.
     """
     check_tolerance(tolerance)
-    this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
-    climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
-    stages, cut = collocation(this, climb, tolerance)
-    return climbed(climb, cut, tolerance, lambda reach: _truncated(this, reach, stages))
+    this = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
+    climb = truncation_sequence(this, harmonics, collocated=bool(cell.sidewall_rad))
+    stages, cut = choose_stages(this, climb, tolerance)
+    return refine_truncation(
+        climb, cut, tolerance, lambda reach: _truncated(this, reach, stages)
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class Ladder:
+class TruncationSequence:
     """Truncations to try, how many before the last an error looks at, and the factor on
     it for what none resolves.
 
@@ -127,7 +135,7 @@ class Ladder:
     crosses, holes, hollows. Walls of
     less than a fiftieth of the pitch are resolved by no truncation; there the factor
     rises to two, for gaps as
-    :func:`metalens.rcwa.solver.crowding` has it. Of 72 rings and crosses with walls of
+    :func:`metalens.rcwa.solver.gap_factor` has it. Of 72 rings and crosses with walls of
     0.004 to 0.2 pitches, at 7 to
     15 orders against 21, two of 648 errors lay above a bar that went by outlines alone,
     by up to 2.3 times; now none
@@ -142,7 +150,9 @@ class Ladder:
     crowded: float
 
 
-def ladder(this: Problem, harmonics: int | None, *, collocated: bool = False) -> Ladder:
+def truncation_sequence(
+    this: CellProblem, harmonics: int | None, *, collocated: bool = False
+) -> TruncationSequence:
     """Of one cell and light; harmonics: the largest truncation, in place of the one
     that takes about a second
     (or some, of walls that are collocated).
@@ -156,20 +166,23 @@ def ladder(this: Problem, harmonics: int | None, *, collocated: bool = False) ->
     gap = cell.gap_um(size_um)
     within = np.array(cell.outline(size_um).spans_um) / cell.pitch_um
     before = int(
-        max(compared(gap / cell.pitch_um), *compared(np.maximum(within, NARROWEST)))
+        max(
+            compared_truncations(gap / cell.pitch_um),
+            *compared_truncations(np.maximum(within, NARROWEST)),
+        )
     )
     last = _last(this.classes, collocated) if harmonics is None else harmonics
     first = (
         _FIRST + _COMPARED - before if harmonics is None else max(1, harmonics - before)
     )
     thin = 1 + _THIN * max(0.0, 1 - float(within.min()) / NARROWEST)
-    return Ladder(
-        range(first, last + 1), before, max(thin, float(crowding(gap, cell.pitch_um)))
+    return TruncationSequence(
+        range(first, last + 1), before, max(thin, float(gap_factor(gap, cell.pitch_um)))
     )
 
 
-def climbed(
-    climb: Ladder, cut: float, tolerance: float, at: Callable[[int], Jones]
+def refine_truncation(
+    climb: TruncationSequence, cut: float, tolerance: float, at: Callable[[int], Jones]
 ) -> Jones:
     """The result of the least truncation that meets the tolerance, or of the last; cut:
     what its collocation leaves.
@@ -179,10 +192,10 @@ def climbed(
     for reach in climb.reaches:
         found = at(reach)
         history.append(_both(found))
-        error = climb.crowded * moved(history, reach, before) + cut
+        error = climb.crowded * estimate_error(history, reach, before) + cut
         if len(history) > before and error <= tolerance:
             break
-    error = min(error, float(farthest(np.ravel(history[-1]))))
+    error = min(error, float(largest_error(np.ravel(history[-1]))))
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
     looked_at = [both[0] for both in history[-1 - before : -1]]
@@ -194,12 +207,16 @@ def climbed(
     )
 
 
-def collocation(this: Problem, climb: Ladder, tolerance: float) -> tuple[int, float]:
+def choose_stages(
+    this: CellProblem, climb: TruncationSequence, tolerance: float
+) -> tuple[int, float]:
     """Stages of a tilted wall and what they leave of t; (0, 0) for an upright one."""
     if not this.cell.sidewall_rad:
         return 0, 0.0
     coarse = min(climb.reaches[-1], _COARSE)
-    return wall.enough(lambda count: _both(_truncated(this, coarse, count)), tolerance)
+    return wall.choose_stage_count(
+        lambda count: _both(_truncated(this, coarse, count)), tolerance
+    )
 
 
 def _both(found: Jones) -> Array:
@@ -207,8 +224,8 @@ def _both(found: Jones) -> Array:
     return np.stack([found.t, found.r])
 
 
-def moved(history: list[Array], reach: int, before: int) -> float:
-    """Error of the last truncation: :func:`metalens.rcwa.solver.safety` times the
+def estimate_error(history: list[Array], reach: int, before: int) -> float:
+    """Error of the last truncation: :func:`metalens.rcwa.solver.safety_factor` times the
     farthest of those before it, of each
     what it tells of the last (:func:`_told`)."""
     earlier = history[-1 - before : -1][::-1]
@@ -219,7 +236,7 @@ def moved(history: list[Array], reach: int, before: int) -> float:
         ),
         default=1.0,
     )
-    return safety(reach) * farthest + _ROUNDING
+    return safety_factor(reach) * farthest + _ROUNDING
 
 
 def _told(reach: int, earlier: int) -> float:
@@ -243,7 +260,7 @@ def co_polarised(
         else None
     )
     if light.angle_rad:
-        place = ("s", "p").index(direction(light)[-1])
+        place = ("s", "p").index(incidence_of(light)[-1])
     elif place is None:  # p lies in the plane of incidence that the azimuth names
         turned = round(light.azimuth_rad / (math.pi / 2)) % 2
         place = turned if light.polarization == "p" else 1 - turned
@@ -273,7 +290,7 @@ def most_harmonics(
     where walls are tilted.
     """
     return _last(
-        classes(cell, size_um, tangent(1.0, angle_rad, azimuth_rad)),
+        symmetry_classes(cell, size_um, tangential_wave(1.0, angle_rad, azimuth_rad)),
         bool(cell.sidewall_rad),
     )
 
@@ -285,30 +302,31 @@ def _last(found: tuple[tuple[Operation, ...], ...], collocated: bool) -> int:
     ]
 
 
-def _truncated(this: Problem, reach: int, stages: int) -> Jones:
+def _truncated(this: CellProblem, reach: int, stages: int) -> Jones:
     """All polarisations at one truncation; stages: of the collocation of a tilted wall,
     0 for an upright one.
     """
     cell, size_um, light = this.cell, this.size_um, this.light
     t, r, energy = np.zeros((2, 2), complex), np.zeros((2, 2), complex), np.zeros(2)
     for operations in this.classes:
-        space = mirrors.orders(reach, pattern.frame(cell, operations))
+        space = mirrors.reduced_orders(reach, pattern.lattice_frame(cell, operations))
         ways, places = waves_of(space, cell, light)
-        operators = functools.partial(pattern.operators, space, ways, cell=cell)
-        walls = made.walls(cell, size_um, light.wavelength_um, operators)
+        operators = functools.partial(pattern.section_operators, space, ways, cell=cell)
+        walls = made.section_walls(cell, size_um, light.wavelength_um, operators)
         media, layers, between = this.media, [], None
         if stages:
-            between = functools.partial(wall.match, walls, stages=stages)
+            between = functools.partial(wall.match_walls, walls, stages=stages)
         else:
             symmetric = cell.outline(size_um).keeps(-1, -1)
             layers = [
-                modes.layer(*part.sample(0.5), symmetric=symmetric) for part in walls
+                modes.solve_eigenmodes(*part.sample(0.5), symmetric=symmetric)
+                for part in walls
             ]
             media = dataclasses.replace(
                 media, heights=tuple(part.reduced_height for part in walls)
             )
         for column, come in places.items():
-            found = respond(ways, media, layers, come[0], between=between)
+            found = scatter_zero_order(ways, media, layers, come[0], between=between)
             energy[column] = float(
                 (np.abs(found.t) ** 2).sum() + (np.abs(found.r) ** 2).sum()
             )
@@ -318,10 +336,10 @@ def _truncated(this: Problem, reach: int, stages: int) -> Jones:
                     sign * found.t[leave[0]],
                     sign * found.r[leave[0]],
                 )
-    return unjudged(this, reach, np.stack([t, r]), energy)
+    return without_error(this, reach, np.stack([t, r]), energy)
 
 
-def unjudged(this: Problem, reach: int, both: Array, energy: Array) -> Jones:
+def without_error(this: CellProblem, reach: int, both: Array, energy: Array) -> Jones:
     """One truncation as a record, before its error is known."""
     names = ("x", "y") if this.light.normal else ("s", "p")
     count = int(

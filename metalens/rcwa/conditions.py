@@ -9,14 +9,14 @@ from typing import Literal
 from metalens.cell import Cell, Film, Light, materials
 from metalens.ground.errors import CellError
 from metalens.rcwa.orders import basis as fourier
-from metalens.rcwa.orders.waves import Waves, waves
-from metalens.rcwa.stack import Media
+from metalens.rcwa.orders.waves import PlaneWaves, plane_waves
+from metalens.rcwa.stack import StackMedia
 
 _STRAIGHT = 1e-15  # cos or sin of an azimuth that lies in a mirror plane, to rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class DiscCase:
     """One wavelength, direction and polarisation of a cell, whatever the diameter.
 
     k0: 2 pi / wavelength_um.
@@ -38,10 +38,10 @@ class Case:
     wave: Literal["s", "p"]
     pillar: complex
     between: complex
-    media: Media
+    media: StackMedia
 
 
-def case(cell: Cell, light: Light) -> Case:
+def disc_case(cell: Cell, light: Light) -> DiscCase:
     """The case of a cell and a plane wave.
 
     Raises:
@@ -62,21 +62,21 @@ def case(cell: Cell, light: Light) -> Case:
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
         return tuple((index(film.material), film.thickness_um * k0) for film in stack)
 
-    media = Media(
+    media = StackMedia(
         index(cell.substrate),
         index(cell.cover),
         films(cell.under),
         films(cell.over),
         (cell.height_um * k0,),
     )
-    kx, ky, azimuth_rad, symmetry, wave = direction(light)
+    kx, ky, azimuth_rad, symmetry, wave = incidence_of(light)
     if media.substrate.real <= math.hypot(kx, ky):
         raise CellError(
             f"sin(angle_rad) = {math.hypot(kx, ky):.6g} in a substrate of n = {media.substrate.real:.6g}: the light "
             "cannot come from there; need a smaller angle_rad or another substrate"
         )
     pillar, between = index(cell.pillar), index(cell.fill)
-    return Case(
+    return DiscCase(
         cell,
         light.wavelength_um,
         k0,
@@ -91,12 +91,12 @@ def case(cell: Cell, light: Light) -> Case:
     )
 
 
-def case_waves(this: Case, harmonics: int) -> tuple[Waves, int]:
+def case_waves(this: DiscCase, harmonics: int) -> tuple[PlaneWaves, int]:
     """The waves of a case within ``harmonics`` orders, and the place of its incident
     wave.
     """
-    ways = waves(
-        fourier.basis(harmonics, this.symmetry),
+    ways = plane_waves(
+        fourier.disc_basis(harmonics, this.symmetry),
         pitch_um=this.cell.pitch_um,
         wavelength_um=this.wavelength_um,
         kx=this.kx,
@@ -131,7 +131,7 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
             )
 
 
-def direction(
+def incidence_of(
     light: Light,
 ) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
     """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into
@@ -168,6 +168,6 @@ def direction(
     return sine * c, sine * s, azimuth_rad, "none", wave
 
 
-def widening(cell: Cell) -> float:
+def taper_um(cell: Cell) -> float:
     """Change of the diameter in micrometres for each unit of lift."""
     return -2 * math.tan(cell.sidewall_rad) * cell.height_um

@@ -15,11 +15,11 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.rcwa.orders import basis as fourier
-from metalens.rcwa.orders.waves import Waves, normal_component
+from metalens.rcwa.orders.waves import PlaneWaves, normal_component
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Layer:
+class FourierModes:
     """Operators and modes of pillar layers; leading axes are a batch of diameters.
 
     P, Q: (*batch, n, n) u' = i P w, w' = i Q u.
@@ -37,7 +37,7 @@ class Layer:
     symmetric: bool = True
 
 
-def layer(P: Array, Q: Array, *, symmetric: bool = True) -> Layer:
+def solve_eigenmodes(P: Array, Q: Array, *, symmetric: bool = True) -> FourierModes:
     """The modes of a layer with these operators. Everything stays real where nothing
     absorbs, but for q and V.
     """
@@ -50,13 +50,15 @@ def layer(P: Array, Q: Array, *, symmetric: bool = True) -> Layer:
     order = np.argsort(q.imag, axis=-1, kind="stable")
     q = np.take_along_axis(q, order, axis=-1)
     W = np.take_along_axis(W, order[..., None, :], axis=-1)
-    return Layer(P, Q, q, W, (Q @ W) / q[..., None, :], symmetric)
+    return FourierModes(P, Q, q, W, (Q @ W) / q[..., None, :], symmetric)
 
 
 _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincide
 
 
-def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
+def film_layer(
+    ways: PlaneWaves, index: complex, *, symmetric: bool = True
+) -> FourierModes:
     """A homogeneous layer with its plane waves as modes, the longest-lived first.
 
     symmetric: whether P and Q of all layers that it is matched with are.
@@ -66,7 +68,7 @@ def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
     is_p = np.arange(len(kz)) < ways.p_count
     P, Q = np.where(is_p, kz**2 / index**2, 1.0), np.where(is_p, index**2, kz**2)
     order = np.argsort(kz.imag, kind="stable")
-    return Layer(
+    return FourierModes(
         np.diag(P),
         np.diag(Q),
         kz[order],
@@ -76,26 +78,31 @@ def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
     )
 
 
-def operators(
-    ways: Waves, diameter_um: Array, pitch_um: float, pillar: complex, between: complex
+def disc_operators(
+    ways: PlaneWaves,
+    diameter_um: Array,
+    pitch_um: float,
+    pillar: complex,
+    between: complex,
 ) -> tuple[Array, Array]:
     """P and Q of :mod:`metalens.rcwa.orders.waves` for a batch of diameters; real where
     nothing absorbs (exp(-iwt)).
     """
     space = ways.space
-    shape = fourier.disc(space, diameter_um, pitch_um)
+    shape = fourier.disc_coefficients(space, diameter_um, pitch_um)
     inside, outside = _real_if_lossless(pillar**2, between**2)
     start = space.shells == 0
     direct = (inside - outside) * shape + outside * start
     inverse = (1 / inside - 1 / outside) * shape + start / outside
     ex, ey = (
-        factored(space, direct, inverse, link) for link in (fourier.EX, fourier.EY)
+        factorised_permittivity(space, direct, inverse, link)
+        for link in (fourier.EX, fourier.EY)
     )
-    E = join(
+    E = join_blocks(
         ways,
         (ex[0], ey[0]),
         (ex[1], ey[1]),
-        fourier.normals(space, diameter_um, pitch_um),
+        fourier.disc_normal_matrices(space, diameter_um, pitch_um),
     )
     s = np.arange(ways.p_count, len(ways.kappa))
     E[..., s, s] -= ways.kappa[s] ** 2
@@ -105,22 +112,24 @@ def operators(
     kappa = ways.kappa[z]
     P[..., z, z] -= (
         kappa[:, None]
-        * np.linalg.inv(fourier.products(space, direct, fourier.EZ))
+        * np.linalg.inv(fourier.toeplitz_matrix(space, direct, fourier.EZ))
         * kappa
     )
     return P, E
 
 
-def factored(
-    space: fourier.Basis, direct: Array, inverse: Array, link: int
+def factorised_permittivity(
+    space: fourier.DiscBasis, direct: Array, inverse: Array, link: int
 ) -> tuple[Array, Array]:
     """[eps] and Delta = [eps] - [1/eps]^-1 in the orders of Ex or Ey."""
-    laurent = fourier.products(space, direct, link)
-    return laurent, laurent - np.linalg.inv(fourier.products(space, inverse, link))
+    laurent = fourier.toeplitz_matrix(space, direct, link)
+    return laurent, laurent - np.linalg.inv(
+        fourier.toeplitz_matrix(space, inverse, link)
+    )
 
 
-def join(
-    ways: Waves,
+def join_blocks(
+    ways: PlaneWaves,
     laurent: tuple[Array, Array],
     delta: tuple[Array, Array],
     normal: tuple[Array, ...],

@@ -13,40 +13,43 @@ from metalens.cell import Cell, Layer
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import pattern
-from metalens.rcwa.wall import Sample, Wall
+from metalens.rcwa.wall import Sample, TiltedWall
 
 # cross-sections of a tilted wall: coefficients turn by a few radians between foot and
 # top
 _NODES = 8
-Operators = Callable[[pattern.Slab], tuple[Array, Array]]
+Operators = Callable[[pattern.PillarSection], tuple[Array, Array]]
 
 
-def walls(
+def section_walls(
     cell: Cell, size_um: float, wavelength_um: float, operators: Operators
-) -> list[Wall]:
+) -> list[TiltedWall]:
     """Every section, foot first; operators: P and Q of a cross-section."""
     made = [
         _wall(cell, layer, grow, size_um, wavelength_um, operators)
-        for layer, grow in spread(cell)
+        for layer, grow in sections_with_growth(cell)
     ]
     return (
-        [Wall(interpolated(part.sample), part.reduced_height) for part in made]
+        [
+            TiltedWall(interpolate_operators(part.sample), part.reduced_height)
+            for part in made
+        ]
         if cell.sidewall_rad
         else made
     )
 
 
-def nodes() -> Array:
+def height_nodes() -> Array:
     """(k,) shares of the height whose cross-sections stand for a tilted wall: Chebyshev
     points.
     """
     return np.asarray((1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2)
 
 
-def weights(share: float | Array) -> Array:
+def interpolation_weights(share: float | Array) -> Array:
     """(*shape, k) of the nodes, in the polynomial through their values."""
     vandermonde = np.linalg.inv(
-        np.polynomial.chebyshev.chebvander(2 * nodes() - 1, _NODES - 1)
+        np.polynomial.chebyshev.chebvander(2 * height_nodes() - 1, _NODES - 1)
     )
     return np.asarray(
         np.polynomial.chebyshev.chebvander(2 * np.asarray(share) - 1, _NODES - 1)
@@ -54,18 +57,21 @@ def weights(share: float | Array) -> Array:
     )
 
 
-def interpolated(sample: Sample) -> Sample:
+def interpolate_operators(sample: Sample) -> Sample:
     """P and Q from polynomials through their values at Chebyshev points of the height,
     worked out when first asked.
     """
 
     @functools.cache
     def values() -> tuple[Array, Array]:
-        P, Q = zip(*(sample(float(node)) for node in nodes()), strict=True)
+        P, Q = zip(*(sample(float(node)) for node in height_nodes()), strict=True)
         return np.stack(P), np.stack(Q)
 
     def at(share: float) -> tuple[Array, Array]:
-        P, Q = (np.tensordot(weights(share).ravel(), part, 1) for part in values())
+        P, Q = (
+            np.tensordot(interpolation_weights(share).ravel(), part, 1)
+            for part in values()
+        )
         return P, Q
 
     return at
@@ -78,14 +84,14 @@ def _wall(
     size_um: float,
     wavelength_um: float,
     operators: Operators,
-) -> Wall:
+) -> TiltedWall:
     def sample(share: float) -> tuple[Array, Array]:
-        wide = grow_um + lift(cell, layer, share)
+        wide = grow_um + width_change_um(cell, layer, share)
         return operators(
-            pattern.slab(cell, layer, size_um, wavelength_um, grow_um=wide)
+            pattern.pillar_section(cell, layer, size_um, wavelength_um, grow_um=wide)
         )
 
-    return Wall(sample, layer.height_um * 2 * math.pi / wavelength_um)
+    return TiltedWall(sample, layer.height_um * 2 * math.pi / wavelength_um)
 
 
 def check_size(cell: Cell, size_um: float) -> None:
@@ -96,8 +102,10 @@ def check_size(cell: Cell, size_um: float) -> None:
     """
     if not (math.isfinite(size_um) and size_um > 0):
         raise CellError(f"size = {size_um} um: need a finite length above 0")
-    for (layer, grow), end in itertools.product(spread(cell), (0.0, 1.0)):
-        wide = layer.grow_um + grow + lift(cell, layer, end) + 2 * layer.coat_um
+    for (layer, grow), end in itertools.product(sections_with_growth(cell), (0.0, 1.0)):
+        wide = (
+            layer.grow_um + grow + width_change_um(cell, layer, end) + 2 * layer.coat_um
+        )
         if cell.gap_um(size_um, grow_um=wide) <= 0:
             raise CellError(
                 f"{cell.described}, size {size_um:g} um: a section {wide:+.4g} um wider touches its neighbour on a "
@@ -105,21 +113,21 @@ def check_size(cell: Cell, size_um: float) -> None:
             )
 
 
-def widening(cell: Cell) -> float:
+def width_slope(cell: Cell) -> float:
     """Change of width for each um of height above the middle."""
     return -2 * math.tan(cell.sidewall_rad)
 
 
-def lift(cell: Cell, layer: Layer, share: float) -> float:
+def width_change_um(cell: Cell, layer: Layer, share: float) -> float:
     """Change of width from the middle of a section to this share of its height."""
-    return (share - 0.5) * widening(cell) * layer.height_um
+    return (share - 0.5) * width_slope(cell) * layer.height_um
 
 
-def spread(cell: Cell) -> list[tuple[Layer, float]]:
+def sections_with_growth(cell: Cell) -> list[tuple[Layer, float]]:
     """(section, widening at its middle by the tilted wall), foot first."""
     found, foot = [], 0.0
     for layer in cell.sections:
         middle = foot + layer.height_um / 2 - cell.height_um / 2
-        found.append((layer, widening(cell) * middle))
+        found.append((layer, width_slope(cell) * middle))
         foot += layer.height_um
     return found

@@ -28,11 +28,18 @@ from metalens.cell import Cell, Light, check_tolerance
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import pattern
-from metalens.rcwa.any_shape import Ladder, ladder
-from metalens.rcwa.near_waves import Points, Slab, orders_at, places, slabs_of, solved
+from metalens.rcwa.any_shape import TruncationSequence, truncation_sequence
+from metalens.rcwa.near_waves import (
+    FieldSlab,
+    PointSums,
+    orders_at,
+    slab_indices,
+    slabs_of,
+    solve_class,
+)
 from metalens.rcwa.orders import mirrors
-from metalens.rcwa.problem import Problem, problem
-from metalens.rcwa.solver import safety
+from metalens.rcwa.problem import CellProblem, cell_problem
+from metalens.rcwa.solver import safety_factor
 
 MOST_POINTS = 4_000_000  # of one call: 1 GB with the truncations that are compared
 _SAFETY, _ENOUGH = (
@@ -107,7 +114,7 @@ class _Look:
 class _Stack:
     """Slabs, and what the points of every grid see of substrate, slabs and cover."""
 
-    slabs: list[Slab]
+    slabs: list[FieldSlab]
     looks: list[list[_Look]]
 
 
@@ -154,10 +161,10 @@ def near_fields(
         raise CellError(
             f"{count} points: need 1 to {MOST_POINTS} in one call; take cuts, or fewer samples"
         )
-    this = problem(
+    this = cell_problem(
         cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad
     )
-    climb = ladder(this, harmonics)
+    climb = truncation_sequence(this, harmonics)
     steps = _STEPS if cell.sidewall_rad else 1
     stack = _stack(this, steps, grids)
     cut = (
@@ -174,7 +181,7 @@ def near_fields(
             else [_apart(one, found) for one in history],
             axis=0,
         )
-        factor = climb.crowded * (_SAFETY if reach >= _ENOUGH else safety(reach))
+        factor = climb.crowded * (_SAFETY if reach >= _ENOUGH else safety_factor(reach))
         error = np.minimum(factor * farthest + cut, 2.0)
         if len(history) >= climb.before and error.max() <= tolerance:
             break
@@ -233,12 +240,12 @@ def _apart(
 
 
 def _staircase(
-    this: Problem,
+    this: CellProblem,
     stack: _Stack,
     steps: int,
     light: Light,
     grids: Sequence[Grid],
-    climb: Ladder,
+    climb: TruncationSequence,
 ) -> Array:
     """What half as many steps of a tilted wall change, at few orders."""
     coarse = min(climb.reaches[-1], climb.reaches[0] + 2)
@@ -246,12 +253,12 @@ def _staircase(
     return np.array(_apart(half, _fields(this, stack, light, grids, coarse)))
 
 
-def _stack(this: Problem, steps: int, grids: Sequence[Grid]) -> _Stack:
+def _stack(this: CellProblem, steps: int, grids: Sequence[Grid]) -> _Stack:
     slabs = slabs_of(this, steps)
     return _Stack(slabs, [_looks(this, slabs, grid) for grid in grids])
 
 
-def _looks(this: Problem, slabs: list[Slab], grid: Grid) -> list[_Look]:
+def _looks(this: CellProblem, slabs: list[FieldSlab], grid: Grid) -> list[_Look]:
     """Of the substrate, every slab and the cover."""
     y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
     flat = np.ones(x.shape, complex)
@@ -266,34 +273,42 @@ def _looks(this: Problem, slabs: list[Slab], grid: Grid) -> list[_Look]:
             weight * n[..., 1] ** 2,
             weight * n[..., 0] * n[..., 1],
         )
-        found.append(_Look(pattern.permittivity(slab.section, this.cell, x, y), normal))
+        found.append(
+            _Look(pattern.permittivity_at(slab.section, this.cell, x, y), normal)
+        )
     return [*found, _Look(this.media.cover**2 * flat, None)]
 
 
-def _index(this: Problem, slabs: list[Slab], looks: list[_Look], grid: Grid) -> Array:
+def _index(
+    this: CellProblem, slabs: list[FieldSlab], looks: list[_Look], grid: Grid
+) -> Array:
     """(nz, ny, nx)."""
     return np.asarray(
         np.sqrt(
-            np.stack([looks[i].eps for i in places(this, slabs, np.asarray(grid.z_um))])
+            np.stack(
+                [looks[i].eps for i in slab_indices(this, slabs, np.asarray(grid.z_um))]
+            )
         )
     )
 
 
 def _fields(
-    this: Problem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int
+    this: CellProblem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int
 ) -> list[tuple[Array, Array]]:
     """(3, nz, ny, nx) e and h of every grid, at one truncation."""
     found = [
         tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
     ]
     for operations in this.classes:
-        space = mirrors.orders(reach, pattern.frame(this.cell, operations))
-        one = solved(this, stack.slabs, light, space)
+        space = mirrors.reduced_orders(
+            reach, pattern.lattice_frame(this.cell, operations)
+        )
+        one = solve_class(this, stack.slabs, light, space)
         if one is None:
             continue
         for grid, (e, h, d) in zip(grids, found, strict=True):
             at = orders_at(this, stack.slabs, one, np.asarray(grid.z_um))
-            summed = Points(
+            summed = PointSums(
                 this,
                 operations,
                 space.reach,
@@ -311,7 +326,9 @@ def _fields(
             ]
             d += [summed(space.ex, at.dx), summed(space.ey, at.dy)]
     for grid, looks, (e, _, d) in zip(grids, stack.looks, found, strict=True):
-        for i, place in enumerate(places(this, stack.slabs, np.asarray(grid.z_um))):
+        for i, place in enumerate(
+            slab_indices(this, stack.slabs, np.asarray(grid.z_um))
+        ):
             e[:2, i] += _jump(looks[place], e[:2, i], d[:, i])
     return [(e, h) for e, h, _ in found]
 

@@ -28,8 +28,8 @@ from metalens.cell import Cell, Layer, materials
 from metalens.cell.shapes import Outline
 from metalens.ground.arrays import Array
 from metalens.rcwa.orders import mirrors
-from metalens.rcwa.orders.mirrors import Frame, Orders
-from metalens.rcwa.orders.waves import Waves
+from metalens.rcwa.orders.mirrors import LatticeFrame, ReducedOrders
+from metalens.rcwa.orders.waves import PlaneWaves
 
 _GRID = 192  # points along the pitch on which normals are sampled
 FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -39,7 +39,7 @@ _FAR = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Slab:
+class PillarSection:
     """One homogeneous-in-z section: outlines from the inside out with the permittivity
     inside each, and outside.
     """
@@ -49,14 +49,14 @@ class Slab:
     outside: complex
 
 
-def slab(
+def pillar_section(
     cell: Cell,
     layer: Layer,
     size_um: float,
     wavelength_um: float,
     *,
     grow_um: float = 0.0,
-) -> Slab:
+) -> PillarSection:
     """The section of a layer at a size, wider by ``grow_um`` besides the layer's own; a
     hole swaps the materials.
     """
@@ -77,28 +77,32 @@ def slab(
     wide = layer.grow_um + grow_um
     wall = cell.outline(size_um, grow_um=wide)
     if layer.coat is None:
-        return Slab((wall,), (pillar,), around)
+        return PillarSection((wall,), (pillar,), around)
     film = materials.index(layer.coat, wavelength_um) ** 2
     if cell.shape.hole:  # the film lies inside the opening
-        return Slab(
+        return PillarSection(
             (cell.outline(size_um, grow_um=wide - 2 * layer.coat_um), wall),
             (pillar, film),
             around,
         )
-    return Slab(
+    return PillarSection(
         (wall, cell.outline(size_um, grow_um=wide + 2 * layer.coat_um)),
         (pillar, film),
         around,
     )
 
 
-def frame(cell: Cell, operations: tuple[mirrors.Operation, ...]) -> Frame:
+def lattice_frame(
+    cell: Cell, operations: tuple[mirrors.Operation, ...]
+) -> LatticeFrame:
     """The rectangle of the lattice in pitches, with the operations of the case."""
     x, y = cell.lattice.periods_um(1.0)
-    return Frame(x, y, cell.lattice.centred, operations)
+    return LatticeFrame(x, y, cell.lattice.centred, operations)
 
 
-def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array]:
+def permittivity_coefficients(
+    this: PillarSection, cell: Cell, reach: tuple[int, int]
+) -> tuple[Array, Array]:
     """Fourier coefficients of eps and 1/eps over m, n from -2 reach to 2 reach; real
     for real, C2 symmetric ones.
     """
@@ -117,7 +121,7 @@ def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array
         factor = outline.fourier(gx[:, None], gy) / area
         direct += (inner - outer) * factor
         inverse += (1 / inner - 1 / outer) * factor
-    return real(direct), real(inverse)
+    return without_rounding(direct), without_rounding(inverse)
 
 
 def normal_tables(
@@ -142,7 +146,7 @@ def normal_tables(
     first, second, third = (
         whole[rows, columns] for whole in _normals(outlines, cell, most, flips)
     )
-    return real(first), real(second), real(third)
+    return without_rounding(first), without_rounding(second), without_rounding(third)
 
 
 @lru_cache(maxsize=64)
@@ -239,7 +243,7 @@ def normals_at(
     return n, np.asarray(1 / (1 + (distance / far) ** 4))
 
 
-def permittivity(this: Slab, cell: Cell, x_um: Array, y_um: Array) -> Array:
+def permittivity_at(this: PillarSection, cell: Cell, x_um: Array, y_um: Array) -> Array:
     """(...) eps at any points."""
     x, y = _wrapped(cell, x_um, y_um)
     eps = np.full(x.shape, this.outside, complex)
@@ -251,7 +255,7 @@ def permittivity(this: Slab, cell: Cell, x_um: Array, y_um: Array) -> Array:
     return eps
 
 
-def real(values: Array) -> Array:
+def without_rounding(values: Array) -> Array:
     """Without the imaginary part where it is rounding."""
     return np.asarray(
         values.real
@@ -260,27 +264,27 @@ def real(values: Array) -> Array:
     )
 
 
-def operators(
-    space: Orders,
-    ways: Waves,
-    this: Slab,
+def section_operators(
+    space: ReducedOrders,
+    ways: PlaneWaves,
+    this: PillarSection,
     cell: Cell,
     flips: tuple[tuple[int, int], ...] | None = None,
 ) -> tuple[Array, Array]:
     """P and Q of :mod:`metalens.rcwa.orders.waves` in these orders; flips: as in
     :func:`normal_tables`.
     """
-    direct, inverse = tables(this, cell, space.reach)
+    direct, inverse = permittivity_coefficients(this, cell, space.reach)
     xx, yy, xy = normal_tables(this.outlines, cell, space.reach, flips)
-    laurent = [mirrors.product(space, direct, link) for link in (0, 1)]
+    laurent = [mirrors.toeplitz_product(space, direct, link) for link in (0, 1)]
     delta = [
-        part - np.linalg.inv(mirrors.product(space, inverse, link))
+        part - np.linalg.inv(mirrors.toeplitz_product(space, inverse, link))
         for link, part in enumerate(laurent)
     ]
     nx, ny, mixed = (
-        mirrors.product(space, xx, 0),
-        mirrors.product(space, yy, 1),
-        mirrors.product(space, xy, 3),
+        mirrors.toeplitz_product(space, xx, 0),
+        mirrors.toeplitz_product(space, yy, 1),
+        mirrors.toeplitz_product(space, xy, 3),
     )
     top = laurent[0] - (delta[0] @ nx + nx @ delta[0]) / 2
     bottom = laurent[1] - (delta[1] @ ny + ny @ delta[1]) / 2
@@ -294,5 +298,9 @@ def operators(
     P = np.eye(len(ways.kappa), dtype=Q.dtype)
     z = slice(ways.bare, ways.p_count)
     kappa = ways.kappa[z]
-    P[z, z] -= kappa[:, None] * np.linalg.inv(mirrors.product(space, direct, 2)) * kappa
+    P[z, z] -= (
+        kappa[:, None]
+        * np.linalg.inv(mirrors.toeplitz_product(space, direct, 2))
+        * kappa
+    )
     return P, Q

@@ -4,6 +4,7 @@ media, symmetries, waves.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +14,14 @@ from metalens.ground.errors import CellError
 from metalens.rcwa.made import check_size
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation
-from metalens.rcwa.orders.waves import Waves
-from metalens.rcwa.stack import Media
+from metalens.rcwa.orders.waves import PlaneWaves
+from metalens.rcwa.stack import StackMedia
 
 _STRAIGHT = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
-class Tangent:
+class TangentialWave:
     """Tangential wave vector over k0, azimuth (0 at normal incidence) and wavelength."""
 
     kx: float
@@ -35,25 +36,25 @@ class Tangent:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class CellProblem:
     """A cell at one size and light, its media, and the symmetries that its
     polarisations have.
     """
 
     cell: Cell
     size_um: float
-    light: Tangent
-    media: Media
+    light: TangentialWave
+    media: StackMedia
     classes: tuple[tuple[Operation, ...], ...]
 
 
-def problem(
+def cell_problem(
     cell: Cell,
     size_um: float,
     wavelength_um: float,
     angle_rad: float,
     azimuth_rad: float,
-) -> Problem:
+) -> CellProblem:
     """Check a cell, its size and its light, and put them together.
 
     Raises:
@@ -61,13 +62,17 @@ def problem(
             zero order.
         MaterialError: a wavelength outside the range of a material.
     """
-    light = tangent(wavelength_um, angle_rad, azimuth_rad)
-    between = media(cell, light)
+    light = tangential_wave(wavelength_um, angle_rad, azimuth_rad)
+    between = stack_media(cell, light)
     check_size(cell, size_um)
-    return Problem(cell, size_um, light, between, classes(cell, size_um, light))
+    return CellProblem(
+        cell, size_um, light, between, symmetry_classes(cell, size_um, light)
+    )
 
 
-def tangent(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> Tangent:
+def tangential_wave(
+    wavelength_um: float, angle_rad: float, azimuth_rad: float
+) -> TangentialWave:
     """The tangential wave vector, its components 0 where they are 0 but for rounding."""
     check_direction(angle_rad, azimuth_rad)
     sine = math.sin(angle_rad)
@@ -76,10 +81,10 @@ def tangent(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> Tange
         0.0 if abs(v) < _STRAIGHT else v
         for v in (sine * math.cos(flat), sine * math.sin(flat))
     )
-    return Tangent(kx, ky, flat, wavelength_um)
+    return TangentialWave(kx, ky, flat, wavelength_um)
 
 
-def media(cell: Cell, light: Tangent) -> Media:
+def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
     """Indices of half-spaces and films, thicknesses times k0.
 
     Raises:
@@ -102,11 +107,11 @@ def media(cell: Cell, light: Tangent) -> Media:
             f"sin(angle_rad) = {math.hypot(light.kx, light.ky):.6g} in a substrate of n = {below.real:.6g}: the light "
             "cannot come from there; need a smaller angle_rad or another substrate"
         )
-    return Media(below, above, films(cell.under), films(cell.over))
+    return StackMedia(below, above, films(cell.under), films(cell.over))
 
 
-def classes(
-    cell: Cell, size_um: float, light: Tangent
+def symmetry_classes(
+    cell: Cell, size_um: float, light: TangentialWave
 ) -> tuple[tuple[Operation, ...], ...]:
     """Sets of operations whose fields together make every polarisation: one set, or one
     for each polarisation.
@@ -129,8 +134,8 @@ def classes(
 
 
 def waves_of(
-    space: mirrors.Orders, cell: Cell, light: Tangent
-) -> tuple[Waves, dict[int, tuple[int, float]]]:
+    space: mirrors.ReducedOrders, cell: Cell, light: TangentialWave
+) -> tuple[PlaneWaves, dict[int, tuple[int, float]]]:
     """The waves, and for each polarisation of the basis that this class holds: its
     place, and its sign there.
 
@@ -167,7 +172,7 @@ def waves_of(
     is_p = np.arange(len(m)) < p_count
     e = np.where(is_p, along, np.stack([-along[1], along[0]]))
 
-    def placed(rows: mirrors.Set) -> Array:
+    def placed(rows: mirrors.OrderSet) -> Array:
         return np.asarray((rows.m[:, None] == m) & (rows.n[:, None] == n), float)
 
     fold = np.concatenate([placed(space.ex) * e[0], placed(space.ey) * e[1]])
@@ -179,10 +184,14 @@ def waves_of(
             places[column] = (place, float(np.sign(e[column, place])))
         else:
             places[1 if place < p_count else 0] = (place, 1.0)
-    return Waves(space, m, n, kappa, along, p_count, int(bare_p), fold, -1, -1), places  # type: ignore[arg-type]
+    any_space: Any = space  # its sets of orders are all that waves need
+    ways = PlaneWaves(any_space, m, n, kappa, along, p_count, int(bare_p), fold, -1, -1)
+    return ways, places
 
 
-def _zero_orders(space: mirrors.Orders, light: Tangent) -> tuple[tuple[bool, ...], int]:
+def _zero_orders(
+    space: mirrors.ReducedOrders, light: TangentialWave
+) -> tuple[tuple[bool, ...], int]:
     """Which of Ex, Ey, Ez, Hz hold the zero order, and whether its p wave lies along y
     (1) or x (0).
     """

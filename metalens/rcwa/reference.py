@@ -115,7 +115,7 @@ def solve_textbook_rcwa(
         return index(material, wavelength_um) ** 2 * one  # type: ignore[arg-type]
 
     slabs = [(modes(film_eps(f.material)), f.thickness_um) for f in cell.under]
-    for layer in staircase(cell, steps):
+    for layer in staircase_layers(cell, steps):
         slabs.append((modes(toeplitz(layer)), layer.height_um))
     slabs += [(modes(film_eps(f.material)), f.thickness_um) for f in cell.over]
 
@@ -164,7 +164,7 @@ def solve_textbook_rcwa(
     return OrderResponse(m, n, t, r, power(on, V_c) / incident, reflected)
 
 
-def staircase(cell: Cell, steps: int) -> list[Layer]:
+def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
     """The sections of a pillar, each of a tilted wall cut into ``steps`` upright ones."""
     slope, foot, found = -2 * math.tan(cell.sidewall_rad), -cell.height_um / 2, []
     for layer in cell.sections:

@@ -13,10 +13,10 @@ import numpy as np
 from metalens.cell import Response
 from metalens.ground.arrays import Array
 from metalens.rcwa import wall
-from metalens.rcwa.conditions import Case, case_waves, widening
-from metalens.rcwa.layer import layer, operators
-from metalens.rcwa.orders.waves import Waves
-from metalens.rcwa.stack import Amplitudes, respond
+from metalens.rcwa.conditions import DiscCase, case_waves, taper_um
+from metalens.rcwa.layer import disc_operators, solve_eigenmodes
+from metalens.rcwa.orders.waves import PlaneWaves
+from metalens.rcwa.stack import ScatteredAmplitudes, scatter_zero_order
 
 Moved = Callable[[Array], Array]
 _ROUNDING = 1e-13
@@ -26,7 +26,7 @@ _ENTRIES = 1_500_000
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Truncated:
+class TruncatedResponse:
     """Results at one truncation, each (d,): transmission, reflection and power of all
     orders.
     """
@@ -41,14 +41,14 @@ class Truncated:
         return np.stack([self.t, self.r])
 
 
-def truncated(
-    this: Case,
+def solve_truncated(
+    this: DiscCase,
     diameter_um: Array,
     harmonics: int,
     stages: int = 0,
     *,
     moved: Moved | None = None,
-) -> Truncated:
+) -> TruncatedResponse:
     """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``.
 
     stages: of the collocation of a tilted wall, see :mod:`metalens.rcwa.wall`; 0:
@@ -67,31 +67,31 @@ def truncated(
             this.media, heights=(this.cell.height_um * this.k0,)
         )
         wide = moved(some) if moved else some
-        part = layer(
-            *operators(ways, wide, this.cell.pitch_um, this.pillar, this.between)
+        part = solve_eigenmodes(
+            *disc_operators(ways, wide, this.cell.pitch_um, this.pillar, this.between)
         )
-        found.append(respond(ways, media, [part], zero))
+        found.append(scatter_zero_order(ways, media, [part], zero))
     t, r = (
         np.concatenate([np.atleast_2d(getattr(part, name)) for part in found])
         for name in ("t", "r")
     )
     energy = (np.abs(t) ** 2).sum(axis=-1) + (np.abs(r) ** 2).sum(axis=-1)
-    return Truncated(t[:, zero], r[:, zero], energy)
+    return TruncatedResponse(t[:, zero], r[:, zero], energy)
 
 
 def _tilted(
-    this: Case,
-    ways: Waves,
+    this: DiscCase,
+    ways: PlaneWaves,
     zero: int,
     diameter_um: float,
     stages: int,
     moved: Moved | None,
-) -> Amplitudes:
+) -> ScatteredAmplitudes:
     """One pillar with a tilted wall."""
 
     def sample(share: float) -> tuple[Array, Array]:
-        wide = np.array([diameter_um + (share - 0.5) * widening(this.cell)])
-        here = operators(
+        wide = np.array([diameter_um + (share - 0.5) * taper_um(this.cell)])
+        here = disc_operators(
             ways,
             moved(wide) if moved else wide,
             this.cell.pitch_um,
@@ -100,39 +100,39 @@ def _tilted(
         )
         return here[0][0], here[1][0]
 
-    whole = [wall.Wall(sample, this.cell.height_um * this.k0)]
-    between = functools.partial(wall.match, whole, stages=stages)
-    return respond(ways, this.media, [], zero, between=between)
+    whole = [wall.TiltedWall(sample, this.cell.height_um * this.k0)]
+    between = functools.partial(wall.match_walls, whole, stages=stages)
+    return scatter_zero_order(ways, this.media, [], zero, between=between)
 
 
-def film(this: Case, index: complex) -> Truncated:
+def film_response(this: DiscCase, index: complex) -> TruncatedResponse:
     """The exact response of a cell whose pillar layer is a film, for one entry."""
     ways, zero = case_waves(this, 0)
     whole = (index, this.cell.height_um * this.k0)
     media = dataclasses.replace(this.media, over=(whole, *this.media.over), heights=())
-    result = respond(ways, media, [], zero)
+    result = scatter_zero_order(ways, media, [], zero)
     energy = np.abs(result.t[zero]) ** 2 + np.abs(result.r[zero]) ** 2
-    return Truncated(
+    return TruncatedResponse(
         result.t[zero : zero + 1], result.r[zero : zero + 1], np.array([energy])
     )
 
 
 def solve_case(
-    this: Case, diameter_um: Array, *, tolerance: float, harmonics: int | None
+    this: DiscCase, diameter_um: Array, *, tolerance: float, harmonics: int | None
 ) -> list[Response]:
     """Responses for (d,) diameters, each at the least truncation that meets the
     tolerance.
     """
-    empty = film(this, this.between)
+    empty = film_response(this, this.between)
     rounding = _ROUNDING * (1 + this.k0 * this.cell.height_um)  # of the phase
     done = {
         int(i): _exact(empty, rounding)
-        for i in np.flatnonzero(homogeneous(this, diameter_um))
+        for i in np.flatnonzero(is_homogeneous(this, diameter_um))
     }
     left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
     stages, cut = wall_stages(this, diameter_um[left], tolerance)
     share = diameter_um / this.cell.pitch_um
-    lags = compared(np.minimum(share, 1 - share))
+    lags = compared_truncations(np.minimum(share, 1 - share))
     before = int(lags[left].max(initial=_COMPARED))
     ladder = _ladder(this, harmonics, before)
     history: list[Array] = []
@@ -140,19 +140,21 @@ def solve_case(
         if not len(left):
             break
         wide = diameter_um[left]
-        found = truncated(this, wide, reach, stages)
+        found = solve_truncated(this, wide, reach, stages)
         history.append(found.both)
         if len(history) <= before and reach != ladder[-1]:
             continue
         change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
-        crowded = crowding(this.cell.pitch_um - wide, this.cell.pitch_um)
+        crowded = gap_factor(this.cell.pitch_um - wide, this.cell.pitch_um)
         estimate = crowded * _estimate(np.array(history), reach, lags[left])
         error = np.minimum(
-            _blur(this, wide, reach, change, estimate) + cut, farthest(found.both)
+            _blur(this, wide, reach, change, estimate) + cut, largest_error(found.both)
         )
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
-        found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
+        found = TruncatedResponse(
+            found.t[chosen], found.r[chosen], found.energy[chosen]
+        )
         for row, place in enumerate(chosen):
             done[int(left[place])] = _response(
                 found, row, reach, float(error[place]), tolerance
@@ -162,7 +164,7 @@ def solve_case(
     return [done[i] for i in range(len(diameter_um))]
 
 
-def farthest(both: Array) -> Array:
+def largest_error(both: Array) -> Array:
     """Most that t and r along the first axis may be wrong by: the true ones of a
     passive cell are 1 at most.
     """
@@ -184,14 +186,14 @@ _CUSPS, NARROWEST = (
 _COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
 
 
-def _ladder(this: Case, harmonics: int | None, before: int) -> range:
+def _ladder(this: DiscCase, harmonics: int | None, before: int) -> range:
     """Truncations to try; the first that may be the last one has ``before`` below it."""
     if harmonics is None:
         return range(_FIRST + _COMPARED - before, _LAST[this.symmetry] + 1)
     return range(max(harmonics - before, 1), harmonics + 1)
 
 
-def compared(width: float | Array) -> Array:
+def compared_truncations(width: float | Array) -> Array:
     """How many truncations before the last are looked at, by the narrower of pillar and
     gap (in pitches): 4 to 6.
 
@@ -201,7 +203,7 @@ def compared(width: float | Array) -> Array:
     error was up to 8.5 times the
     farthest of four (5 of 380 above its bar), and up to twice the farthest of so many.
     Below a fiftieth of the pitch
-    :func:`crowding` stands for it, and discs so thin are not resolved.
+    :func:`gap_factor` stands for it, and discs so thin are not resolved.
     """
     width = np.asarray(width)
     swing = np.clip(
@@ -210,15 +212,15 @@ def compared(width: float | Array) -> Array:
     return np.where(width < NARROWEST, _COMPARED, swing).astype(int)
 
 
-def safety(reach: int) -> float:
+def safety_factor(reach: int) -> float:
     """How many times the farthest of the truncations before an error may be, at this
     many orders.
     """
     return _SAFETY + _MORE * max(0, _ENOUGH - reach)
 
 
-def crowding(gap_um: float | Array, pitch_um: float) -> Array:
-    """Factor on :func:`safety` for pillars that all but touch: fields between them are
+def gap_factor(gap_um: float | Array, pitch_um: float) -> Array:
+    """Factor on :func:`safety_factor` for pillars that all but touch: fields between them are
     seen late by any order.
 
     Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest
@@ -234,7 +236,7 @@ def _estimate(t: Array, reach: int, lags: Array) -> Array:
     """Error of the last of the results, t and r (rungs, 2, d): some times the farthest
     of the truncations before.
 
-    lags: (d,) how many, see :func:`compared`. Truncation errors fall as reach^-2 and
+    lags: (d,) how many, see :func:`compared_truncations`. Truncation errors fall as reach^-2 and
     swing with the number of orders
     that fit across the disc; a swing takes up to four rungs where nothing is narrow.
     For 52 diameters in three cells
@@ -244,7 +246,7 @@ def _estimate(t: Array, reach: int, lags: Array) -> Array:
     orders it is more: up to 4.8 of it
     below 8, and with a factor of 3 at 8 to 10 orders 3 of 200 cells (``python -m
     benchmarks engines``) lay apart from
-    the modal method by up to 1.5 times both bars. Hence :func:`safety`: 6 at 8 orders,
+    the modal method by up to 1.5 times both bars. Hence :func:`safety_factor`: 6 at 8 orders,
     3 from 13 on.
     """
     if len(t) < 2:
@@ -252,12 +254,12 @@ def _estimate(t: Array, reach: int, lags: Array) -> Array:
     moved = np.abs(t[-1] - t[:-1]).max(axis=1)
     age = np.arange(len(moved), 0, -1)[:, None]
     return np.asarray(
-        safety(reach) * np.where(age <= lags, moved, 0.0).max(axis=0) + _ROUNDING
+        safety_factor(reach) * np.where(age <= lags, moved, 0.0).max(axis=0) + _ROUNDING
     )
 
 
 def _blur(
-    this: Case, diameter_um: Array, reach: int, change: Array, error: Array
+    this: DiscCase, diameter_um: Array, reach: int, change: Array, error: Array
 ) -> Array:
     """Where the orders do not resolve the pillar, none of its effect (d,) is believed."""
     return np.where(
@@ -265,18 +267,21 @@ def _blur(
     )
 
 
-def wall_stages(this: Case, diameter_um: Array, tolerance: float) -> tuple[int, float]:
+def wall_stages(
+    this: DiscCase, diameter_um: Array, tolerance: float
+) -> tuple[int, float]:
     """Stages of a tilted wall and the error they leave, the same at all orders; (0, 0)
     where it is upright.
     """
     if not (len(diameter_um) and this.cell.sidewall_rad):
         return 0, 0.0
-    return wall.enough(
-        lambda stages: truncated(this, diameter_um, _COARSE, stages).both, tolerance
+    return wall.choose_stage_count(
+        lambda stages: solve_truncated(this, diameter_um, _COARSE, stages).both,
+        tolerance,
     )
 
 
-def homogeneous(this: Case, diameter_um: Array) -> Array:
+def is_homogeneous(this: DiscCase, diameter_um: Array) -> Array:
     """Where the pillar layer is a film to rounding: (d,) truth values."""
     share = math.pi / 4 * (diameter_um / this.cell.pitch_um) ** 2
     effect = (
@@ -285,7 +290,7 @@ def homogeneous(this: Case, diameter_um: Array) -> Array:
     return np.asarray(effect < _ROUNDING)
 
 
-def _exact(exact: Truncated, rounding: float) -> Response:
+def _exact(exact: TruncatedResponse, rounding: float) -> Response:
     reason = "a homogeneous layer: exact"
     return Response(
         complex(exact.t[0]),
@@ -300,7 +305,7 @@ def _exact(exact: Truncated, rounding: float) -> Response:
 
 
 def _response(
-    result: Truncated, place: int, reach: int, error: float, tolerance: float
+    result: TruncatedResponse, place: int, reach: int, error: float, tolerance: float
 ) -> Response:
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa.layer import Layer
-from metalens.rcwa.orders.waves import Waves, half_space, normal_component
+from metalens.rcwa.layer import FourierModes
+from metalens.rcwa.orders.waves import PlaneWaves, half_space, normal_component
 
 Pair = tuple[Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
-class Media:
+class StackMedia:
     """Refractive indices and thicknesses at one wavelength (exp(-iwt)); lengths in
     units of 1/k0.
 
@@ -40,7 +40,7 @@ class Media:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Amplitudes:
+class ScatteredAmplitudes:
     """Power-normalised amplitudes of every order for unit incident power in the zero
     order: (*batch, n).
 
@@ -52,7 +52,7 @@ class Amplitudes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fields:
+class TangentialFields:
     """Tangential fields of one incident wave.
 
     u, w: (*batch, n) at the foot of the lowest layer; u_top, w_top: at the top of the
@@ -69,17 +69,17 @@ class Fields:
     down: list[Array]
 
 
-Between = Callable[[Pair, Pair, Array], Fields]
+Between = Callable[[Pair, Pair, Array], TangentialFields]
 
 
-def respond(
-    ways: Waves,
-    media: Media,
-    layers: list[Layer],
+def scatter_zero_order(
+    ways: PlaneWaves,
+    media: StackMedia,
+    layers: list[FourierModes],
     zero: int,
     *,
     between: Between | None = None,
-) -> Amplitudes:
+) -> ScatteredAmplitudes:
     """Response to the zero order (place ``zero``) from the substrate; no layers: a
     stack of films.
 
@@ -94,17 +94,21 @@ def respond(
     found = (
         between(top, foot, source)
         if between
-        else match(layers, media.heights, top, foot, source)
+        else match_layers(layers, media.heights, top, foot, source)
     )
-    incident = flux(below)[zero]
-    t = outgoing(top, found.u_top, found.w_top) * lift * np.sqrt(flux(above) / incident)
+    incident = power_flux(below)[zero]
+    t = (
+        outgoing_amplitudes(top, found.u_top, found.w_top)
+        * lift
+        * np.sqrt(power_flux(above) / incident)
+    )
     r = _reflected(ways, media, foot, drop, found, zero) * np.sqrt(
-        flux(below) / incident
+        power_flux(below) / incident
     )
-    return Amplitudes(t, r)
+    return ScatteredAmplitudes(t, r)
 
 
-def outgoing(pair: Pair, u: Array, w: Array) -> Array:
+def outgoing_amplitudes(pair: Pair, u: Array, w: Array) -> Array:
     """Amplitudes a of the diagonal pair with u = U a, w = V a, from whichever of the
     two is large.
     """
@@ -114,22 +118,22 @@ def outgoing(pair: Pair, u: Array, w: Array) -> Array:
     )
 
 
-def match(
-    layers: list[Layer],
+def match_layers(
+    layers: list[FourierModes],
     heights: tuple[float, ...],
     top: Pair,
     foot: Pair,
     source: Array,
-) -> Fields:
+) -> TangentialFields:
     """Fields that radiate into ``top`` above the layers, and whose incident part gives
     foot V u + U w = source.
     """
     if not layers:
         a = source / (foot[1] * top[0] + foot[0] * top[1])
-        return Fields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
+        return TangentialFields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
     pair, returns = top, []
     for part, height in zip(reversed(layers), reversed(heights), strict=True):
-        back, kept, fade = reflection(part, height, pair)
+        back, kept, fade = layer_reflection(part, height, pair)
         returns.append((back, kept, fade))
         pair = foot_pair(part, back, kept, fade)
     a = _solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
@@ -147,10 +151,12 @@ def match(
         u_top, w_top = _times(part.W, up + down), _times(part.V, up - down)
         ups.append(a)
         downs.append(down)
-    return Fields(u, w, u_top, w_top, ups, downs)
+    return TangentialFields(u, w, u_top, w_top, ups, downs)
 
 
-def reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Array]:
+def layer_reflection(
+    part: FourierModes, height: float, pair: Pair
+) -> tuple[Array, int, Array]:
     """Downward amplitudes at the top for each upward one at the foot, for the modes
     that reach the top at all.
     """
@@ -178,7 +184,7 @@ def reflection(part: Layer, height: float, pair: Pair) -> tuple[Array, int, Arra
 _FADED = 41.0  # exp(-41) = 1.6e-18
 
 
-def foot_pair(part: Layer, back: Array, kept: int, fade: Array) -> Pair:
+def foot_pair(part: FourierModes, back: Array, kept: int, fade: Array) -> Pair:
     """The upward-radiating pair at the foot of a layer, its columns the upward modes
     there.
     """
@@ -190,7 +196,7 @@ def foot_pair(part: Layer, back: Array, kept: int, fade: Array) -> Pair:
 
 
 def _through(
-    ways: Waves, pair: Pair, films: tuple[tuple[complex, float], ...]
+    ways: PlaneWaves, pair: Pair, films: tuple[tuple[complex, float], ...]
 ) -> tuple[Pair, Array]:
     """An outgoing pair seen through films, nearest to its half-space first, and the
     decay of its waves on the way.
@@ -217,7 +223,12 @@ def _through(
 
 
 def _reflected(
-    ways: Waves, media: Media, foot: Pair, drop: Array, fields: Fields, zero: int
+    ways: PlaneWaves,
+    media: StackMedia,
+    foot: Pair,
+    drop: Array,
+    fields: TangentialFields,
+    zero: int,
 ) -> Array:
     """Reflected amplitudes in the substrate, from the fields above the films under the
     pillar.
@@ -231,12 +242,14 @@ def _reflected(
     whole = V[zero] * u[zero] + U[zero] * w[zero]
     passed = np.zeros(len(U), complex)
     passed[zero] = fade[zero] * 2 * U[zero] * V[zero] / whole
-    back = drop * outgoing(foot, fields.u - U * passed, V * passed - fields.w)
+    back = drop * outgoing_amplitudes(
+        foot, fields.u - U * passed, V * passed - fields.w
+    )
     back[..., zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / whole
     return np.asarray(back)
 
 
-def flux(pair: Pair) -> Array:
+def power_flux(pair: Pair) -> Array:
     """Power along z of outgoing waves of unit amplitude, Re(u w*); 0 for waves that
     decay.
     """

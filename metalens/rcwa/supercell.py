@@ -21,17 +21,17 @@ from metalens.cell.shapes.outline import Conic
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import pattern
-from metalens.rcwa.layer import layer
+from metalens.rcwa.layer import solve_eigenmodes
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.waves import normal_component
-from metalens.rcwa.problem import media, tangent, waves_of
-from metalens.rcwa.stack import respond
+from metalens.rcwa.problem import stack_media, tangential_wave, waves_of
+from metalens.rcwa.stack import scatter_zero_order
 
 _MIRRORED = ((1, 1), (1, -1))  # rows are mirror symmetric in y
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Row:
+class RowResponse:
     """What a row of pillars does to light at normal incidence from the substrate.
 
     orders: (n,) diffraction orders along the row. t: (n,) transverse amplitude of each
@@ -87,7 +87,7 @@ def solve_row(
     polarization: Literal["x", "y"],
     harmonics: int = 4,
     diagonal: bool = False,
-) -> Row:
+) -> RowResponse:
     """Supercell RCWA: orders of a row of pillars of these diameters, one pitch apart,
     repeated without end.
 
@@ -133,21 +133,24 @@ def solve_row(
     inside, around = (
         materials.index(one, wavelength_um) ** 2 for one in (cell.pillar, cell.fill)
     )
-    slab = pattern.Slab((Outline(tuple(discs)),), (inside,), around)
-    light = tangent(wavelength_um, 0.0, 0.0)
+    slab = pattern.PillarSection((Outline(tuple(discs)),), (inside,), around)
+    light = tangential_wave(wavelength_um, 0.0, 0.0)
     operations = (mirrors.IDENTITY, mirrors.FLIP_Y[polarization])
     radius = (2 * harmonics + 1) / math.sqrt(math.pi)
-    space = mirrors.orders(
+    space = mirrors.reduced_orders(
         radius * math.sqrt(blocks) * block.width_um / cell.pitch_um,
-        pattern.frame(supercell, operations),
+        pattern.lattice_frame(supercell, operations),
     )
     ways, places = waves_of(space, supercell, light)
-    operators = pattern.operators(space, ways, slab, supercell, flips=_MIRRORED)
+    operators = pattern.section_operators(space, ways, slab, supercell, flips=_MIRRORED)
     stack = replace(
-        media(cell, light), heights=(2 * math.pi / wavelength_um * cell.height_um,)
+        stack_media(cell, light),
+        heights=(2 * math.pi / wavelength_um * cell.height_um,),
     )
     zero, sign = places["xy".index(polarization)]
-    found = respond(ways, stack, [layer(*operators, symmetric=False)], zero)
+    found = scatter_zero_order(
+        ways, stack, [solve_eigenmodes(*operators, symmetric=False)], zero
+    )
     energy = float((np.abs(found.t) ** 2).sum() + (np.abs(found.r) ** 2).sum())
 
     # in the plane of the row, light along x is p and light along y is s
@@ -158,7 +161,7 @@ def solve_row(
     cosine = normal_component(ways.kappa[kept], cover).real / cover
     factor = np.sqrt(cosine if polarization == "x" else _inverse(cosine))
     direction = np.where(ways.m[kept] == 0, sign, ways.along[0, kept])
-    return Row(ways.m[kept], sign * direction * factor * found.t[kept], energy)
+    return RowResponse(ways.m[kept], sign * direction * factor * found.t[kept], energy)
 
 
 def _inverse(cosine: Array) -> Array:

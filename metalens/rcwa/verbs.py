@@ -15,7 +15,7 @@ import numpy as np
 from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.rcwa.any_shape import co_polarised
-from metalens.rcwa.conditions import case, check_diameter
+from metalens.rcwa.conditions import check_diameter, disc_case
 from metalens.rcwa.solver import solve_case
 
 
@@ -98,5 +98,5 @@ def solve_many(
             )
             for d in diameters
         ]
-    this = case(cell, light)
+    this = disc_case(cell, light)
     return solve_case(this, diameters, tolerance=tolerance, harmonics=harmonics)

@@ -24,7 +24,7 @@ from functools import lru_cache
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa.stack import Fields, Pair
+from metalens.rcwa.stack import Pair, TangentialFields
 
 Sample = Callable[
     [float], tuple[Array, Array]
@@ -44,7 +44,7 @@ FIRST, MOST = 4, 10  # stages: 2e-3, 2e-5, 2e-7 of t for 4, 5, 6 and a wall of 0
 
 
 @lru_cache(maxsize=8)
-def gauss(stages: int) -> tuple[Array, Array, Array]:
+def gauss_collocation(stages: int) -> tuple[Array, Array, Array]:
     """Points c (m,), weights b (m,) and integrals a (m, m) of the Lagrange polynomials
     on [0, 1].
     """
@@ -58,7 +58,7 @@ def gauss(stages: int) -> tuple[Array, Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
-class Wall:
+class TiltedWall:
     """One section of a pillar: P and Q at a share of its height, 0 at its foot, and its
     height times k0.
     """
@@ -68,7 +68,7 @@ class Wall:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Panel:
+class CollocatedPanel:
     """A part of a wall, its unknowns put in: fields at the Gauss points from those at
     its upper end.
 
@@ -103,9 +103,11 @@ class Panel:
         return both
 
 
-def panel(this: Wall, low: float, high: float, stages: int) -> Panel:
+def collocate_panel(
+    this: TiltedWall, low: float, high: float, stages: int
+) -> CollocatedPanel:
     """The part of a wall between two shares of its height."""
-    c, b, a = gauss(stages)
+    c, b, a = gauss_collocation(stages)
     share = high - c * (high - low)
     P, Q = (
         np.stack(part)
@@ -128,12 +130,12 @@ def panel(this: Wall, low: float, high: float, stages: int) -> Panel:
         np.eye(stages * n) - step**2 * (p @ q), given
     )  # u = u0 + step p w, with w put in
     w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
-    return Panel(share, step, b, P, Q, u, w)
+    return CollocatedPanel(share, step, b, P, Q, u, w)
 
 
-def match(
-    walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages: int
-) -> Fields:
+def match_walls(
+    walls: Sequence[TiltedWall], top: Pair, foot: Pair, source: Array, *, stages: int
+) -> TangentialFields:
     """Fields that radiate into ``top``, and whose incident part gives foot V u + U w =
     source; see ``stack.match``.
 
@@ -144,17 +146,21 @@ def match(
     scales = []
     for this in reversed(walls):
         for low, high in zip(EDGES[-2::-1], EDGES[:0:-1], strict=True):
-            pair, scale = np.linalg.qr(panel(this, low, high, stages).downwards @ pair)
+            pair, scale = np.linalg.qr(
+                collocate_panel(this, low, high, stages).downwards @ pair
+            )
             scales.append(scale)
     U, V = pair[:n], pair[n:]
     a = np.linalg.solve(foot[1][:, None] * U + foot[0][:, None] * V, source)
     u, w = U @ a, V @ a
     for scale in reversed(scales):
         a = np.linalg.solve(scale, a)
-    return Fields(u, w, top[0] * a, top[1] * a, [], [])
+    return TangentialFields(u, w, top[0] * a, top[1] * a, [], [])
 
 
-def enough(respond_at: Callable[[int], Array], tolerance: float) -> tuple[int, float]:
+def choose_stage_count(
+    respond_at: Callable[[int], Array], tolerance: float
+) -> tuple[int, float]:
     """Stages that leave less than a tenth of the tolerance, and the error they leave:
     as the last one changed t.
     """

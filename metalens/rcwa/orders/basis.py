@@ -30,7 +30,7 @@ _PARITY: dict[
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Orders:
+class DiscOrders:
     """Amplitudes of one scalar field: one representative order for each set of mirror
     images.
 
@@ -46,7 +46,7 @@ class Orders:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Basis:
+class DiscBasis:
     """Orders within a circle of radius ``harmonics``, for one symmetry.
 
     ex, ey, ez, hz: the scalar sets.
@@ -59,17 +59,17 @@ class Basis:
 
     harmonics: int
     symmetry: Symmetry
-    ex: Orders
-    ey: Orders
-    ez: Orders
-    hz: Orders
+    ex: DiscOrders
+    ey: DiscOrders
+    ez: DiscOrders
+    hz: DiscOrders
     shells: Array
-    links: tuple["Link", ...]
+    links: tuple["DiscLink", ...]
     normal: tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Link:
+class DiscLink:
     """How a function of the cell couples two scalar sets: a sum over the mirror images
     of the column's order.
 
@@ -86,14 +86,14 @@ class Link:
 
 
 @lru_cache(maxsize=24)
-def basis(harmonics: int, symmetry: Symmetry) -> Basis:
+def disc_basis(harmonics: int, symmetry: Symmetry) -> DiscBasis:
     """The basis of all orders with m² + n² <= harmonics², reduced by the symmetry."""
     ex, ey, ez, hz = (_orders(harmonics, parity) for parity in _PARITY[symmetry])
     pairs = ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
     reach = np.arange(2 * harmonics + 1) ** 2
     shells = np.unique(reach[:, None] + reach)
     links = tuple(_link(rows, columns, shells) for rows, columns in pairs)
-    return Basis(
+    return DiscBasis(
         harmonics,
         symmetry,
         ex,
@@ -106,7 +106,7 @@ def basis(harmonics: int, symmetry: Symmetry) -> Basis:
     )
 
 
-def _orders(harmonics: int, parity: tuple[int, int]) -> Orders:
+def _orders(harmonics: int, parity: tuple[int, int]) -> DiscOrders:
     reach = np.arange(-harmonics, harmonics + 1)
     m, n = (a.ravel() for a in np.meshgrid(reach, reach, indexing="ij"))
     keep = m * m + n * n <= harmonics**2
@@ -117,10 +117,10 @@ def _orders(harmonics: int, parity: tuple[int, int]) -> Orders:
     size = np.where(m != 0, 2, 1) ** (parity[0] != 0) * np.where(n != 0, 2, 1) ** (
         parity[1] != 0
     )
-    return Orders(m, n, size, parity)
+    return DiscOrders(m, n, size, parity)
 
 
-def _images(rows: Orders, columns: Orders) -> tuple[Array, Array, Array]:
+def _images(rows: DiscOrders, columns: DiscOrders) -> tuple[Array, Array, Array]:
     """Differences between the rows and every mirror image of the columns, with the
     weight of each.
     """
@@ -139,18 +139,20 @@ def _images(rows: Orders, columns: Orders) -> tuple[Array, Array, Array]:
     return dm, dn, share[..., None] * np.array([float(sign) for *_, sign in signs])
 
 
-def _link(rows: Orders, columns: Orders, shells: Array) -> Link:
+def _link(rows: DiscOrders, columns: DiscOrders, shells: Array) -> DiscLink:
     dm, dn, weight = _images(rows, columns)
     square = dm * dm + dn * dn
     round_part = np.where(square == 0, 1, square)
     cos2, sin2 = (dm * dm - dn * dn) / round_part, 2 * dm * dn / round_part
-    return Link(np.searchsorted(shells, square), weight, weight * cos2, weight * sin2)
+    return DiscLink(
+        np.searchsorted(shells, square), weight, weight * cos2, weight * sin2
+    )
 
 
 EX, EY, EZ, MIXED = range(4)  # places in Basis.links
 
 
-def products(space: Basis, coefficients: Array, link: int) -> Array:
+def toeplitz_matrix(space: DiscBasis, coefficients: Array, link: int) -> Array:
     """Matrix of the product with a round function: (*batch, shells) Fourier
     coefficients -> (*batch, k, k).
     """
@@ -160,7 +162,7 @@ def products(space: Basis, coefficients: Array, link: int) -> Array:
     )
 
 
-def disc(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
+def disc_coefficients(space: DiscBasis, diameter_um: Array, pitch_um: float) -> Array:
     """Fourier coefficients of the indicator of a disc: f 2 J1(x)/x, x = pi D |G| /
     pitch, f its share of the cell.
 
@@ -179,8 +181,8 @@ def _bessel(order: int, x: Array) -> Array:
     return np.asarray(j1(x) if order else j0(x))
 
 
-def normals(
-    space: Basis, diameter_um: Array, pitch_um: float
+def disc_normal_matrices(
+    space: DiscBasis, diameter_um: Array, pitch_um: float
 ) -> tuple[Array, Array, Array]:
     """Matrices (xx, yy, xy) of a field N that is n n^T of the radial unit field at the
     rim and outside the disc.
@@ -204,20 +206,20 @@ def normals(
     return xx, yy, xy
 
 
-def _argument(space: Basis, radius: Array) -> tuple[Array, Array, Array]:
+def _argument(space: DiscBasis, radius: Array) -> tuple[Array, Array, Array]:
     x = np.sqrt(space.shells) * radius
     small = np.abs(x) < 0.01
     return x, np.where(small, 1.0, x), small
 
 
-def _directed(space: Basis, a: Array, b: Array) -> tuple[Array, Array, Array]:
+def _directed(space: DiscBasis, a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Matrices of the functions with coefficients a + b cos 2f, a - b cos 2f and b sin
     2f: (xx, yy, xy).
     """
     taken = []
     for link, sign in ((EX, 1), (EY, -1)):
         pair = space.links[link]
-        isotropic = products(space, a, link)
+        isotropic = toeplitz_matrix(space, a, link)
         directed = np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.cos2)
         taken.append(isotropic + sign * directed)
     pair = space.links[MIXED]
@@ -228,10 +230,12 @@ def _directed(space: Basis, a: Array, b: Array) -> tuple[Array, Array, Array]:
     )
 
 
-def _normal(ex: Orders, ey: Orders, reach: int) -> tuple[Array, Array, Array]:
+def _normal(ex: DiscOrders, ey: DiscOrders, reach: int) -> tuple[Array, Array, Array]:
     even, odd = _radial_field(reach)
 
-    def matrix(rows: Orders, columns: Orders, table: Array, odd_in_both: bool) -> Array:
+    def matrix(
+        rows: DiscOrders, columns: DiscOrders, table: Array, odd_in_both: bool
+    ) -> Array:
         dm, dn, weight = _images(rows, columns)
         sign = np.sign(dm) * np.sign(dn) if odd_in_both else 1.0
         return np.asarray((table[np.abs(dm), np.abs(dn)] * sign * weight).sum(axis=-1))

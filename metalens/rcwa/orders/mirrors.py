@@ -25,7 +25,7 @@ HALF_TURN: Operation = (-1, -1, (1, 1, -1, -1))
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class LatticeFrame:
     """What the orders depend on: edges of the rectangle that repeats over the pitch,
     centred or not, operations.
     """
@@ -37,7 +37,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Set:
+class OrderSet:
     """Amplitudes of one scalar field: (k,) orders m, n, sizes of their orbits, sign of
     each operation.
     """
@@ -49,7 +49,7 @@ class Set:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Link:
+class OrderLink:
     """How a function couples two sets: (k, l, operations) places in its table of
     coefficients, and weights.
     """
@@ -59,21 +59,23 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Orders:
+class ReducedOrders:
     """The reduced sets of one truncation; coefficients are tabled over m, n from -2
     reach to 2 reach.
     """
 
-    ex: Set
-    ey: Set
-    ez: Set
-    hz: Set
+    ex: OrderSet
+    ey: OrderSet
+    ez: OrderSet
+    hz: OrderSet
     reach: tuple[int, int]
-    links: tuple[Link, Link, Link, Link]  # (ex, ex), (ey, ey), (ez, ez), (ex, ey)
+    links: tuple[
+        OrderLink, OrderLink, OrderLink, OrderLink
+    ]  # (ex, ex), (ey, ey), (ez, ez), (ex, ey)
 
 
 @lru_cache(maxsize=24)
-def orders(harmonics: float, frame: Frame) -> Orders:
+def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
     """All orders within the circle of radius ``harmonics`` orders of a square lattice
     of this cell's area.
     """
@@ -93,12 +95,14 @@ def orders(harmonics: float, frame: Frame) -> Orders:
     ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
     pairs = ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
     first, second, third, fourth = (
-        link(rows, columns, frame.operations, reach) for rows, columns in pairs
+        link_sets(rows, columns, frame.operations, reach) for rows, columns in pairs
     )
-    return Orders(ex, ey, ez, hz, reach, (first, second, third, fourth))
+    return ReducedOrders(ex, ey, ez, hz, reach, (first, second, third, fourth))
 
 
-def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) -> Set:
+def _reduced(
+    m: Array, n: Array, operations: tuple[Operation, ...], field: int
+) -> OrderSet:
     """One order of each orbit; those that an operation keeps but whose field it turns
     into its negative vanish.
     """
@@ -108,12 +112,15 @@ def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) 
     dead = ((images == own) & (np.array(signs)[:, None] < 0)).any(axis=0)
     keep = first & ~dead
     size = np.array([len(set(column)) for column in images[:, keep].T], int)
-    return Set(m[keep], n[keep], size, signs)
+    return OrderSet(m[keep], n[keep], size, signs)
 
 
-def link(
-    rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]
-) -> Link:
+def link_sets(
+    rows: OrderSet,
+    columns: OrderSet,
+    operations: tuple[Operation, ...],
+    reach: tuple[int, int],
+) -> OrderLink:
     """How a function couples two sets; it must turn the fields of the columns into
     those of the rows.
 
@@ -129,16 +136,16 @@ def link(
     )
     share = np.sqrt(rows.size[:, None] * columns.size) / len(operations)
     place = (dm + 2 * reach[0]) * (4 * reach[1] + 1) + dn + 2 * reach[1]
-    return Link(place, share[..., None] * np.array(columns.signs, float))
+    return OrderLink(place, share[..., None] * np.array(columns.signs, float))
 
 
-def product(space: Orders, table: Array, pair: int) -> Array:
+def toeplitz_product(space: ReducedOrders, table: Array, pair: int) -> Array:
     """(k, l) matrix of the product with a function of these coefficients ((2 m reach) x
     (2 n reach) table).
     """
     return product_by(space.links[pair], table)
 
 
-def product_by(pair: Link, table: Array) -> Array:
+def product_by(pair: OrderLink, table: Array) -> Array:
     """The same for any two sets."""
     return np.asarray(np.einsum("ijg,ijg->ij", table.ravel()[pair.place], pair.weight))

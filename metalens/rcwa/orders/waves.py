@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa.orders.basis import Basis, Orders
+from metalens.rcwa.orders.basis import DiscBasis, DiscOrders
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Waves:
+class PlaneWaves:
     """The waves of a basis at one wavelength and direction: all p waves, then all s
     waves.
 
@@ -35,7 +35,7 @@ class Waves:
     zero_p, zero_s: place of the zero order, -1 where the symmetry excludes it.
     """
 
-    space: Basis
+    space: DiscBasis
     m: Array
     n: Array
     kappa: Array
@@ -47,15 +47,15 @@ class Waves:
     zero_s: int
 
 
-def waves(
-    space: Basis,
+def plane_waves(
+    space: DiscBasis,
     *,
     pitch_um: float,
     wavelength_um: float,
     kx: float,
     ky: float,
     azimuth_rad: float,
-) -> Waves:
+) -> PlaneWaves:
     """The waves around the zero order (kx, ky) / k0, whose azimuth gives the direction
     of E where k vanishes.
     """
@@ -72,7 +72,7 @@ def waves(
     e = np.where(np.arange(len(m)) < p_count, along, np.stack([-along[1], along[0]]))
     fold = np.concatenate([_place(ex, m, n) * e[0], _place(ey, m, n) * e[1]])
     zero_p, zero_s = _zero(m, n, 0, p_count), _zero(m, n, p_count, len(m))
-    return Waves(space, m, n, kappa, along, p_count, bare, fold, zero_p, zero_s)
+    return PlaneWaves(space, m, n, kappa, along, p_count, bare, fold, zero_p, zero_s)
 
 
 def normal_component(kappa: Array, index: complex) -> Array:
@@ -84,7 +84,7 @@ def normal_component(kappa: Array, index: complex) -> Array:
     return np.asarray(np.where(kz.imag < 0, -kz, kz))
 
 
-def half_space(basis_waves: Waves, index: complex) -> tuple[Array, Array]:
+def half_space(basis_waves: PlaneWaves, index: complex) -> tuple[Array, Array]:
     """(u, w) of the outgoing waves of unit electric amplitude; (u, -w) are the incoming
     ones.
     """
@@ -93,7 +93,7 @@ def half_space(basis_waves: Waves, index: complex) -> tuple[Array, Array]:
     return np.where(is_p, kz / index, 1.0), np.where(is_p, index, kz)
 
 
-def _place(rows: Orders, m: Array, n: Array) -> Array:
+def _place(rows: DiscOrders, m: Array, n: Array) -> Array:
     return np.asarray((rows.m[:, None] == m) & (rows.n[:, None] == n), float)
 
 

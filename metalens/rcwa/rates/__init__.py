@@ -8,9 +8,14 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from metalens.rcwa.rates.verb import JonesDerivatives as JonesDerivatives
-    from metalens.rcwa.rates.verb import Rate as Rate
+    from metalens.rcwa.rates.verb import ParameterDerivative as ParameterDerivative
     from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
 
 __getattr__, __dir__, __all__ = attach(
-    __name__, {"JonesDerivatives": "verb", "Rate": "verb", "jones_derivatives": "verb"}
+    __name__,
+    {
+        "JonesDerivatives": "verb",
+        "ParameterDerivative": "verb",
+        "jones_derivatives": "verb",
+    },
 )

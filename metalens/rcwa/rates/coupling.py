@@ -8,14 +8,14 @@ import numpy as np
 
 from metalens.cell import Cell
 from metalens.ground.arrays import Array
-from metalens.rcwa.pattern import Slab
+from metalens.rcwa.pattern import PillarSection
 from metalens.rcwa.rates import kernels, tables
-from metalens.rcwa.rates.regions import Modes
-from metalens.rcwa.rates.solved import Solved
-from metalens.rcwa.rates.tables import Change, Section, Tables
+from metalens.rcwa.rates.regions import RegionModes
+from metalens.rcwa.rates.solved import AdjointClass
+from metalens.rcwa.rates.tables import Change, SectionMatrices, Tables
 
 
-class Coupling:
+class ClassCoupling:
     """What all numbers of the pillar share in it, worked out when first asked.
 
     rows, columns: the classes; i: the region. slabs: the cross-sections at the shares
@@ -24,7 +24,12 @@ class Coupling:
     """
 
     def __init__(
-        self, rows: Solved, columns: Solved, i: int, cell: Cell, slabs: list[Slab]
+        self,
+        rows: AdjointClass,
+        columns: AdjointClass,
+        i: int,
+        cell: Cell,
+        slabs: list[PillarSection],
     ) -> None:
         self._rows, self._columns, self._i, self._cell, self._slabs = (
             rows,
@@ -46,8 +51,8 @@ class Coupling:
         )
         count = len(self._columns.columns)
         total = np.zeros((2 * len(self._rows.columns), count), complex)
-        if not (isinstance(rows, Modes) and isinstance(columns, Modes)):
-            total += kernels.tilted(
+        if not (isinstance(rows, RegionModes) and isinstance(columns, RegionModes)):
+            total += kernels.tilted_rates(
                 self._stages,
                 self._z,
                 [self._changed(k, table) for k, table in enumerate(changes)],
@@ -59,20 +64,22 @@ class Coupling:
                 if change is not None:
                     turned = kernels.in_modes(rows, columns, self._z, change)
                     integrals = self._plain if sign > 0 else self._sloped
-                    total += kernels.upright(turned, integrals, sign, back, light)
+                    total += kernels.upright_rates(turned, integrals, sign, back, light)
         return total.reshape(2, -1, count) * self._columns.scale
 
     def _changed(self, k: int, table: Tables | None) -> Change | None:
-        return None if table is None else tables.change(*self._sections(k), table)
+        return (
+            None if table is None else tables.operator_rates(*self._sections(k), table)
+        )
 
     @functools.cached_property
-    def _held(self) -> dict[int, tuple[Section, Section]]:
+    def _held(self) -> dict[int, tuple[SectionMatrices, SectionMatrices]]:
         return {}
 
-    def _sections(self, k: int) -> tuple[Section, Section]:
+    def _sections(self, k: int) -> tuple[SectionMatrices, SectionMatrices]:
         if k not in self._held:
             first, second = (
-                tables.section(
+                tables.section_matrices(
                     one.space, one.ways, one.operations, self._slabs[k], self._cell
                 )
                 for one in (self._rows, self._columns)
@@ -81,26 +88,26 @@ class Coupling:
         return self._held[k]
 
     @functools.cached_property
-    def _stages(self) -> kernels.Stages:
+    def _stages(self) -> kernels.GaussStages:
         rows, columns, i = self._rows, self._columns, self._i
-        return kernels.stages(
+        return kernels.gauss_stages(
             rows.regions[i], columns.regions[i], rows.sent[i], columns.light[i]
         )
 
     @functools.cached_property
     def _plain(self) -> kernels.Integrals:
-        return kernels.plain(*self._modes)
+        return kernels.mode_integrals(*self._modes)
 
     @functools.cached_property
     def _sloped(self) -> kernels.Integrals:
-        return kernels.sloped(*self._modes)
+        return kernels.weighted_mode_integrals(*self._modes)
 
     @property
-    def _modes(self) -> tuple[Modes, Modes]:
+    def _modes(self) -> tuple[RegionModes, RegionModes]:
         rows, columns = (
             self._rows.regions[self._i].transposed,
             self._columns.regions[self._i].plain,
         )
-        if not (isinstance(rows, Modes) and isinstance(columns, Modes)):
+        if not (isinstance(rows, RegionModes) and isinstance(columns, RegionModes)):
             raise TypeError("a tilted wall has no modes")
         return rows, columns

@@ -13,7 +13,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.rcwa import made
-from metalens.rcwa.rates.regions import Fields, Modes, Region
+from metalens.rcwa.rates.regions import LayerRegion, RegionFields, RegionModes
 from metalens.rcwa.rates.tables import Change
 
 _NEAR = 0.3  # of the half phase between two modes: below it a series
@@ -21,7 +21,7 @@ Integrals = tuple[Array, Array]  # between modes that go the same way, and oppos
 
 
 def in_modes(
-    rows: Modes, columns: Modes, z: tuple[slice, slice], change: Change
+    rows: RegionModes, columns: RegionModes, z: tuple[slice, slice], change: Change
 ) -> tuple[Array, Array]:
     """V~^T dP V and W~^T dQ W; z: where among the waves those of dP stand."""
     first, second = rows.part, columns.part
@@ -30,12 +30,12 @@ def in_modes(
     return of_P, first.W.T @ change[1] @ second.W
 
 
-def upright(
+def upright_rates(
     change: tuple[Array, Array],
     integrals: Integrals,
     sign: int,
-    back: Fields,
-    light: Fields,
+    back: RegionFields,
+    light: RegionFields,
 ) -> Array:
     """(b, k) rates for a change :func:`in_modes`; sign: of the integrals between modes
     that go down.
@@ -47,7 +47,7 @@ def upright(
     return np.asarray(1j * (back.up.T @ ups + sign * back.down.T @ downs))
 
 
-def plain(rows: Modes, columns: Modes) -> Integrals:
+def mode_integrals(rows: RegionModes, columns: RegionModes) -> Integrals:
     """∫ exp(i (q + p) z) dz and ∫ exp(i q z + i p (h - z)) dz for every pair of modes."""
     q, p, h = rows.part.q[:, None], columns.part.q, columns.height
     same = np.expm1(1j * (q + p) * h) / (1j * (q + p))
@@ -61,7 +61,7 @@ def plain(rows: Modes, columns: Modes) -> Integrals:
     )
 
 
-def sloped(rows: Modes, columns: Modes) -> Integrals:
+def weighted_mode_integrals(rows: RegionModes, columns: RegionModes) -> Integrals:
     """The same with z / h - 1/2 as a factor, i h / 2 j1(y) exp(i (q + p) h / 2), y = (q
     +- p) h / 2: of changes that
     grow from -1/2 at the foot to 1/2 at the top. Between modes that go down it is the
@@ -82,7 +82,7 @@ def sloped(rows: Modes, columns: Modes) -> Integrals:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stages:
+class GaussStages:
     """All Gauss points of a tilted wall. share: (m, nodes) what a change of each of the
     cross-sections whose polynomial
     the wall is counts there; u, w, u_back, w_back: (m, n, k) and (m, n, b) fields."""
@@ -94,14 +94,18 @@ class Stages:
     w_back: Array
 
 
-def stages(rows: Region, columns: Region, back: Fields, light: Fields) -> Stages:
+def gauss_stages(
+    rows: LayerRegion, columns: LayerRegion, back: RegionFields, light: RegionFields
+) -> GaussStages:
     """Of one wall in two symmetry classes."""
     share, parts = [], []
     for i, (step, other) in enumerate(
         zip(columns.panels, rows.panels_transposed, strict=True)
     ):
         m, n = step.P.shape[:2]
-        share.append(-step.step * step.weights[:, None] * made.weights(step.share))
+        share.append(
+            -step.step * step.weights[:, None] * made.interpolation_weights(step.share)
+        )
         here = [
             (part @ light.ends[i + 1]).reshape(m, n, -1) for part in (step.u, step.w)
         ]
@@ -111,11 +115,11 @@ def stages(rows: Region, columns: Region, back: Fields, light: Fields) -> Stages
         ]
         parts.append(here + sent)
     u, w, u_back, w_back = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Stages(np.concatenate(share), u, w, u_back, w_back)
+    return GaussStages(np.concatenate(share), u, w, u_back, w_back)
 
 
-def tilted(
-    this: Stages, z: tuple[slice, slice], changes: Sequence[Change | None]
+def tilted_rates(
+    this: GaussStages, z: tuple[slice, slice], changes: Sequence[Change | None]
 ) -> Array:
     """(b, k) rates for a change of every cross-section."""
     total = np.zeros((this.u_back.shape[2], this.u.shape[2]), complex)
@@ -131,16 +135,16 @@ def tilted(
     return total
 
 
-def stretch(this: Region, back: Fields, light: Fields) -> Array:
+def height_rates(this: LayerRegion, back: RegionFields, light: RegionFields) -> Array:
     """(b, k) rates for each unit of reduced height: i (u~^T Q u - w~^T P w)."""
-    if isinstance(this.plain, Modes) and isinstance(this.transposed, Modes):
+    if isinstance(this.plain, RegionModes) and isinstance(this.transposed, RegionModes):
         part = this.plain.part
         (u, w), (u_back, w_back) = (
             _at_foot(this.plain, light),
             _at_foot(this.transposed, back),
         )
         return np.asarray(1j * (u_back.T @ part.Q @ u - w_back.T @ part.P @ w))
-    found, start = stages(this, this, back, light), 0
+    found, start = gauss_stages(this, this, back, light), 0
     total = np.zeros((found.u_back.shape[2], found.u.shape[2]), complex)
     for step in this.panels:
         at = slice(start, start + len(step.share))
@@ -155,6 +159,6 @@ def stretch(this: Region, back: Fields, light: Fields) -> Array:
     return total
 
 
-def _at_foot(side: Modes, fields: Fields) -> tuple[Array, Array]:
+def _at_foot(side: RegionModes, fields: RegionFields) -> tuple[Array, Array]:
     down = fields.down * np.exp(1j * side.part.q * side.height)[:, None]
     return side.part.W @ (fields.up + down), side.part.V @ (fields.up - down)

@@ -19,8 +19,8 @@ from metalens.cell.shapes.motion import difference
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import made
-from metalens.rcwa.rates.tables import numbers
-from metalens.rcwa.rates.truncated import Motion, shares, slab_at
+from metalens.rcwa.rates.tables import section_parameters
+from metalens.rcwa.rates.truncated import ParameterMotion, sampled_heights, slab_at
 
 # of a number; of 1 where it is an angle or a coordinate, of the size where it is a
 # change of width
@@ -29,7 +29,7 @@ _FILM_UM = 0.1  # thickness of a film at least, about which its change is looked
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class ChangedPillar:
     """A pillar whose number has changed: the cell, its size, and what all widths have
     grown by.
     """
@@ -40,24 +40,28 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class PillarParameter:
     """A number of a pillar: what the pillar is when it changes by an amount, and a step
     for differences.
     """
 
     name: str
-    moved: Callable[[float], Moved]
+    moved: Callable[[float], ChangedPillar]
     step: float
 
 
-def parameters(
+def pillar_parameters(
     cell: Cell, size_um: float, wavelength_um: float
-) -> dict[str, Parameter]:
+) -> dict[str, PillarParameter]:
     """All of them, by name."""
     found = [
-        Parameter("size_um", lambda x: Moved(cell, size_um + x), _STEP * size_um),
-        Parameter("grow_um", lambda x: Moved(cell, size_um, x), _STEP * size_um),
-        Parameter("sidewall_rad", _of(cell, size_um, "sidewall_rad"), _STEP),
+        PillarParameter(
+            "size_um", lambda x: ChangedPillar(cell, size_um + x), _STEP * size_um
+        ),
+        PillarParameter(
+            "grow_um", lambda x: ChangedPillar(cell, size_um, x), _STEP * size_um
+        ),
+        PillarParameter("sidewall_rad", _of(cell, size_um, "sidewall_rad"), _STEP),
         *_of_shape(cell, size_um),
         *_of_heights(cell, size_um),
         *_of_indices(cell, size_um, wavelength_um),
@@ -75,11 +79,13 @@ def _in_place(records: tuple[Any, ...], i: int, changed: object) -> tuple[Any, .
     return (*records[:i], changed, *records[i + 1 :])
 
 
-def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], Moved]:
-    return lambda x: Moved(_with(cell, name, getattr(cell, name) + x), size_um)
+def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], ChangedPillar]:
+    return lambda x: ChangedPillar(_with(cell, name, getattr(cell, name) + x), size_um)
 
 
-def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parameter]:
+def _of_indices(
+    cell: Cell, size_um: float, wavelength_um: float
+) -> list[PillarParameter]:
     """Real parts of the indices of pillar and surroundings, and of layers that have
     their own.
     """
@@ -88,16 +94,18 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
         now = materials.index(material, wavelength_um)
         return Index(now.real + x, now.imag)
 
-    def of_cell(name: str, x: float) -> Moved:
+    def of_cell(name: str, x: float) -> ChangedPillar:
         now = cell.fill if name == "between" else cell.pillar
-        return Moved(_with(cell, name, beside(now, x)), size_um)
+        return ChangedPillar(_with(cell, name, beside(now, x)), size_um)
 
-    def of_layer(i: int, name: str, x: float) -> Moved:
+    def of_layer(i: int, name: str, x: float) -> ChangedPillar:
         changed = _with(cell.layers[i], name, beside(getattr(cell.layers[i], name), x))
-        return Moved(_with(cell, "layers", _in_place(cell.layers, i, changed)), size_um)
+        return ChangedPillar(
+            _with(cell, "layers", _in_place(cell.layers, i, changed)), size_um
+        )
 
     found = [
-        Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP)
+        PillarParameter(f"{name}.n", functools.partial(of_cell, name), _STEP)
         for name in ("pillar", "between")
     ]
     for i, layer in enumerate(cell.layers):
@@ -107,7 +115,7 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
             if getattr(layer, name) is not None
         ]
         found += [
-            Parameter(
+            PillarParameter(
                 f"layers.{i}.{name}.n", functools.partial(of_layer, i, name), _STEP
             )
             for name in own
@@ -115,14 +123,16 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
     return found
 
 
-def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
+def _of_shape(cell: Cell, size_um: float) -> list[PillarParameter]:
     """Ratios, the in-plane angle, corners: every number that the record of the shape
     has.
     """
     shape, found = cell.shape, []
 
-    def changed(name: str, value: Callable[[float], Any]) -> Callable[[float], Moved]:
-        return lambda x: Moved(
+    def changed(
+        name: str, value: Callable[[float], Any]
+    ) -> Callable[[float], ChangedPillar]:
+        return lambda x: ChangedPillar(
             dataclasses.replace(cell, shape=_with(shape, name, value(x))), size_um
         )
 
@@ -131,7 +141,7 @@ def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
         if part.type is float:  # a whole number too, but no count of sides
             step = _STEP if name.endswith("_rad") else _STEP * now
             found.append(
-                Parameter(
+                PillarParameter(
                     f"shape.{name}",
                     changed(name, functools.partial(operator.add, now)),
                     step,
@@ -140,7 +150,9 @@ def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
         elif isinstance(now, tuple):
             for i, axis in np.ndindex(len(now), 2):
                 corner = changed(name, functools.partial(_shifted, now, i, axis))
-                found.append(Parameter(f"shape.{name}.{i}.{'xy'[axis]}", corner, _STEP))
+                found.append(
+                    PillarParameter(f"shape.{name}.{i}.{'xy'[axis]}", corner, _STEP)
+                )
     return found
 
 
@@ -152,14 +164,14 @@ def _shifted(
     return tuple((float(a), float(b)) for a, b in moved)
 
 
-def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
+def _of_heights(cell: Cell, size_um: float) -> list[PillarParameter]:
     """Heights of the pillar or of its layers, their growth and coats, thicknesses of
     films.
     """
     found = []
     if not cell.layers:
         found.append(
-            Parameter(
+            PillarParameter(
                 "height_um", _of(cell, size_um, "height_um"), _STEP * cell.height_um
             )
         )
@@ -171,13 +183,15 @@ def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
         ):
             step = _STEP * (size_um if name == "grow_um" else getattr(layer, name))
             found.append(
-                Parameter(f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step)
+                PillarParameter(
+                    f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step
+                )
             )
     for side in ("under", "over"):
         for i, film in enumerate(getattr(cell, side)):
             step = _STEP * max(film.thickness_um, _FILM_UM)
             found.append(
-                Parameter(
+                PillarParameter(
                     f"{side}.{i}.thickness_um", _of_film(cell, size_um, side, i), step
                 )
             )
@@ -186,11 +200,11 @@ def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
 
 def _of_layer(
     cell: Cell, size_um: float, i: int, name: str
-) -> Callable[[float], Moved]:
-    def moved(x: float) -> Moved:
+) -> Callable[[float], ChangedPillar]:
+    def moved(x: float) -> ChangedPillar:
         changed = _with(cell.layers[i], name, getattr(cell.layers[i], name) + x)
         layers = _in_place(cell.layers, i, changed)
-        return Moved(
+        return ChangedPillar(
             dataclasses.replace(
                 cell, layers=layers, height_um=sum(layer.height_um for layer in layers)
             ),
@@ -200,20 +214,22 @@ def _of_layer(
     return moved
 
 
-def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float], Moved]:
+def _of_film(
+    cell: Cell, size_um: float, side: str, i: int
+) -> Callable[[float], ChangedPillar]:
     """Heights change alike at any thickness; a film of none cannot have less."""
 
-    def moved(x: float) -> Moved:
+    def moved(x: float) -> ChangedPillar:
         films = getattr(cell, side)
         changed = _with(
             films[i], "thickness_um", max(films[i].thickness_um, _FILM_UM) + x
         )
-        return Moved(_with(cell, side, _in_place(films, i, changed)), size_um)
+        return ChangedPillar(_with(cell, side, _in_place(films, i, changed)), size_um)
 
     return moved
 
 
-def motion(this: Parameter, wavelength_um: float) -> Motion:
+def parameter_motion(this: PillarParameter, wavelength_um: float) -> ParameterMotion:
     """What it moves.
 
     Raises:
@@ -230,7 +246,7 @@ def motion(this: Parameter, wavelength_um: float) -> Motion:
                         functools.partial(_numbers, this, wavelength_um, i, s),
                         this.step,
                     )
-                    for s in shares(cell)
+                    for s in sampled_heights(cell)
                 ]
             )
             for i in range(len(cell.sections))
@@ -239,16 +255,16 @@ def motion(this: Parameter, wavelength_um: float) -> Motion:
         raise CellError(
             f"no derivative by {this.name}: {error} (or ask for others alone, by = ...)"
         ) from None
-    return Motion(heights, by)
+    return ParameterMotion(heights, by)
 
 
 def _numbers(
-    this: Parameter, wavelength_um: float, i: int, share: float, x: float
+    this: PillarParameter, wavelength_um: float, i: int, share: float, x: float
 ) -> Array:
     """Of section i at a share of its height, where the number has changed by x."""
     now = this.moved(x)
-    layer, grow = made.spread(now.cell)[i]
-    return numbers(
+    layer, grow = made.sections_with_growth(now.cell)[i]
+    return section_parameters(
         slab_at(
             now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share
         )

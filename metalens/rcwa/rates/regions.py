@@ -18,21 +18,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.rcwa.layer import Layer
-from metalens.rcwa.stack import Pair, foot_pair, reflection
-from metalens.rcwa.wall import EDGES, Panel, Wall, panel
+from metalens.rcwa.layer import FourierModes
+from metalens.rcwa.stack import Pair, foot_pair, layer_reflection
+from metalens.rcwa.wall import EDGES, CollocatedPanel, TiltedWall, collocate_panel
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Modes:
+class RegionModes:
     """A layer by its modes, and its height times k0."""
 
-    part: Layer
+    part: FourierModes
     height: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Steps:
+class PanelSteps:
     """A tilted wall by the matrices of its panels from their upper to their lower ends,
     foot first.
     """
@@ -41,7 +41,7 @@ class Steps:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fields:
+class RegionFields:
     """Of waves in one region, (..., k) of k of them. up, down: (n, k) of its modes, at
     foot and top; or of a tilted
     wall ends: (panels + 1, 2 n, k) fields (u, w) at the ends of the panels, foot first.
@@ -51,63 +51,66 @@ class Fields:
     down: Array
     ends: Array
 
-    def beside(self, other: "Fields") -> "Fields":
+    def beside(self, other: "RegionFields") -> "RegionFields":
         """These waves and others."""
         pairs = ((self.up, other.up), (self.down, other.down), (self.ends, other.ends))
-        return Fields(*(np.concatenate(pair, axis=-1) for pair in pairs))
+        return RegionFields(*(np.concatenate(pair, axis=-1) for pair in pairs))
 
     @property
-    def upside_down(self) -> "Fields":
+    def upside_down(self) -> "RegionFields":
         """The same, seen in a frame that is turned upside down."""
         n = self.ends.shape[1] // 2
-        return Fields(
+        return RegionFields(
             self.down, self.up, self.ends[::-1] * np.repeat([1.0, -1.0], n)[:, None]
         )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Region:
+class LayerRegion:
     """A film or section: as it is, with transposed operators, and these upside down.
 
     height: times k0. panels, panels_transposed: of a tilted wall, foot first.
     """
 
     height: float
-    plain: Modes | Steps
-    transposed: Modes | Steps
-    reverse: Modes | Steps
-    panels: tuple[Panel, ...] = ()
-    panels_transposed: tuple[Panel, ...] = ()
+    plain: RegionModes | PanelSteps
+    transposed: RegionModes | PanelSteps
+    reverse: RegionModes | PanelSteps
+    panels: tuple[CollocatedPanel, ...] = ()
+    panels_transposed: tuple[CollocatedPanel, ...] = ()
 
 
-def of_modes(part: Layer, height: float) -> Region:
+def of_modes(part: FourierModes, height: float) -> LayerRegion:
     """An upright section, or a film."""
     if part.symmetric:
-        same = Modes(part, height)
-        return Region(height, same, same, same)
+        same = RegionModes(part, height)
+        return LayerRegion(height, same, same, same)
     W, V = np.linalg.inv(part.V).T, np.linalg.inv(part.W).T
-    turned = Modes(Layer(part.P.T, part.Q.T, part.q, W, V, symmetric=False), height)
-    return Region(height, Modes(part, height), turned, turned)
+    turned = RegionModes(
+        FourierModes(part.P.T, part.Q.T, part.q, W, V, symmetric=False), height
+    )
+    return LayerRegion(height, RegionModes(part, height), turned, turned)
 
 
-def of_wall(this: Wall, stages: int, *, symmetric: bool) -> Region:
+def of_wall(this: TiltedWall, stages: int, *, symmetric: bool) -> LayerRegion:
     """A tilted section."""
 
     def transposed(share: float) -> tuple[Array, Array]:
         P, Q = this.sample(share)
         return P.T, Q.T
 
-    def panels(wall: Wall) -> tuple[Panel, ...]:
+    def panels(wall: TiltedWall) -> tuple[CollocatedPanel, ...]:
         return tuple(
-            panel(wall, low, high, stages) for low, high in itertools.pairwise(EDGES)
+            collocate_panel(wall, low, high, stages)
+            for low, high in itertools.pairwise(EDGES)
         )
 
     plain = panels(this)
-    turned = plain if symmetric else panels(Wall(transposed, this.reduced_height))
-    steps = Steps(tuple(part.downwards for part in plain))
-    reverse = Steps(tuple(_reversed(matrix) for matrix in steps.downwards[::-1]))
-    other = steps if symmetric else Steps(tuple(part.downwards for part in turned))
-    return Region(this.reduced_height, steps, other, reverse, plain, turned)
+    turned = plain if symmetric else panels(TiltedWall(transposed, this.reduced_height))
+    steps = PanelSteps(tuple(part.downwards for part in plain))
+    reverse = PanelSteps(tuple(_reversed(matrix) for matrix in steps.downwards[::-1]))
+    other = steps if symmetric else PanelSteps(tuple(part.downwards for part in turned))
+    return LayerRegion(this.reduced_height, steps, other, reverse, plain, turned)
 
 
 def _reversed(matrix: Array) -> Array:
@@ -120,9 +123,9 @@ def _reversed(matrix: Array) -> Array:
     )
 
 
-def match(
-    regions: Sequence[Modes | Steps], top: Pair, foot: Pair, sources: Array
-) -> tuple[list[Fields], Array, Array]:
+def match_regions(
+    regions: Sequence[RegionModes | PanelSteps], top: Pair, foot: Pair, sources: Array
+) -> tuple[list[RegionFields], Array, Array]:
     """Fields that radiate into ``top``, and whose incident part gives foot V u + U w =
     sources; see ``stack.match``.
 
@@ -144,9 +147,11 @@ def match(
     return found, start, here
 
 
-def _down(region: Modes | Steps, pair: Pair) -> tuple[Pair, tuple[Array, ...]]:
-    if isinstance(region, Modes):
-        back, kept, fade = reflection(region.part, region.height, pair)
+def _down(
+    region: RegionModes | PanelSteps, pair: Pair
+) -> tuple[Pair, tuple[Array, ...]]:
+    if isinstance(region, RegionModes):
+        back, kept, fade = layer_reflection(region.part, region.height, pair)
         return foot_pair(region.part, back, kept, fade), (back, fade)
     both = np.concatenate([np.diag(side) if side.ndim == 1 else side for side in pair])
     made: list[Array] = [both]
@@ -158,16 +163,16 @@ def _down(region: Modes | Steps, pair: Pair) -> tuple[Pair, tuple[Array, ...]]:
 
 
 def _up(
-    region: Modes | Steps, state: tuple[Array, ...], here: Array
-) -> tuple[Fields, Array]:
+    region: RegionModes | PanelSteps, state: tuple[Array, ...], here: Array
+) -> tuple[RegionFields, Array]:
     n = len(here) // 2
-    if isinstance(region, Modes):
+    if isinstance(region, RegionModes):
         part, (back, fade) = region.part, state
         up = (np.linalg.solve(part.W, here[:n]) + np.linalg.solve(part.V, here[n:])) / 2
         down = back @ up[: len(fade)]
         late = np.zeros_like(up)
         late[: len(fade)] = fade[:, None] * up[: len(fade)]
-        return Fields(up, down, np.zeros((1, 0, here.shape[1]))), np.concatenate(
+        return RegionFields(up, down, np.zeros((1, 0, here.shape[1]))), np.concatenate(
             [part.W @ (late + down), part.V @ (late - down)]
         )
     a, ends = state[-1].conj().T @ here, [here]
@@ -175,4 +180,4 @@ def _up(
         a = np.linalg.solve(scale, a)
         ends.append(both @ a)
     none = np.zeros((0, here.shape[1]))
-    return Fields(none, none, np.array(ends)), ends[-1]
+    return RegionFields(none, none, np.array(ends)), ends[-1]

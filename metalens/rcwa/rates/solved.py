@@ -12,15 +12,21 @@ from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern
 from metalens.rcwa.layer import film_layer
 from metalens.rcwa.orders import mirrors
-from metalens.rcwa.orders.mirrors import Operation, Orders
-from metalens.rcwa.orders.waves import Waves, half_space
-from metalens.rcwa.problem import Problem, waves_of
-from metalens.rcwa.rates.regions import Fields, Region, match, of_modes, of_wall
-from metalens.rcwa.stack import flux, outgoing
+from metalens.rcwa.orders.mirrors import Operation, ReducedOrders
+from metalens.rcwa.orders.waves import PlaneWaves, half_space
+from metalens.rcwa.problem import CellProblem, waves_of
+from metalens.rcwa.rates.regions import (
+    LayerRegion,
+    RegionFields,
+    match_regions,
+    of_modes,
+    of_wall,
+)
+from metalens.rcwa.stack import outgoing_amplitudes, power_flux
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solved:
+class AdjointClass:
     """One symmetry class.
 
     columns: the k polarisations that its zero orders are. regions, light, sent: what
@@ -31,13 +37,13 @@ class Solved:
     light of unit power of ``light``.
     """
 
-    space: Orders
-    ways: Waves
+    space: ReducedOrders
+    ways: PlaneWaves
     operations: tuple[Operation, ...]
     columns: list[int]
-    regions: list[Region]
-    light: list[Fields]
-    sent: list[Fields]
+    regions: list[LayerRegion]
+    light: list[RegionFields]
+    sent: list[RegionFields]
     both: Array
     energy: Array
     scale: Array
@@ -48,13 +54,13 @@ class Solved:
         return slice(self.ways.bare, self.ways.p_count)
 
 
-def solved(
-    this: Problem, operations: tuple[Operation, ...], reach: int, stages: int
-) -> Solved:
+def solve_adjoint_class(
+    this: CellProblem, operations: tuple[Operation, ...], reach: int, stages: int
+) -> AdjointClass:
     """At one truncation; stages: of the collocation of a tilted wall, 0 for an upright
     one.
     """
-    space = mirrors.orders(reach, pattern.frame(this.cell, operations))
+    space = mirrors.reduced_orders(reach, pattern.lattice_frame(this.cell, operations))
     ways, places = waves_of(space, this.cell, this.light)
     regions = _regions(this, space, ways, stages)
     below, above = (
@@ -64,14 +70,19 @@ def solved(
     unit = np.zeros((len(ways.kappa), len(places)))
     for k, (at, sign) in enumerate(places.values()):
         unit[at, k] = sign
-    foot_share, top_share = np.sqrt(flux(below))[:, None], np.sqrt(flux(above))[:, None]
+    foot_share, top_share = (
+        np.sqrt(power_flux(below))[:, None],
+        np.sqrt(power_flux(above))[:, None],
+    )
     scale = 1 / (np.abs(unit) * foot_share).sum(axis=0)
     source = 2 * (below[0] * below[1])[:, None] * unit
-    light, foot, top = match([part.plain for part in regions], above, below, source)
-    from_below, _, _ = match(
+    light, foot, top = match_regions(
+        [part.plain for part in regions], above, below, source
+    )
+    from_below, _, _ = match_regions(
         [part.transposed for part in regions], above, below, foot_share * unit
     )
-    from_above, _, _ = match(
+    from_above, _, _ = match_regions(
         [part.reverse for part in regions[::-1]], below, above, top_share * unit
     )
     sent = [
@@ -81,27 +92,40 @@ def solved(
     n = len(unit)
     U, V = below[0][:, None], below[1][:, None]
     t = (
-        outgoing((above[0][:, None], above[1][:, None]), top[:n], top[n:])
+        outgoing_amplitudes((above[0][:, None], above[1][:, None]), top[:n], top[n:])
         * top_share
         * scale
     )
-    r = outgoing((U, V), foot[:n] - U * unit, V * unit - foot[n:]) * foot_share * scale
+    r = (
+        outgoing_amplitudes((U, V), foot[:n] - U * unit, V * unit - foot[n:])
+        * foot_share
+        * scale
+    )
     energy = (np.abs(t) ** 2 + np.abs(r) ** 2).sum(axis=0)
     both = np.stack([unit.T @ t, unit.T @ r])
-    return Solved(
+    return AdjointClass(
         space, ways, operations, list(places), regions, light, sent, both, energy, scale
     )
 
 
-def _regions(this: Problem, space: Orders, ways: Waves, stages: int) -> list[Region]:
+def _regions(
+    this: CellProblem, space: ReducedOrders, ways: PlaneWaves, stages: int
+) -> list[LayerRegion]:
     """Films and sections, foot first."""
     symmetric = this.cell.outline(this.size_um).keeps(-1, -1)
-    operators = functools.partial(pattern.operators, space, ways, cell=this.cell)
-    walls = made.walls(this.cell, this.size_um, this.light.wavelength_um, operators)
+    operators = functools.partial(
+        pattern.section_operators, space, ways, cell=this.cell
+    )
+    walls = made.section_walls(
+        this.cell, this.size_um, this.light.wavelength_um, operators
+    )
     if stages:
         middle = [of_wall(wall, stages, symmetric=symmetric) for wall in walls]
     else:
-        parts = [modes.layer(*wall.sample(0.5), symmetric=symmetric) for wall in walls]
+        parts = [
+            modes.solve_eigenmodes(*wall.sample(0.5), symmetric=symmetric)
+            for wall in walls
+        ]
         middle = [
             of_modes(part, wall.reduced_height)
             for part, wall in zip(parts, walls, strict=True)

@@ -22,8 +22,8 @@ from metalens.cell.shapes import motion
 from metalens.ground.arrays import Array
 from metalens.rcwa import pattern
 from metalens.rcwa.orders import mirrors
-from metalens.rcwa.orders.mirrors import Operation, Orders
-from metalens.rcwa.orders.waves import Waves
+from metalens.rcwa.orders.mirrors import Operation, ReducedOrders
+from metalens.rcwa.orders.waves import PlaneWaves
 
 Tables = tuple[
     Array, Array
@@ -33,41 +33,41 @@ _NONE = 1e-13  # of a table: rounding
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Section:
+class SectionMatrices:
     """Matrices of a cross-section in one symmetry class.
 
     stiff: [1/eps]^-1 in the orders of Ex, Ey; normals: of N, by rows and columns;
     upright: [eps]^-1 of Ez.
     """
 
-    space: Orders
-    ways: Waves
+    space: ReducedOrders
+    ways: PlaneWaves
     operations: tuple[Operation, ...]
     stiff: tuple[Array, Array]
     normals: tuple[tuple[Array, Array], tuple[Array, Array]]
     upright: Array
 
 
-def section(
-    space: Orders,
-    ways: Waves,
+def section_matrices(
+    space: ReducedOrders,
+    ways: PlaneWaves,
     operations: tuple[Operation, ...],
-    this: pattern.Slab,
+    this: pattern.PillarSection,
     cell: Cell,
-) -> Section:
+) -> SectionMatrices:
     """Of a slab."""
-    direct, inverse = pattern.tables(this, cell, space.reach)
+    direct, inverse = pattern.permittivity_coefficients(this, cell, space.reach)
     xx, yy, xy = pattern.normal_tables(this.outlines, cell, space.reach)
     first, second = (
-        np.linalg.inv(mirrors.product(space, inverse, link)) for link in (0, 1)
+        np.linalg.inv(mirrors.toeplitz_product(space, inverse, link)) for link in (0, 1)
     )
     nx, ny, mixed = (
-        mirrors.product(space, xx, 0),
-        mirrors.product(space, yy, 1),
-        mirrors.product(space, xy, 3),
+        mirrors.toeplitz_product(space, xx, 0),
+        mirrors.toeplitz_product(space, yy, 1),
+        mirrors.toeplitz_product(space, xy, 3),
     )
-    upright = np.linalg.inv(mirrors.product(space, direct, 2))
-    return Section(
+    upright = np.linalg.inv(mirrors.toeplitz_product(space, direct, 2))
+    return SectionMatrices(
         space,
         ways,
         operations,
@@ -77,7 +77,7 @@ def section(
     )
 
 
-def numbers(this: pattern.Slab) -> Array:
+def section_parameters(this: pattern.PillarSection) -> Array:
     """(k,) numbers of all outlines, then the permittivities from the inside out."""
     return np.concatenate(
         [
@@ -88,10 +88,10 @@ def numbers(this: pattern.Slab) -> Array:
     )
 
 
-def coefficients(
-    this: pattern.Slab, cell: Cell, reach: tuple[int, int], rates: Array
+def coefficient_rates(
+    this: pattern.PillarSection, cell: Cell, reach: tuple[int, int], rates: Array
 ) -> Tables:
-    """Derivatives of the coefficients of eps and 1/eps, as :func:`numbers` change at
+    """Derivatives of the coefficients of eps and 1/eps, as :func:`section_parameters` change at
     these rates.
     """
     x, y = cell.lattice.periods_um(cell.pitch_um)
@@ -121,7 +121,9 @@ def coefficients(
     return direct.reshape(len(m), len(n)), inverse.reshape(len(m), len(n))
 
 
-def change(rows: Section, columns: Section, tables: Tables) -> Change | None:
+def operator_rates(
+    rows: SectionMatrices, columns: SectionMatrices, tables: Tables
+) -> Change | None:
     """dP and dQ for these derivatives of the coefficients; None where they do not
     couple the classes.
     """
@@ -135,7 +137,7 @@ def change(rows: Section, columns: Section, tables: Tables) -> Change | None:
         for name in ("ex", "ey", "ez")
     ]
     links = [
-        mirrors.link(row, column, columns.operations, rows.space.reach)
+        mirrors.link_sets(row, column, columns.operations, rows.space.reach)
         for row, column in pairs
     ]
     plain = [mirrors.product_by(link, direct) for link in links]
@@ -162,7 +164,7 @@ def change(rows: Section, columns: Section, tables: Tables) -> Change | None:
     return dP, (right @ (left @ whole).T).T
 
 
-def _coupling(rows: Section, columns: Section, table: Array) -> Array:
+def _coupling(rows: SectionMatrices, columns: SectionMatrices, table: Array) -> Array:
     """The part of a function that turns the fields of one class into those of the
     other.
     """
@@ -172,4 +174,4 @@ def _coupling(rows: Section, columns: Section, table: Array) -> Array:
             rows.operations, columns.operations, strict=True
         )
     ]
-    return pattern.real(np.mean(images, axis=0))
+    return pattern.without_rounding(np.mean(images, axis=0))

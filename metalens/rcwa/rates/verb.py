@@ -9,14 +9,29 @@ import numpy as np
 from metalens.cell import Cell, check_tolerance
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.rcwa.any_shape import Jones, climbed, collocation, ladder, moved, unjudged
-from metalens.rcwa.problem import Problem, problem
-from metalens.rcwa.rates.parameters import Parameter, motion, parameters
-from metalens.rcwa.rates.truncated import Motion, Rates, truncated
+from metalens.rcwa.any_shape import (
+    Jones,
+    choose_stages,
+    estimate_error,
+    refine_truncation,
+    truncation_sequence,
+    without_error,
+)
+from metalens.rcwa.problem import CellProblem, cell_problem
+from metalens.rcwa.rates.parameters import (
+    PillarParameter,
+    parameter_motion,
+    pillar_parameters,
+)
+from metalens.rcwa.rates.truncated import (
+    ParameterMotion,
+    TruncatedRates,
+    solve_with_rates,
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rate:
+class ParameterDerivative:
     """Derivative by one number, per um, rad or 1 as its name says.
 
     t, r: (2, 2) as of :class:`metalens.rcwa.Jones`. error: estimate of the largest
@@ -35,7 +50,7 @@ class JonesDerivatives:
     """
 
     jones: Jones
-    by: dict[str, Rate]
+    by: dict[str, ParameterDerivative]
 
 
 def jones_derivatives(
@@ -82,33 +97,37 @@ def jones_derivatives(
     (True, True)
     """
     check_tolerance(tolerance)
-    this = problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
-    wanted = _wanted(parameters(cell, size_um, wavelength_um), by)
-    motions = {one.name: motion(one, wavelength_um) for one in wanted}
-    climb = ladder(this, harmonics, collocated=bool(cell.sidewall_rad))
-    stages, cut = collocation(this, climb, tolerance)
-    found: list[Rates] = []
+    this = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
+    wanted = _wanted(pillar_parameters(cell, size_um, wavelength_um), by)
+    motions = {one.name: parameter_motion(one, wavelength_um) for one in wanted}
+    climb = truncation_sequence(this, harmonics, collocated=bool(cell.sidewall_rad))
+    stages, cut = choose_stages(this, climb, tolerance)
+    found: list[TruncatedRates] = []
 
     def at(reach: int) -> Jones:
-        found.append(truncated(this, reach, stages, motions))
-        return unjudged(this, reach, found[-1].both, found[-1].energy)
+        found.append(solve_with_rates(this, reach, stages, motions))
+        return without_error(this, reach, found[-1].both, found[-1].energy)
 
-    value = climbed(climb, cut, tolerance, at)
+    value = refine_truncation(climb, cut, tolerance, at)
     last = climb.reaches[len(found) - 1]
     left = _left_by_collocation(this, motions, stages, climb.reaches[0])
     rates = {}
     for name in motions:
         history = [one.by[name] for one in found]
         error = (
-            climb.crowded * moved(history, last, climb.before)
+            climb.crowded * estimate_error(history, last, climb.before)
             if len(history) > 1
             else math.inf
         )
-        rates[name] = Rate(history[-1][0], history[-1][1], error + left[name])
+        rates[name] = ParameterDerivative(
+            history[-1][0], history[-1][1], error + left[name]
+        )
     return JonesDerivatives(value, rates)
 
 
-def _wanted(known: dict[str, Parameter], by: Iterable[str] | None) -> list[Parameter]:
+def _wanted(
+    known: dict[str, PillarParameter], by: Iterable[str] | None
+) -> list[PillarParameter]:
     names = list(known) if by is None else list(by)
     for name in names:
         if name not in known:
@@ -119,12 +138,13 @@ def _wanted(known: dict[str, Parameter], by: Iterable[str] | None) -> list[Param
 
 
 def _left_by_collocation(
-    this: Problem, motions: dict[str, Motion], stages: int, reach: int
+    this: CellProblem, motions: dict[str, ParameterMotion], stages: int, reach: int
 ) -> dict[str, float]:
     """What one stage more changes at a coarse truncation; 0 for upright walls."""
     if not stages:
         return dict.fromkeys(motions, 0.0)
     few, more = (
-        truncated(this, reach, count, motions).by for count in (stages - 1, stages)
+        solve_with_rates(this, reach, count, motions).by
+        for count in (stages - 1, stages)
     )
     return {name: float(np.abs(more[name] - few[name]).max()) for name in motions}

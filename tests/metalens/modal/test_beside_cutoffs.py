@@ -12,8 +12,8 @@ import pytest
 from metalens.cell import Cell, Index, Light
 from metalens.modal import RUNGS, case_of, evaluate, ladder
 from metalens.modal.case import RARER
-from metalens.modal.engine import basis
-from metalens.modal.match import NEAR, lattice, nearness
+from metalens.modal.engine import homogeneous_basis
+from metalens.modal.match import NEAR, cutoff_proximity, lattice_wavenumbers
 
 
 def cell(pitch_um, height_um, pillar, substrate, cover, between):
@@ -113,7 +113,7 @@ def test_meshes_of_wide_discs_place_the_first_orders_to_millionths(rho):
     4e-5, and so do both forms; that
     of 6 by 2e-6 at most. The second asks for an outer degree too: 4e-5 where the gap is
     wide (degree 5: 5e-5)."""
-    placed = basis(rho, RUNGS[3].choice(rho).plan, False, 0.0)
+    placed = homogeneous_basis(rho, RUNGS[3].choice(rho).plan, False, 0.0)
     for family in (placed.te, placed.tm):
         first, second = (
             family[abs(family / (n * math.pi**2) - 1).argmin()] / (n * math.pi**2)
@@ -124,9 +124,9 @@ def test_meshes_of_wide_discs_place_the_first_orders_to_millionths(rho):
 
 
 def test_the_lattice_has_every_order_up_to_twice_the_cutoff_and_one_is_near_only_from_two_fifths_on():
-    have = lattice(11.0, 0.3)
+    have = lattice_wavenumbers(11.0, 0.3)
     for m, n in ((0, 0), (-1, 0), (1, 0), (0, 1), (-1, 1)):
         assert abs(have - ((0.3 + m * math.pi) ** 2 + (n * math.pi) ** 2)).min() < 1e-12
-    assert nearness((math.pi - 0.3) ** 2 / (1 + NEAR), 0.3) == pytest.approx(
+    assert cutoff_proximity((math.pi - 0.3) ** 2 / (1 + NEAR), 0.3) == pytest.approx(
         0.0, abs=1e-12
     )

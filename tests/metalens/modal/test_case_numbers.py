@@ -14,17 +14,17 @@ from metalens.cell.shapes.round import Circle
 from metalens.ground.errors import CellError
 from metalens.modal.case import (
     RARER,
-    Case,
-    Solution,
+    MeshSolution,
+    ModalCase,
     case_of,
     check_shape,
-    film,
+    fresnel_scattering,
     half_spaces,
     plane_of_incidence,
 )
 
 CELL = Cell(0.4, 0.7, Index(3.0, 0.2), Index(1.5), Index(1.2), Index(1.1))
-USUAL = Case(
+USUAL = ModalCase(
     rho=0.4,
     k0=1.2,
     height=3.0,
@@ -216,7 +216,9 @@ def test_a_disc_of_the_rarer_medium_is_strangest():
 
 
 def test_forms_are_apart_by_waves_and_rim_together():
-    one = Solution(np.eye(2), waves=0.25, rim=0.5, drift=0.1, energy=1.0, unknowns=3)
+    one = MeshSolution(
+        np.eye(2), waves=0.25, rim=0.5, drift=0.1, energy=1.0, unknowns=3
+    )
     assert one.spread == 0.75
     assert (one.grazing, one.beside, one.bloch, one.size, one.strange, one.damping) == (
         0,
@@ -236,5 +238,7 @@ def test_a_film_of_no_height_reflects_as_its_half_spaces_do(p, r, t):
     """k0 = kx = 2, permittivities 5 and 2: kz 4 and 2. Admittances in s 4 and 2; in p 5
     / 4 and 2 / 2.
     """
-    found = film(replace(USUAL, k0=2.0, bloch=2.0, below=5.0, above=2.0, p=p))
+    found = fresnel_scattering(
+        replace(USUAL, k0=2.0, bloch=2.0, below=5.0, above=2.0, p=p)
+    )
     assert found == pytest.approx(np.array([[r, t], [t, -r]]), rel=1e-12)

@@ -8,14 +8,19 @@ import pytest
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal import dense
-from metalens.modal.assembly import assemble
+from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
-from metalens.modal.homogeneous import modes
+from metalens.modal.homogeneous import homogeneous_modes
 from metalens.modal.ladder import RUNGS
-from metalens.modal.layer import Medium
-from metalens.modal.match import eliminated
-from metalens.modal.pencil import Turn, electric_pencil, low_levels, magnetic_pencil
-from metalens.modal.spaces import space
+from metalens.modal.layer import LayerMedium
+from metalens.modal.match import solve_symmetric
+from metalens.modal.pencil import (
+    CoordinateTurn,
+    electric_pencil,
+    low_levels,
+    magnetic_pencil,
+)
+from metalens.modal.spaces import build_symmetry_class
 
 # of products of 20 rows of numbers up to some tens, and of inverses whose condition is
 # below 1e3
@@ -35,12 +40,12 @@ def lower_alone(matrix):
 
 def test_factors_inverses_and_products():
     definite, _, right = drawn()
-    lower = dense.cholesky(lower_alone(definite))
+    lower = dense.cholesky_factor(lower_alone(definite))
     assert np.abs(lower @ lower.T - definite).max() < ROUNDING
     assert (lower == np.tril(lower)).all()
-    assert np.abs(lower @ dense.below(lower, right) - right).max() < ROUNDING
+    assert np.abs(lower @ dense.solve_lower(lower, right) - right).max() < ROUNDING
     assert (
-        np.abs(lower.T @ dense.below(lower, right, transposed=True) - right).max()
+        np.abs(lower.T @ dense.solve_lower(lower, right, transposed=True) - right).max()
         < ROUNDING
     )
     assert (
@@ -51,11 +56,13 @@ def test_factors_inverses_and_products():
         < ROUNDING
     )
     assert (
-        np.abs(dense.gram(right[:7]) - np.tril(right[:7].T @ right[:7])).max()
+        np.abs(dense.gram_matrix(right[:7]) - np.tril(right[:7].T @ right[:7])).max()
         < ROUNDING
     )
     assert (
-        np.abs(dense.added(definite.copy(), 0.3) - definite - 0.3 * np.eye(20)).max()
+        np.abs(
+            dense.add_diagonal(definite.copy(), 0.3) - definite - 0.3 * np.eye(20)
+        ).max()
         < ROUNDING
     )
 
@@ -68,7 +75,8 @@ def test_rows_of_zeros_count_for_nothing_between_vectors():
     )  # semidefinite, and 13 rows of zeros
     assert (
         np.abs(
-            dense.congruent(inner, right[:, :8]) - right[:, :8].T @ inner @ right[:, :8]
+            dense.congruence_product(inner, right[:, :8])
+            - right[:, :8].T @ inner @ right[:, :8]
         ).max()
         < ROUNDING
     )
@@ -76,13 +84,13 @@ def test_rows_of_zeros_count_for_nothing_between_vectors():
 
 def test_eigenvectors_of_one_matrix_and_of_two():
     definite, symmetric, _ = drawn()
-    level, vectors = dense.eigenvectors(lower_alone(symmetric))
+    level, vectors = dense.symmetric_eigenvectors(lower_alone(symmetric))
     assert np.abs(symmetric @ vectors - vectors * level).max() < ROUNDING
     value, pairs = dense.eigen_pairs(lower_alone(symmetric), lower_alone(definite))
     assert (np.diff(value) > 0).all()
     assert np.abs(symmetric @ pairs - definite @ pairs * value).max() < ROUNDING
     assert np.abs(pairs.T @ definite @ pairs - np.eye(20)).max() < ROUNDING
-    white, turn = dense.whitened(lower_alone(definite), lower_alone(symmetric))
+    white, turn = dense.whitened_levels(lower_alone(definite), lower_alone(symmetric))
     assert np.abs(turn.T @ definite @ turn - np.diag(np.abs(white))).max() < ROUNDING
     want = np.linalg.inv(symmetric)
     assert (
@@ -93,7 +101,7 @@ def test_eigenvectors_of_one_matrix_and_of_two():
 @pytest.mark.parametrize(
     "call",
     [
-        dense.cholesky,
+        dense.cholesky_factor,
         dense.definite_inverse,
         lambda m: dense.eigen_pairs(np.eye(20), m),
     ],
@@ -106,7 +114,7 @@ def test_what_is_not_definite_is_refused(call):
 @pytest.mark.parametrize("m", [0, 3, 8])
 def test_a_turn_of_the_first_alone_is_a_matrix(m):
     random = np.random.default_rng(m)
-    turn = Turn(random.normal(size=(m, m)), 8, 1.3)
+    turn = CoordinateTurn(random.normal(size=(m, m)), 8, 1.3)
     whole = 1.3 * np.eye(8)
     whole[:m, :m] = turn.low
     matrix, diagonal, block = (
@@ -143,13 +151,18 @@ def test_blocks_diagonalised_in_part_are_those_of_the_layer(contrast):
     """The pencil in the basis of the homogeneous modes, with its turns undone:
     stiffness of curl less k0² mass.
     """
-    symmetry_class = space(
-        assemble(0.5, RUNGS[1].choice(0.5).plan), electric=False, half_phase_rad=None
+    symmetry_class = build_symmetry_class(
+        assemble_disc(0.5, RUNGS[1].choice(0.5).plan),
+        electric=False,
+        half_phase_rad=None,
     )
     case = case_of(
         Cell(0.4, 0.7, Index(contrast), Index(1.6), Index(1.1)), 0.2, Light(0.85)
     )
-    b, medium = modes(symmetry_class), Medium(case.k0, case.disc, case.around)
+    b, medium = (
+        homogeneous_modes(symmetry_class),
+        LayerMedium(case.k0, case.disc, case.around),
+    )
     a, k2, step = len(b.te), case.k0**2, case.disc.real - case.around.real
     electric, magnetic = electric_pencil(b, medium), magnetic_pencil(b, medium)
     assert len(electric.te_turn.low) < a
@@ -190,6 +203,8 @@ def test_elimination_by_halves_is_a_solve(lift, first):
     matrix = matrix + matrix.T + np.diag([lift[0]] * 4 + [lift[1]] * 5)
     columns = random.normal(size=(9, 2))
     assert (
-        np.abs(matrix @ eliminated(matrix, 4, columns, first=first) - columns).max()
+        np.abs(
+            matrix @ solve_symmetric(matrix, 4, columns, first=first) - columns
+        ).max()
         < ROUNDING
     )

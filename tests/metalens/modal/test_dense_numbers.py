@@ -35,17 +35,19 @@ def alike(found, want):
 
 def test_a_diagonal_is_added_in_place():
     matrix = np.arange(9.0).reshape(3, 3)
-    assert dense.added(matrix, np.array([0.5, -7, 3])) is matrix
+    assert dense.add_diagonal(matrix, np.array([0.5, -7, 3])) is matrix
     assert matrix.tolist() == [[0.5, 1, 2], [3, -3, 5], [6, 7, 11]]
 
 
 def test_the_factor_is_lower_and_what_solves_with_it_inverts_it():
-    assert dense.cholesky(DEFINITE.copy()) == pytest.approx(L, **EXACT)
+    assert dense.cholesky_factor(DEFINITE.copy()) == pytest.approx(L, **EXACT)
     right = np.array([[1.0, 2], [-3, 4], [5, 0.5]])
-    assert dense.below(L, L @ right) == pytest.approx(right, **EXACT)
-    assert dense.below(L, L.T @ right, transposed=True) == pytest.approx(right, **EXACT)
+    assert dense.solve_lower(L, L @ right) == pytest.approx(right, **EXACT)
+    assert dense.solve_lower(L, L.T @ right, transposed=True) == pytest.approx(
+        right, **EXACT
+    )
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        dense.cholesky(np.diag([2.0, -1.0, 3.0]))
+        dense.cholesky_factor(np.diag([2.0, -1.0, 3.0]))
 
 
 def test_inverse_and_gram_are_lower_halves():
@@ -54,7 +56,7 @@ def test_inverse_and_gram_are_lower_halves():
         np.tril(whole), **EXACT
     )
     wide = np.array([[1.0, 2, -3], [0.5, 4, 7]])
-    assert dense.gram(wide) == pytest.approx(
+    assert dense.gram_matrix(wide) == pytest.approx(
         np.array([[1.25, 0, 0], [4, 20, 0], [0.5, 22, 58]]), **EXACT
     )
 
@@ -67,11 +69,13 @@ def test_a_congruence_leaves_out_rows_without_a_diagonal_alone():
         [14.25, 7.75],
         [7.75, 37.0],
     ]  # by hand: inner outer is (2.5, 4, 3.25) and (0, 9.5, 1) on the rows that count
-    assert dense.congruent(inner, outer) == pytest.approx(np.array(want), **EXACT)
+    assert dense.congruence_product(inner, outer) == pytest.approx(
+        np.array(want), **EXACT
+    )
 
 
 def test_eigenvalues_rise_and_their_vectors_are_columns():
-    value, vectors = dense.eigenvectors(symmetric(LEVELS, SPIN))
+    value, vectors = dense.symmetric_eigenvectors(symmetric(LEVELS, SPIN))
     assert value == pytest.approx(LEVELS, **EXACT)
     assert alike(vectors, SPIN)
 
@@ -90,6 +94,8 @@ def test_whitened_levels_come_with_the_roots_of_their_sizes():
     """Lᵀ inner L = turn levels turnᵀ; vectors L⁻ᵀ turn √|level|."""
     back = np.linalg.inv(L)
     whole = back.T @ ((SPIN * LEVELS) @ SPIN.T) @ back
-    level, vectors = dense.whitened(DEFINITE.copy(), np.where(np.tri(3), whole, 99.0))
+    level, vectors = dense.whitened_levels(
+        DEFINITE.copy(), np.where(np.tri(3), whole, 99.0)
+    )
     assert level == pytest.approx(LEVELS, **EXACT)
     assert alike(vectors, back.T @ SPIN * np.sqrt([3.0, 2.0, 7.0]))

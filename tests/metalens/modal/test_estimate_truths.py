@@ -80,7 +80,7 @@ def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_ne
     assert found.damping == min(first.damping, second.damping)
     assert (first.damping != second.damping) is hole
     assert found.beside == max(
-        match.nearness(case.k0**2 * n**2, case.bloch) for n in (1.45, 1.1)
+        match.cutoff_proximity(case.k0**2 * n**2, case.bloch) for n in (1.45, 1.1)
     )
     assert found.size == pytest.approx(case.k0 * abs(3.3 + 0.02j) / math.pi, rel=1e-12)
     mean = (first.matrix + second.matrix) / 2
@@ -97,7 +97,7 @@ def test_the_mean_of_matrices_with_one_basis_is_of_the_roots_of_their_products()
     assert got == pytest.approx((turn * (a * np.sqrt(b / a))) @ turn.conj().T, rel=1e-9)
     black = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-5]])
     assert engine.geometric_mean(black, 3 * black) == pytest.approx(2 * black)
-    assert engine.determinant(np.array([[2.0, 3j], [1.5, -1.0]])) == pytest.approx(
+    assert engine.determinant_2x2(np.array([[2.0, 3j], [1.5, -1.0]])) == pytest.approx(
         -2 - 4.5j
     )
 
@@ -124,11 +124,11 @@ def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_leas
     )
     monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
     usual = SimpleNamespace(**{**vars(CASE), "strange": 0.0})
-    met = engine.climb(usual, 0.02)
+    met = engine.refine_mesh(usual, 0.02)
     assert (met.solution, met.error, met.converged) == ("b", 0.02, True)
-    missed = engine.climb(usual, 0.01)
+    missed = engine.refine_mesh(usual, 0.01)
     assert (missed.solution, missed.error, missed.converged) == ("b", 0.02, False)
-    assert engine.climb(usual, 0.5).solution == "a"
+    assert engine.refine_mesh(usual, 0.5).solution == "a"
 
 
 def test_cells_unlike_those_of_lenses_begin_two_meshes_before_and_are_judged_by_all_that_were_solved(
@@ -164,7 +164,7 @@ def test_cells_unlike_those_of_lenses_begin_two_meshes_before_and_are_judged_by_
         (1e-4, "f", [("d", "bc"), ("f", "bcd")]),
     ):
         asked.clear()
-        found = engine.climb(hole, tolerance)
+        found = engine.refine_mesh(hole, tolerance)
         assert (found.solution, found.error, found.converged) == (
             name,
             bars[name],
@@ -173,7 +173,7 @@ def test_cells_unlike_those_of_lenses_begin_two_meshes_before_and_are_judged_by_
         assert asked == judged
     bars["c"] = 1.4
     monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in "abc"))
-    found = engine.climb(
+    found = engine.refine_mesh(
         hole, 3.5e-3
     )  # of what two meshes say an amplitude of 1 is unknown
     assert (found.error, found.converged) == (1.0, False)
@@ -239,14 +239,14 @@ def test_an_order_counts_as_at_its_cutoff_by_one_over_the_distance(apart, want):
     the next is far.
     """
     cutoff = (math.pi - 1.1) ** 2 / (1 + apart)
-    assert match.nearness(cutoff, 1.1) == pytest.approx(want, abs=1e-9)
+    assert match.cutoff_proximity(cutoff, 1.1) == pytest.approx(want, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("cutoff", "bloch"), [(17.0, 0.4), (120.0, -1.3), (3.1, 1.5), (61.0, 0.0)]
 )
 def test_the_wavenumbers_of_the_lattice_are_all_up_to_twice_the_cutoff(cutoff, bloch):
-    found = np.sort(match.lattice(cutoff, bloch))
+    found = np.sort(match.lattice_wavenumbers(cutoff, bloch))
     every = [
         (bloch + math.pi * m) ** 2 + (math.pi * n) ** 2
         for m in range(-40, 41)
@@ -263,5 +263,5 @@ def test_the_zero_order_keeps_the_wavenumber_of_the_mesh():
         0.9999 * zero
     ]
     assert (
-        match.nearness(1.05 * zero, 1.3) == 0
+        match.cutoff_proximity(1.05 * zero, 1.3) == 0
     )  # the next, (pi - 1.3)², is 1.9 times as far

@@ -7,9 +7,9 @@ import pytest
 import scipy.linalg as sl
 
 from metalens.modal import homogeneous
-from metalens.modal.assembly import assemble
+from metalens.modal.assembly import assemble_disc
 from metalens.modal.mesh import MeshPlan
-from metalens.modal.spaces import space
+from metalens.modal.spaces import build_symmetry_class
 
 PLAN = MeshPlan(1, 2, 1)
 SPACES = [(False, None), (False, 0.4), (True, 1.3)]
@@ -18,12 +18,14 @@ SPACES = [(False, None), (False, 0.4), (True, 1.3)]
 @pytest.fixture(scope="module", params=SPACES)
 def cell(request):
     electric, half = request.param
-    return space(assemble(0.57, PLAN), electric=electric, half_phase_rad=half)
+    return build_symmetry_class(
+        assemble_disc(0.57, PLAN), electric=electric, half_phase_rad=half
+    )
 
 
 @pytest.fixture(scope="module", params=["plain", "careful", "quick"])
 def made(cell, request):
-    return homogeneous.modes(
+    return homogeneous.homogeneous_modes(
         cell, careful=request.param == "careful", quick=request.param == "quick"
     )
 
@@ -63,7 +65,8 @@ def test_gradients_of_the_scalars_are_the_tm_modes(cell, made):
 
 def test_the_careful_way_is_taken_where_both_are_asked(cell):
     both, careful = (
-        homogeneous.modes(cell, careful=True, quick=quick) for quick in (True, False)
+        homogeneous.homogeneous_modes(cell, careful=True, quick=quick)
+        for quick in (True, False)
     )
     assert np.array_equal(both.tm, careful.tm)
     assert np.array_equal(both.te, careful.te)
@@ -105,5 +108,5 @@ def test_the_zero_order_is_given_its_exact_wavenumber(cell, made):
     ],
 )
 def test_a_wavenumber_near_that_of_the_zero_order_takes_it(lowest, half, want):
-    found = homogeneous.corrected(np.array([lowest, 7.0]), half)
+    found = homogeneous.exact_zero_order(np.array([lowest, 7.0]), half)
     assert found == pytest.approx(np.array([want, 7.0]), rel=1e-12, abs=0)

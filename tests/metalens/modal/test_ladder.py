@@ -12,15 +12,15 @@ import pytest
 from metalens import modal
 from metalens.cell import Cell, Index, Light
 from metalens.modal import case_of, evaluate, ladder
-from metalens.modal.ladder import Choice, Factors, Rung, Settling
+from metalens.modal.ladder import DampedEstimate, ErrorFactors, MeshChoice, Rung
 
 THIN_PLAN, WIDE_PLAN = object(), object()
-THIN = Factors(0.3, 1.4, flat=2e-4, steep=7e-4, oblique=3e-4)
-WIDE = Factors(0.7, 0.9, flat=1e-4, at_cutoff=3.1, grazing=0.15)
-ALONE, AFTER = Factors(2.2, 5.1, flat=6e-4), Factors(0.4, 0.6, moved=0.8)
+THIN = ErrorFactors(0.3, 1.4, flat=2e-4, steep=7e-4, oblique=3e-4)
+WIDE = ErrorFactors(0.7, 0.9, flat=1e-4, at_cutoff=3.1, grazing=0.15)
+ALONE, AFTER = ErrorFactors(2.2, 5.1, flat=6e-4), ErrorFactors(0.4, 0.6, moved=0.8)
 RUNG = Rung(
     "typed",
-    (Choice(THIN_PLAN, 0.6, THIN, AFTER), Choice(WIDE_PLAN, 1.0, WIDE, THIN)),
+    (MeshChoice(THIN_PLAN, 0.6, THIN, AFTER), MeshChoice(WIDE_PLAN, 1.0, WIDE, THIN)),
     1e-2,
     alone=ALONE,
 )
@@ -29,7 +29,7 @@ UNSEEN = 0.02 * 1e-2
 
 def whole(first):
     """Of a cell of lenses: with the orders beyond the first."""
-    return ladder.beyond(first)
+    return ladder.second_order_bound(first)
 
 
 def found(t=0.6 + 0.1j, **other):
@@ -105,7 +105,7 @@ def test_a_mesh_meant_for_wider_discs_is_judged_as_the_own_and_the_wider_one():
 
 def test_factors_of_wider_discs_do_not_count_where_the_mesh_is_the_own():
     """The same matrices: the estimate is that of a solve of this disc alone."""
-    wider = Choice(THIN_PLAN, 0.9, Factors(5.0, 5.0, flat=1e-2), AFTER)
+    wider = MeshChoice(THIN_PLAN, 0.9, ErrorFactors(5.0, 5.0, flat=1e-2), AFTER)
     assert RUNG.error(found(), 0.5, mesh=wider) == RUNG.error(found(), 0.5)
 
 
@@ -124,10 +124,10 @@ def test_after_other_meshes_the_farthest_change_counts_as_far_as_the_forms_have_
         found(rim=0.08, waves=0.2, t=0.1 + 0.1j),
         found(rim=0.001, waves=0.02, t=0.6 + 0.4j),
     )
-    assert ladder.settled(now, first) == pytest.approx(
+    assert ladder.damped_change(now, first) == pytest.approx(
         0.5 * math.sqrt(0.07 / 0.28), rel=1e-9
     )
-    assert ladder.settled(now, second) == pytest.approx(0.3, rel=1e-9)
+    assert ladder.damped_change(now, second) == pytest.approx(0.3, rel=1e-9)
     both = RUNG.error(now, 0.5, (first, second))
     assert both == pytest.approx(0.4 * 0.02 + 0.6 * 0.05 + 0.8 * 0.3, rel=1e-9)
     assert RUNG.error(now, 0.5, (first, first)) == pytest.approx(
@@ -136,7 +136,7 @@ def test_after_other_meshes_the_farthest_change_counts_as_far_as_the_forms_have_
     assert RUNG.error(now, 0.5, (second, first, first)) == RUNG.error(
         now, 0.5, (first, first)
     )
-    assert ladder.settled(
+    assert ladder.damped_change(
         now, found(rim=0.0, waves=0.0, t=0.1 + 0.1j)
     ) == pytest.approx(0.5, rel=1e-9)
     assert RUNG.error(found(), 0.5, (first,)) == RUNG.error(
@@ -151,7 +151,9 @@ def test_near_a_resonance_a_change_counts_by_as_much_as_waves_in_the_layer_go_un
     before = found(t=0.6 + 0.4j)
     for damping, factor in ((0.25, 4.0), (1.0, 1.0), (1.3, 1.0), (0.01, 6.0)):
         now = found(strange=1.0, damping=damping)
-        assert ladder.settled(now, before) == pytest.approx(0.3 * factor, rel=1e-9)
+        assert ladder.damped_change(now, before) == pytest.approx(
+            0.3 * factor, rel=1e-9
+        )
 
 
 def test_at_a_cutoff_the_last_change_of_a_disc_of_the_rarer_medium_counts_in_full_and_half_as_much_again():
@@ -211,7 +213,7 @@ def test_damped_cells_at_normal_incidence_are_judged_by_how_they_settle_where_th
         found(rim=0.08, waves=0.2, t=0.1 + 0.1j),
         found(rim=0.08, waves=0.2, t=0.6 + 0.3j, **before),
     )
-    settling = Settling(moved=0.2, forms=0.3, shared=1e-3)
+    settling = DampedEstimate(moved=0.2, forms=0.3, shared=1e-3)
     want = 0.2 * 0.25 + 0.3 * 0.07 + 1e-3 * 1.7
     assert settling.bound(found_, meshes) == pytest.approx(
         want if applies else math.inf, rel=1e-9
@@ -221,7 +223,7 @@ def test_damped_cells_at_normal_incidence_are_judged_by_how_they_settle_where_th
     )  # one mesh before tells nothing of how an answer settles
     rung, wide = (
         replace(RUNG, settling=settling),
-        replace(RUNG, settling=Settling(9.0, 9.0, 9.0)),
+        replace(RUNG, settling=DampedEstimate(9.0, 9.0, 9.0)),
     )
     usual = RUNG.error(found_, 0.5, meshes)
     assert want < usual == wide.error(found_, 0.5, meshes)
@@ -246,7 +248,7 @@ def test_the_first_mesh_is_the_coarsest_that_usually_meets_the_tolerance():
 def test_a_mesh_may_usually_meet_less_for_some_discs(monkeypatch):
     quick = Rung(
         "quick",
-        (Choice(THIN_PLAN, 0.3, THIN, AFTER, usual=3e-3), *RUNG.choices),
+        (MeshChoice(THIN_PLAN, 0.3, THIN, AFTER, usual=3e-3), *RUNG.choices),
         2e-2,
         alone=ALONE,
     )
@@ -295,7 +297,7 @@ def test_bars_of_slim_discs_hold_and_are_not_too_wide(place):
 def test_off_normal_incidence_waves_may_count_more():
     slanted = Rung(
         "slanted",
-        (Choice(THIN_PLAN, 1.0, Factors(0.3, 1.4, slanted=2.1), AFTER),),
+        (MeshChoice(THIN_PLAN, 1.0, ErrorFactors(0.3, 1.4, slanted=2.1), AFTER),),
         1e-9,
         alone=ALONE,
     )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from metalens.modal import layer
-from metalens.modal.homogeneous import Basis
-from metalens.modal.layer import Medium
+from metalens.modal.homogeneous import HomogeneousBasis
+from metalens.modal.layer import LayerMedium
 from tests.metalens.modal.unordered import apart
 
 A, B, K0 = 4, 3, 1.7
@@ -25,7 +25,7 @@ def part(rng, size, most):
 def basis():
     rng = np.random.default_rng(8)
     te, tm = np.array([0.0, 4.1, 9.3, 33.0]), np.array([3.7, 8.2, 45.0])
-    return Basis(te, tm, te + 9, tm + 9, lambda: np.eye(N), np.eye(B), part(rng, N, 0.9), part(rng, A, 20.0),
+    return HomogeneousBasis(te, tm, te + 9, tm + 9, lambda: np.eye(N), np.eye(B), part(rng, N, 0.9), part(rng, A, 20.0),
                  part(rng, B, 0.9))  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def test_modes_solve_the_equation_of_their_form(form, disc, around):
     """-q² growth w = stiffness w with p = growth w; growth and stiffness symmetric, q
     all of them, once each.
     """
-    medium = Medium(K0, disc, around)
+    medium = LayerMedium(K0, disc, around)
     found = {"electric": layer.electric_modes, "magnetic": layer.magnetic_modes}[form](
         basis(), medium
     )
@@ -96,7 +96,7 @@ def test_waves_decay_or_go_up():
     lie on it.
     """
     square = np.array([4.0, -9.0, 2j, -2j, 4 + 1e-10j, 4 - 1e-8j, -9 + 1e-12j])
-    found = layer.axial(square)
+    found = layer.axial_wavenumber(square)
     assert found**2 == pytest.approx(square)
     assert found[:4] == pytest.approx(np.array([2, 3j, 1 + 1j, -1 + 1j]))
     assert found[4] == pytest.approx(2, abs=1e-9)
@@ -104,14 +104,17 @@ def test_waves_decay_or_go_up():
         -2, abs=1e-7
     )  # that gains, by more than rounding, decays the other way
     assert found[5].imag > 0
-    assert layer.axial(np.array([0.0]))[0] == 0
+    assert layer.axial_wavenumber(np.array([0.0]))[0] == 0
 
 
 def test_permittivities_are_real_where_neither_absorbs():
-    assert Medium(1.0, 3.0 + 0j, 2.0 + 0j).permittivities() == (3.0, 2.0)
-    assert [type(e) for e in Medium(1.0, 3.0 + 0j, 2.0 + 0j).permittivities()] == [
+    assert LayerMedium(1.0, 3.0 + 0j, 2.0 + 0j).permittivities() == (3.0, 2.0)
+    assert [type(e) for e in LayerMedium(1.0, 3.0 + 0j, 2.0 + 0j).permittivities()] == [
         float,
         float,
     ]
-    for medium in (Medium(1.0, 3.0 + 1j, 2.0 + 0j), Medium(1.0, 3.0 + 0j, 2.0 + 1j)):
+    for medium in (
+        LayerMedium(1.0, 3.0 + 1j, 2.0 + 0j),
+        LayerMedium(1.0, 3.0 + 0j, 2.0 + 1j),
+    ):
         assert medium.permittivities() == (medium.disc, medium.around)

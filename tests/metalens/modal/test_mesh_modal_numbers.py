@@ -9,7 +9,7 @@ import pytest
 
 from metalens.modal import mesh
 from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan
-from metalens.modal.shapes import plain
+from metalens.modal.shapes import polynomial_interval
 
 PLAN = MeshPlan(
     2, 3, 4, inner=(0.6, 1.0), outer=(0.35, 1.0), sectors=(0.45, 1.0), core=0.55
@@ -63,9 +63,9 @@ def test_jacobians_of_every_element_are_those_of_the_map():
     """Rings, then sectors; the parts that grow with the radius and those that do not
     together.
     """
-    core, rings, rim, near, far = mesh.build(PLAN).patches
-    cuts, line = (0.0, 0.45, 1.0), plain(3, 7).point
-    across = plain(3, 8).point
+    core, rings, rim, near, far = mesh.build_mesh(PLAN).patches
+    cuts, line = (0.0, 0.45, 1.0), polynomial_interval(3, 7).point
+    across = polynomial_interval(3, 8).point
     for at, (i, j) in enumerate((i, j) for i in (0, 1) for j in (0, 1)):
 
         def inner(a, b, i=i, j=j):
@@ -122,7 +122,7 @@ def radial_points(patch):
     """Places along xi, from the linear functions of the basis: the sum over eta of
     those that grow along xi.
     """
-    high = len(plain(3, 8).value)
+    high = len(polynomial_interval(3, 8).value)
     rising = patch.basis.scalar[high : high + 2].sum(0)
     return rising.reshape(-1, 8)[:, 0]
 
@@ -131,7 +131,7 @@ def test_functions_are_counted_once_and_know_their_walls():
     """Vertices, edges and inside by Euler: 3 x 3 of the core, rings of 2 x 2 elements
     on both sides.
     """
-    made = mesh.build(PLAN)
+    made = mesh.build_mesh(PLAN)
     elements = 4 + 4 * 2 * 2
     # vertices: core 2 x 2 off its rim, and of 5 rings of ends 2 on either side and the
     # diagonal between
@@ -180,12 +180,12 @@ def test_rules_have_four_or_five_points_more_than_degrees_and_two_dozen_at_the_r
     """(3 + 4)² of the core; 3 + 5 along every ring, across it 2 + 5, 2 + 24 on both
     sides of the rim, 4 + 5.
     """
-    points = [len(patch.basis.weight) for patch in mesh.build(PLAN).patches]
+    points = [len(patch.basis.weight) for patch in mesh.build_mesh(PLAN).patches]
     assert points == [49, 7 * 8, 26 * 8, 26 * 8, 9 * 8]
 
 
 def test_every_function_is_had_by_as_many_elements_as_meet_there():
-    made = mesh.build(PLAN)
+    made = mesh.build_mesh(PLAN)
     for name, wall in (("vector", made.vector_wall), ("scalar", made.scalar_wall)):
         seen = np.concatenate([getattr(patch, name).ravel() for patch in made.patches])
         times = np.bincount(seen, minlength=len(wall))
@@ -204,7 +204,7 @@ def test_one_ring_and_one_sector_are_the_plain_plan():
         (1.0,),
         0.5,
     )
-    made = mesh.build(plan)
+    made = mesh.build_mesh(plan)
     assert [patch.inside for patch in made.patches] == [True, True, False]
     assert [len(patch.basis.along_xi) for patch in made.patches] == [
         3 * 4,

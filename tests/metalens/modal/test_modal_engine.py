@@ -13,14 +13,14 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError
 from metalens.modal import engine
-from metalens.modal.assembly import assemble
+from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate, geometric_mean, nearest_pairs
-from metalens.modal.homogeneous import modes
+from metalens.modal.homogeneous import homogeneous_modes
 from metalens.modal.ladder import RUNGS
-from metalens.modal.mesh import X0, X1, MeshPlan, build
-from metalens.modal.shapes import plain, rim, square
-from metalens.modal.spaces import space
+from metalens.modal.mesh import X0, X1, MeshPlan, build_mesh
+from metalens.modal.shapes import polynomial_interval, rim_interval, square_basis
+from metalens.modal.spaces import build_symmetry_class
 
 WAVELENGTH = 0.85
 PLAN = MeshPlan(3, 3, 3, (0.7, 1.3))
@@ -89,7 +89,9 @@ def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
     monkeypatch.setattr(
         engine, "evaluate", lambda case, plan, weak: (plan, round(10 * weak))
     )
-    made = engine.climb(SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance)
+    made = engine.refine_mesh(
+        SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance
+    )
     assert (made.solution, made.rung.name, made.error) == (
         (last, last),
         f"n{last}",
@@ -110,7 +112,7 @@ def test_a_mesh_that_is_the_one_before_is_not_solved_again(monkeypatch):
     monkeypatch.setattr(
         engine, "evaluate", lambda case, plan, weak: solved.append(plan) or plan
     )
-    made = engine.climb(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
+    made = engine.refine_mesh(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
     assert solved == ["a", "b"]
     assert (made.solution, made.error) == ("b", 0.01)
 
@@ -144,9 +146,9 @@ def test_modes_of_both_forms_are_paired_by_nearness_not_by_order():
 
 def test_slopes_are_orthonormal_and_integrate_to_the_values():
     for line in (
-        plain(5, 12),
-        rim(4, 28, (0.7, 1.3), False),
-        rim(4, 28, (0.7, 1.3), True),
+        polynomial_interval(5, 12),
+        rim_interval(4, 28, (0.7, 1.3), False),
+        rim_interval(4, 28, (0.7, 1.3), True),
     ):
         gram = (line.slope * line.weight) @ line.slope.T
         assert np.abs(gram - np.eye(line.degree)).max() < 1e-11
@@ -157,19 +159,19 @@ def test_slopes_are_orthonormal_and_integrate_to_the_values():
 
 
 def test_rim_rule_integrates_fractional_powers():
-    line = rim(3, 28, (0.7,), False)
+    line = rim_interval(3, 28, (0.7,), False)
     for power in (-0.6, -0.3, 0.7, 1.4, 2.0):
         assert abs((line.weight * line.point**power).sum() - 1 / (power + 1)) < 1e-12
 
 
 def test_curl_of_gradient_vanishes():
-    basis = square(rim(3, 20, (0.7,), True), plain(4, 9))
+    basis = square_basis(rim_interval(3, 20, (0.7,), True), polynomial_interval(4, 9))
     assert np.abs(basis.curl @ basis.gradient).max() == 0
 
 
 @pytest.mark.parametrize("rho", [0.025, 0.5, 0.975])
 def test_areas_of_disc_and_cell(rho):
-    geometry = assemble(rho, PLAN)
+    geometry = assemble_disc(rho, PLAN)
     # constants are the sum of the vertex functions: those that the gradient sends to
     # zero together
     _, _, right = np.linalg.svd(geometry.gradient)
@@ -183,7 +185,9 @@ def test_scalars_beyond_the_disc_have_no_gradient_in_it(half_phase):
     """And each of the others has: what counts is told by the numbering alone, and by
     the integrals.
     """
-    one = space(assemble(0.43, PLAN), electric=True, half_phase_rad=half_phase)
+    one = build_symmetry_class(
+        assemble_disc(0.43, PLAN), electric=True, half_phase_rad=half_phase
+    )
     assert (one.within == np.flatnonzero(one.disc.scalar.diagonal())).all()
     assert 0.4 < len(one.within) / len(one.disc.scalar) < 0.8
     reaching = np.abs(one.disc.mass @ one.gradient).max(0)
@@ -193,7 +197,7 @@ def test_scalars_beyond_the_disc_have_no_gradient_in_it(half_phase):
 
 
 def test_every_edge_is_shared_with_one_direction():
-    mesh = build(PLAN)
+    mesh = build_mesh(PLAN)
     keys = {
         pair
         for patch in mesh.patches
@@ -206,7 +210,11 @@ def test_every_edge_is_shared_with_one_direction():
 
 @pytest.mark.parametrize("half_phase", [None, 0.3, 1.2])
 def test_empty_cell_has_plane_waves_as_modes(half_phase):
-    basis = modes(space(assemble(0.5, PLAN), electric=True, half_phase_rad=half_phase))
+    basis = homogeneous_modes(
+        build_symmetry_class(
+            assemble_disc(0.5, PLAN), electric=True, half_phase_rad=half_phase
+        )
+    )
     along = (
         range(1, 5)
         if half_phase is None
@@ -222,7 +230,11 @@ def test_plane_waves_converge_exponentially_with_the_degree():
     errors = []
     for degree in (3, 4, 5):
         plan = MeshPlan(degree, degree, degree, (0.7,))
-        basis = modes(space(assemble(0.5, plan), electric=False, half_phase_rad=0.3))
+        basis = homogeneous_modes(
+            build_symmetry_class(
+                assemble_disc(0.5, plan), electric=False, half_phase_rad=0.3
+            )
+        )
         errors.append(abs(basis.tm[0] - 0.09) / 0.09)
     assert errors[1] < errors[0] / 5
     assert errors[2] < errors[1] / 5

@@ -7,22 +7,27 @@ import pytest
 
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
-from metalens.modal.assembly import assemble
+from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
-from metalens.modal.few_modes import carrying, few_modes, root, squared
-from metalens.modal.homogeneous import corrected, modes
+from metalens.modal.few_modes import (
+    carrying_modes,
+    few_modes,
+    matrix_root,
+    symmetric_square,
+)
+from metalens.modal.homogeneous import exact_zero_order, homogeneous_modes
 from metalens.modal.ladder import RUNGS
-from metalens.modal.layer import Medium, electric_modes, magnetic_modes
-from metalens.modal.match import few_scattering, half_space, scattering
+from metalens.modal.layer import LayerMedium, electric_modes, magnetic_modes
+from metalens.modal.match import few_scattering, half_space, scattering_matrix
 from metalens.modal.pencil import (
-    Pencil,
-    Turn,
+    CoordinateTurn,
+    LayerPencil,
     electric_pencil,
-    lossless,
+    is_lossless,
     magnetic_pencil,
 )
-from metalens.modal.spaces import space
+from metalens.modal.spaces import build_symmetry_class
 
 COARSE = RUNGS[0].choice(0.5).plan
 CASES = [
@@ -41,14 +46,19 @@ def cell(height=0.7, n=3.6, k=0.0):
 def both(case, *, magnetic, weak):
     """Scattering matrices from all modes and from few (None where they are not few)."""
     electric = bool(case.bloch) and case.p == magnetic
-    symmetry_class = space(
-        assemble(case.rho, COARSE), electric=electric, half_phase_rad=case.bloch or None
+    symmetry_class = build_symmetry_class(
+        assemble_disc(case.rho, COARSE),
+        electric=electric,
+        half_phase_rad=case.bloch or None,
     )
-    b, medium = modes(symmetry_class), Medium(case.k0, case.disc, case.around)
+    b, medium = (
+        homogeneous_modes(symmetry_class),
+        LayerMedium(case.k0, case.disc, case.around),
+    )
     halves = [
         half_space(b, case.k0, e, magnetic=magnetic) for e in (case.below, case.above)
     ]
-    full = scattering(
+    full = scattering_matrix(
         (magnetic_modes if magnetic else electric_modes)(b, medium),
         case.height,
         *halves,
@@ -93,9 +103,9 @@ def test_hard_tall_pillar_conserves_energy(height):
 
 
 def test_absorbing_and_metallic_layers_take_all_modes():
-    assert not lossless(Medium(1.0, 3.6**2 + 0.1j, 1.0))
-    assert not lossless(Medium(1.0, -4.0, 1.0))
-    assert lossless(Medium(1.0, 3.6**2, 1.0))
+    assert not is_lossless(LayerMedium(1.0, 3.6**2 + 0.1j, 1.0))
+    assert not is_lossless(LayerMedium(1.0, -4.0, 1.0))
+    assert is_lossless(LayerMedium(1.0, 3.6**2, 1.0))
 
 
 def near_diagonal(random, signs, ends):
@@ -113,7 +123,7 @@ def test_root_of_a_matrix_near_a_diagonal():
     n = 24
     signs = np.where(np.arange(n) < 12, 1.0, -1.0)
     level, square = near_diagonal(random, signs, (50, 1e5))
-    found = root(square, signs, 30.0, 1e-13)
+    found = matrix_root(square, signs, 30.0, 1e-13)
     assert np.abs(found @ found - square).max() < 1e-11 * level.max()
     assert (np.linalg.eigvals(found).real > 0).all()
     assert np.abs(
@@ -126,7 +136,9 @@ def test_a_root_that_single_precision_holds_takes_no_steps_in_double():
     n = 40
     signs = np.where(random.random(n) < 0.4, 1.0, -1.0)
     level, square = near_diagonal(random, signs, (60, 3e4))
-    quick, exact = (root(square, signs, 30.0, accuracy) for accuracy in (4e-8, 1e-13))
+    quick, exact = (
+        matrix_root(square, signs, 30.0, accuracy) for accuracy in (4e-8, 1e-13)
+    )
     beside = ~np.eye(n, dtype=bool)
     assert (quick[beside] == quick[beside].astype(np.float32)).all()
     assert not (exact[beside] == exact[beside].astype(np.float32)).all()
@@ -154,7 +166,7 @@ def test_single_precision_ends_at_the_first_step_below_a_few_of_its_roundings(
         e.append((square - 1 - e[-1] ** 2) / 2)
     assert e[3] - e[4] == pytest.approx(change, rel=0.02)  # two digits
     exact = np.sqrt(square) - 1
-    found = root(np.array([[square]]), np.ones(1), 1.0, 4e-8)[0, 0] - 1
+    found = matrix_root(np.array([[square]]), np.ones(1), 1.0, 4e-8)[0, 0] - 1
     # 0.06 is told to 1.9e-9, and a step that begins with that rounding ends with one of
     # its own
     close = 4e-9
@@ -174,7 +186,7 @@ def test_root_of_levels_wider_apart_than_single_precision_counts():
         * np.sqrt(np.minimum(level[:, None], level))
     )
     square = np.diag(level) + signs[:, None] * (rest + rest.T)
-    found = root(square, signs, 1.0, 1e-12)
+    found = matrix_root(square, signs, 1.0, 1e-12)
     off = np.abs(found @ found - square)[
         :6, :6
     ]  # of the rows that carry: 1e-12 of the roots, times the rows they meet
@@ -190,13 +202,13 @@ def test_a_product_by_strips_is_the_whole_product(n, dtype):
     e = (signs[:, None] * (half + half.T)).astype(
         dtype
     )  # whole numbers, whose products have no rounding
-    assert (squared(e, signs) == e @ e).all()
-    assert squared(e, signs).dtype == dtype
+    assert (symmetric_square(e, signs) == e @ e).all()
+    assert symmetric_square(e, signs).dtype == dtype
 
 
 def test_root_refuses_what_is_far_from_a_diagonal():
     square = np.array([[1.0, 50.0], [-50.0, 1.0]])
-    assert root(square, np.array([1.0, -1.0]), 1.0, 1e-12) is None
+    assert matrix_root(square, np.array([1.0, -1.0]), 1.0, 1e-12) is None
 
 
 @pytest.mark.parametrize(
@@ -219,19 +231,24 @@ def test_the_zero_order_has_its_exact_wavenumber_where_this_family_has_it(
     far better; no others move,
     and rounding leaves no square below 0."""
     given = np.array([lowest, 9.1, -1e-12, 0.161])
-    assert corrected(given.copy(), half_phase_rad).tolist() == [want, 9.1, 0.0, 0.161]
+    assert exact_zero_order(given.copy(), half_phase_rad).tolist() == [
+        want,
+        9.1,
+        0.0,
+        0.161,
+    ]
 
 
 @pytest.mark.parametrize("half_phase", [None, 0.05, 0.3, 1.3])
 @pytest.mark.parametrize("rho", [0.1, 0.5, 0.9])
 def test_quick_homogeneous_modes_are_the_homogeneous_modes(half_phase, rho):
     for electric in (True, False):
-        symmetry_class = space(
-            assemble(rho, COARSE), electric=electric, half_phase_rad=half_phase
+        symmetry_class = build_symmetry_class(
+            assemble_disc(rho, COARSE), electric=electric, half_phase_rad=half_phase
         )
         slow, quick = (
-            modes(symmetry_class, careful=True),
-            modes(symmetry_class, quick=True),
+            homogeneous_modes(symmetry_class, careful=True),
+            homogeneous_modes(symmetry_class, quick=True),
         )
         assert np.abs(slow.tm / quick.tm - 1).max() < 1e-6
         assert np.abs(slow.te - quick.te).max() < 3e-8 * slow.te.max()
@@ -269,11 +286,11 @@ def test_modes_are_few_as_long_as_four_fifths_of_all_directions_hold_them(ranks,
             np.linalg.qr(random.normal(size=(n, rank)))[0] for n in part.shape
         )
         part += left * np.linspace(40.0, 60.0, rank) @ right.T
-    turn = Turn(np.eye(10), 10)
-    pencil = Pencil(
+    turn = CoordinateTurn(np.eye(10), 10)
+    pencil = LayerPencil(
         te, tm, np.ones(10), -np.ones(10), coupling, turn, turn, None, None, dual=False
     )
-    found = carrying(
+    found = carrying_modes(
         pencil, 2.0, 1e-6, 1e-10
     )  # (ln 1e-6 / 2)² = 48: levels to that carry, to 203 are low
     if not held:

@@ -14,7 +14,7 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.ground.errors import CellError
 from metalens.modal import RUNGS
-from metalens.modal.case import Case, case_of
+from metalens.modal.case import ModalCase, case_of
 from metalens.modal.engine import evaluate
 
 FILE = Path(__file__).parents[3] / "benchmarks" / "results" / "reference_pillars.json"
@@ -123,7 +123,7 @@ def test_error_estimate_holds_for_many_waves_in_a_pitch():
     """2.5 waves across a tall cell, against the next finer meshes: bars that knew of no
     dispersion lay 10 % below.
     """
-    case = Case(
+    case = ModalCase(
         0.668, 2.3157, 8.6786, 2.9236, 1.638, 11.8613 + 0j, 1.0997 + 0j, 0.0, False
     )
     best = evaluate(case, RUNGS[3].choice(case.rho).plan)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from metalens.modal import pencil
-from metalens.modal.homogeneous import Basis
-from metalens.modal.layer import Medium
-from metalens.modal.pencil import Turn
+from metalens.modal.homogeneous import HomogeneousBasis
+from metalens.modal.layer import LayerMedium
+from metalens.modal.pencil import CoordinateTurn
 from tests.metalens.modal.unordered import apart
 
 A, B = 6, 5
-MEDIUM = Medium(1.7, 5.3 + 0j, 1.6 + 0j)
+MEDIUM = LayerMedium(1.7, 5.3 + 0j, 1.6 + 0j)
 K2, STEP = 1.7**2, 3.7
 
 
@@ -31,7 +31,7 @@ def basis():
         np.array([0.0, 4.1, 9.3, 330.0, 377.0, 512.0]),
         np.array([3.7, 8.2, 330.0, 350.0, 611.0]),
     )
-    return Basis(te, tm, te, tm, lambda: np.eye(A + B), np.eye(B), part(rng, A + B, 0.9), part(rng, A, 40.0),
+    return HomogeneousBasis(te, tm, te, tm, lambda: np.eye(A + B), np.eye(B), part(rng, A + B, 0.9), part(rng, A, 40.0),
                  part(rng, B, 0.9))  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def test_the_magnetic_form_has_the_values_of_its_equation():
     assert apart(values(written_out(found)), want).max() < 1e-9
 
 
-@pytest.mark.parametrize("medium", [MEDIUM, Medium(1.7, 1.6 + 0j, 5.3 + 0j)])
+@pytest.mark.parametrize("medium", [MEDIUM, LayerMedium(1.7, 1.6 + 0j, 5.3 + 0j)])
 def test_levels_that_are_diagonalised_end_where_permittivities_weigh_little(medium):
     """Four of the six and three of the five lie below 342, whichever side is the
     denser.
@@ -163,14 +163,14 @@ def test_levels_below_32_times_the_most_are_diagonalised_and_the_rest_is_told(
     assert level == pytest.approx(
         np.concatenate([want, matrix.diagonal()[count:]]), rel=1e-12
     )
-    turn = whole(Turn(vectors, 4))
+    turn = whole(CoordinateTurn(vectors, 4))
     assert np.diag(level) + rest == pytest.approx(turn.T @ matrix @ turn, abs=1e-12)
 
 
 def test_a_turn_is_the_dense_matrix_that_it_stands_for():
     low = np.array([[0.6, -0.3], [0.2, 0.9]])
     rng = np.random.default_rng(2)
-    for turn in (Turn(low, 5, 1.7), Turn(low, 2, 1.7)):
+    for turn in (CoordinateTurn(low, 5, 1.7), CoordinateTurn(low, 2, 1.7)):
         dense, matrix = whole(turn), rng.normal(size=(turn.size, 3))
         assert turn.down(matrix) == pytest.approx(dense.T @ matrix)
         block, diagonal = (
@@ -181,8 +181,8 @@ def test_a_turn_is_the_dense_matrix_that_it_stands_for():
         turn.onto(block, diagonal)
         assert block == pytest.approx(want)
     places = np.array([4, 0, 1, 2])
-    assert Turn(low, 5, 1.7).rows(places) == pytest.approx(
-        whole(Turn(low, 5, 1.7))[places]
+    assert CoordinateTurn(low, 5, 1.7).rows(places) == pytest.approx(
+        whole(CoordinateTurn(low, 5, 1.7))[places]
     )
 
 
@@ -198,4 +198,4 @@ def test_a_turn_is_the_dense_matrix_that_it_stands_for():
     ],
 )
 def test_a_layer_is_lossless_where_both_permittivities_are_positive(disc, around, same):
-    assert pencil.lossless(Medium(1.7, disc, around)) is same
+    assert pencil.is_lossless(LayerMedium(1.7, disc, around)) is same

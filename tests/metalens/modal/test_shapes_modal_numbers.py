@@ -28,14 +28,14 @@ EXACT = {"rel": 1e-13, "abs": 1e-14}  # roundings of float64
 
 
 def test_rules_lie_on_the_unit_interval():
-    point, weight = shapes.gauss(2)
+    point, weight = shapes.gauss_rule(2)
     assert point == pytest.approx(np.array([1 - 1 / R3, 1 + 1 / R3]) / 2, **EXACT)
     assert weight == pytest.approx(np.array([0.5, 0.5]), **EXACT)
-    s, w = shapes.graded(2)
+    s, w = shapes.graded_rule(2)
     t = (1 + np.array([-1, 1]) / R3) / 2
     assert s == pytest.approx(t**10, **EXACT)
     assert w == pytest.approx(5 * t**9, **EXACT)
-    s, w = shapes.graded(
+    s, w = shapes.graded_rule(
         12
     )  # to the 23rd degree of t: s^1.3 has the 13th, and 9 of the step
     for power in (0.0, 0.7, 1.3):
@@ -43,10 +43,10 @@ def test_rules_lie_on_the_unit_interval():
 
 
 def test_polynomials_are_those_written_out():
-    value, slope = shapes.polynomials(4, S)
+    value, slope = shapes.polynomial_basis(4, S)
     assert value == pytest.approx(np.array(VALUES), **EXACT)
     assert slope == pytest.approx(np.array(SLOPES), **EXACT)
-    value, slope = shapes.polynomials(1, S)
+    value, slope = shapes.polynomial_basis(1, S)
     assert (value.tolist(), slope.tolist()) == (
         [(1 - S).tolist(), S.tolist()],
         [[1.0] * 4],
@@ -54,13 +54,13 @@ def test_polynomials_are_those_written_out():
 
 
 def test_plain_functions_lie_on_a_gauss_rule():
-    one = shapes.plain(3, 5)
-    s, w = shapes.gauss(5)
+    one = shapes.polynomial_interval(3, 5)
+    s, w = shapes.gauss_rule(5)
     assert one.degree == 3
     assert np.array_equal(one.point, s)
     assert np.array_equal(one.weight, w)
-    assert one.value == pytest.approx(shapes.polynomials(3, s)[0])
-    assert one.slope == pytest.approx(shapes.polynomials(3, s)[1])
+    assert one.value == pytest.approx(shapes.polynomial_basis(3, s)[0])
+    assert one.slope == pytest.approx(shapes.polynomial_basis(3, s)[1])
 
 
 @pytest.mark.parametrize("at_end", [False, True])
@@ -69,13 +69,13 @@ def test_bubbles_of_the_rim_are_powers_of_the_distance_from_it(at_end):
     polynomials of t below 80.
     """
     tau = (0.7, 1.3)
-    one = shapes.rim(3, 40, tau, at_end)
+    one = shapes.rim_interval(3, 40, tau, at_end)
     s, w = one.point, one.weight
-    away = shapes.graded(40)[0]
+    away = shapes.graded_rule(40)[0]
     assert (one.degree, one.value.shape, one.slope.shape) == (5, (6, 40), (5, 40))
     assert s == pytest.approx(1 - away if at_end else away)
     assert w.sum() == pytest.approx(1, rel=1e-13)
-    plain = shapes.polynomials(3, s)
+    plain = shapes.polynomial_basis(3, s)
     assert one.value[:4] == pytest.approx(plain[0])
     assert one.slope[:3] == pytest.approx(plain[1])
     assert (one.slope * w) @ one.slope.T == pytest.approx(
@@ -97,19 +97,23 @@ def test_bubbles_of_the_rim_are_powers_of_the_distance_from_it(at_end):
 
 
 def test_derivatives_of_values_are_slopes():
-    assert shapes.difference(3).tolist() == [[-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    value, slope = shapes.polynomials(3, S)
+    assert shapes.derivative_matrix(3).tolist() == [
+        [-1, 1, 0, 0],
+        [0, 0, 1, 0],
+        [0, 0, 0, 1],
+    ]
+    value, slope = shapes.polynomial_basis(3, S)
     step = 1e-6
-    high, low = (shapes.polynomials(3, S + d)[0] for d in (step, -step))
-    assert shapes.difference(3).T @ slope == pytest.approx(
+    high, low = (shapes.polynomial_basis(3, S + d)[0] for d in (step, -step))
+    assert shapes.derivative_matrix(3).T @ slope == pytest.approx(
         (high - low) / (2 * step), abs=1e-8
     )  # third derivative
     assert value.shape == (4, 4)
 
 
 def test_products_on_a_square_run_along_xi_slowly_and_have_their_curls_and_gradients():
-    xi, eta = shapes.plain(2, 4), shapes.plain(3, 5)
-    both = shapes.square(xi, eta)
+    xi, eta = shapes.polynomial_interval(2, 4), shapes.polynomial_interval(3, 5)
+    both = shapes.square_basis(xi, eta)
     assert both.weight == pytest.approx(
         np.array([a * b for a in xi.weight for b in eta.weight])
     )

@@ -16,7 +16,7 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Index, Light
 from metalens.cell.shapes import Ellipse
 from metalens.modal import RUNGS, case_of, evaluate
-from metalens.modal.case import Case
+from metalens.modal.case import ModalCase
 from metalens.modal.ladder import NEAREST
 
 COARSE, FAIR, EVEN = RUNGS[0], RUNGS[1], RUNGS[2]
@@ -413,7 +413,7 @@ def case(**other):
         "around": 1.2,
         "bloch": 0.1,
     }
-    return Case(**(usual | {"p": False} | other))
+    return ModalCase(**(usual | {"p": False} | other))
 
 
 @pytest.mark.parametrize(

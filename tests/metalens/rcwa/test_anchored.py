@@ -13,7 +13,7 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Index, Light
 from metalens.ground.errors import CellError
 from metalens.rcwa import anchored
-from metalens.rcwa.anchored import node_diameters, plain, solve_anchored
+from metalens.rcwa.anchored import node_diameters, solve_anchored, upright_cell
 
 UPRIGHT = Cell(0.33, 0.61, Index(2.6), Index(1.46), Index(1.04), Index(1.0))
 TILTED = replace(UPRIGHT, sidewall_rad=0.027)
@@ -81,7 +81,7 @@ def test_nodes_lie_between_foot_and_top():
     assert np.abs(nodes - DIAMETER).max() < half
     assert np.ptp(nodes) > 1.8 * half
     assert node_diameters(UPRIGHT, DIAMETER) == (DIAMETER,)
-    assert plain(replace(TILTED, over=(Film("SiO2", 0.1),))) == UPRIGHT
+    assert upright_cell(replace(TILTED, over=(Film("SiO2", 0.1),))) == UPRIGHT
 
 
 def test_walls_that_close_are_refused():

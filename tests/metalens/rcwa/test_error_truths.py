@@ -13,9 +13,9 @@ from metalens import rcwa
 from metalens.cell import Cell, Index, Light
 from metalens.cell.shapes import Rectangle
 from metalens.rcwa import anchored, any_shape, solver, wall
-from metalens.rcwa.anchored import Anchors
-from metalens.rcwa.conditions import case
-from metalens.rcwa.solver import Truncated
+from metalens.rcwa.anchored import ReferencePillars
+from metalens.rcwa.conditions import disc_case
+from metalens.rcwa.solver import TruncatedResponse
 
 CELL = Cell(0.4, 0.5, Index(3.5), Index(1.45))
 LIGHT = Light(0.85)
@@ -25,7 +25,7 @@ LIGHT = Light(0.85)
     ("reach", "times"), [(6, 7.2), (8, 6.0), (12, 3.6), (13, 3.0), (16, 3.0)]
 )
 def test_few_orders_are_trusted_less(reach, times):
-    assert solver.safety(reach) == pytest.approx(times, rel=1e-12)
+    assert solver.safety_factor(reach) == pytest.approx(times, rel=1e-12)
 
 
 def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what_is_trusted():
@@ -61,12 +61,14 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
         49 / (81 - 49) * 0.02
     )  # of nine orders, seven leave 1.5: whole; six 0.8, five 0.45, four 0.25 of the way
     assert two > 0.02
-    assert any_shape.moved(both, 9, 4) == pytest.approx(5.4 * 36 / 45 * 0.04, rel=1e-9)
-    assert any_shape.moved(both, 9, 5) == pytest.approx(
+    assert any_shape.estimate_error(both, 9, 4) == pytest.approx(
+        5.4 * 36 / 45 * 0.04, rel=1e-9
+    )
+    assert any_shape.estimate_error(both, 9, 5) == pytest.approx(
         5.4 * 16 / 65 * (9.0 - 0.31), rel=1e-9
     )
-    assert any_shape.moved(both, 15, 4) == pytest.approx(3 * 0.04, rel=1e-9)
-    assert any_shape.moved(both[:1], 9, 4) == pytest.approx(5.4)
+    assert any_shape.estimate_error(both, 15, 4) == pytest.approx(3 * 0.04, rel=1e-9)
+    assert any_shape.estimate_error(both[:1], 9, 4) == pytest.approx(5.4)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,7 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
     [(0.0, 6.0), (0.0019, 4.75), (0.0057, 2.25), (0.0076, 1.0), (0.1, 1.0)],
 )
 def test_pillars_that_all_but_touch_are_trusted_less(gap_um, times):
-    assert solver.crowding(gap_um, 0.38) == pytest.approx(
+    assert solver.gap_factor(gap_um, 0.38) == pytest.approx(
         times, rel=1e-12
     )  # 1 + 5 (1 - 50 gap / pitch)
 
@@ -89,7 +91,7 @@ def test_narrow_pillars_and_gaps_are_looked_at_over_three_quarters_of_a_swing(
     """0.75 / width of the truncations before the last, four at least and six at most;
     touching ones have a factor.
     """
-    assert solver.compared(width) == count
+    assert solver.compared_truncations(width) == count
 
 
 # cell, diameter, wavelength, orders; t and r of the modal method (mesh "fine", to 1e-5)
@@ -130,12 +132,12 @@ def test_bars_hold_where_truncations_swing_slowly(cell, asked, exact):
     """
     found = rcwa.solve(cell, asked[0], asked[1], harmonics=asked[2])
     error = max(abs(found.t - exact[0]), abs(found.r - exact[1]))
-    this = case(cell, Light(asked[1]))
+    this = disc_case(cell, Light(asked[1]))
     four = [
-        solver.truncated(this, np.array([asked[0]]), n).both
+        solver.solve_truncated(this, np.array([asked[0]]), n).both
         for n in range(asked[2] - 4, asked[2] + 1)
     ]
-    assert error > solver.safety(asked[2]) * max(
+    assert error > solver.safety_factor(asked[2]) * max(
         np.abs(four[-1] - one).max() for one in four[:-1]
     )
     assert error + 2e-5 < found.t_error
@@ -186,11 +188,11 @@ def test_each_diameter_stops_at_the_first_truncation_that_meets_the_tolerance(
     def truncated(this, diameters, reach, stages):
         assert stages == 3
         t = np.array([0.6 + size[round(float(d), 3)] / reach**2 for d in diameters])
-        return Truncated(t.astype(complex), 0.2j * t, np.full(len(t), 0.99))
+        return TruncatedResponse(t.astype(complex), 0.2j * t, np.full(len(t), 0.99))
 
-    monkeypatch.setattr(solver, "truncated", truncated)
-    empty = Truncated(np.array([0.97 + 0j]), np.array([0.03 + 0j]), np.ones(1))
-    monkeypatch.setattr(solver, "film", lambda this, index: empty)
+    monkeypatch.setattr(solver, "solve_truncated", truncated)
+    empty = TruncatedResponse(np.array([0.97 + 0j]), np.array([0.03 + 0j]), np.ones(1))
+    monkeypatch.setattr(solver, "film_response", lambda this, index: empty)
     monkeypatch.setattr(solver, "wall_stages", lambda this, wide, tolerance: (3, 2e-4))
     found = solver.solve_case(
         this, np.array([0.11, 0.23]), tolerance=0.015, harmonics=None
@@ -222,7 +224,9 @@ def test_a_layer_without_contrast_is_a_film_to_rounding():
     """The disc's share of the cell times the contrast times its phase, below 1e-13."""
     this = SimpleNamespace(cell=CELL, k0=7.4, pillar=1.3, between=1.0)
     edge = math.sqrt(1e-13 / (math.pi / 4 * 0.69 * 7.4 * 0.5)) * 0.4
-    assert solver.homogeneous(this, np.array([0.99 * edge, 1.01 * edge])).tolist() == [
+    assert solver.is_homogeneous(
+        this, np.array([0.99 * edge, 1.01 * edge])
+    ).tolist() == [
         True,
         False,
     ]
@@ -240,17 +244,17 @@ def test_anchored_bars_add_what_truncations_modes_collocation_and_shifts_leave(
 
     def truncated(this, diameter, reach, stages, *, moved):
         asked.append((reach, stages, float(moved(diameter)[0])))
-        return Truncated(
+        return TruncatedResponse(
             np.array([t[reach] + 0j]), np.array([0.1j * t[reach]]), np.array([0.98])
         )
 
-    monkeypatch.setattr(anchored, "case", lambda cell, light: cell)
+    monkeypatch.setattr(anchored, "disc_case", lambda cell, light: cell)
     monkeypatch.setattr(anchored, "wall_stages", lambda *_: (5, 3e-4))
-    monkeypatch.setattr(anchored, "truncated", truncated)
+    monkeypatch.setattr(anchored, "solve_truncated", truncated)
     monkeypatch.setattr(
         anchored,
-        "shifted",
-        lambda bare, anchors, reach: anchored.Shift(
+        "fit_diameter_shift",
+        lambda bare, anchors, reach: anchored.DiameterShift(
             lambda d: 1e-3 * reach, rest[reach]
         ),
     )
@@ -290,19 +294,19 @@ def test_a_shift_is_the_least_of_squares_of_both_amplitudes_and_leaves_what_no_s
 
     monkeypatch.setattr(anchored, "_amplitudes", amplitudes)
     known = nodes[:, None] * slope + off[:, None] * across
-    found = anchored.shifted(None, Anchors(nodes, known, 0.0), 6)
+    found = anchored.fit_diameter_shift(None, ReferencePillars(nodes, known, 0.0), 6)
     assert found.at(nodes) == pytest.approx(0.003 + 0.02 * nodes, rel=1e-6)
     assert found(np.array([0.18])) == pytest.approx([0.18 + 0.003 + 0.0036], rel=1e-6)
     assert found.left == pytest.approx(math.sqrt((0.004**2 + 0.003**2) / 2), rel=1e-6)
-    far = Anchors(nodes, (nodes[:, None] + 0.5) * slope, 0.0)
-    assert anchored.shifted(None, far, 6).at(nodes) == pytest.approx(
+    far = ReferencePillars(nodes, (nodes[:, None] + 0.5) * slope, 0.0)
+    assert anchored.fit_diameter_shift(None, far, 6).at(nodes) == pytest.approx(
         [0.01, 0.01]
     )  # no truncation is that far off
 
 
 @pytest.mark.parametrize("stages", [4, 6])
 def test_collocation_integrates_polynomials_from_the_foot_to_every_point(stages):
-    c, b, a = wall.gauss(stages)
+    c, b, a = wall.gauss_collocation(stages)
     for n in range(2 * stages):
         assert b @ c**n == pytest.approx(1 / (n + 1), rel=1e-10)
         if n < stages:
@@ -314,7 +318,7 @@ def test_stages_of_a_wall_are_enough_where_one_more_changes_a_tenth_of_the_toler
     tolerance, stages
 ):
     """Off by 10^(1 - stages) of (1, 2): the last change is 2 (10^-(m-2) - 10^-(m-1))."""
-    found, left = wall.enough(
+    found, left = wall.choose_stage_count(
         lambda m: np.array([0.3, 0.7j]) + 10.0 ** (1 - m) * np.array([1.0, 2.0]),
         tolerance,
     )
@@ -360,7 +364,9 @@ def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(
         )
 
     monkeypatch.setattr(any_shape, "_truncated", truncated)
-    monkeypatch.setattr(any_shape.wall, "enough", lambda both, tolerance: (5, 3e-3))
+    monkeypatch.setattr(
+        any_shape.wall, "choose_stage_count", lambda both, tolerance: (5, 3e-3)
+    )
     found = any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1e-9)
     want = times * (5.4 * 0.1 / 81 + 1e-13) + cut
     assert found.t_error == pytest.approx(
@@ -395,11 +401,11 @@ def test_a_bar_is_no_wider_than_to_the_farthest_that_a_passive_cell_may_be(
 def test_a_round_pillar_s_bar_is_no_wider_either(monkeypatch, most, want):
     def truncated(this, diameter_um, reach, stages=0, **moved):
         t = np.full(len(diameter_um), most * (-1) ** reach + 0j)
-        return Truncated(t, 0.2 * t, np.ones(len(diameter_um)))
+        return TruncatedResponse(t, 0.2 * t, np.ones(len(diameter_um)))
 
-    monkeypatch.setattr(solver, "truncated", truncated)
+    monkeypatch.setattr(solver, "solve_truncated", truncated)
     (found,) = solver.solve_case(
-        case(CELL, Light(0.85)), np.array([0.23]), tolerance=1e-3, harmonics=9
+        disc_case(CELL, Light(0.85)), np.array([0.23]), tolerance=1e-3, harmonics=9
     )
     assert found.t_error == pytest.approx(want, rel=1e-12)
 

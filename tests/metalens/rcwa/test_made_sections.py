@@ -23,13 +23,13 @@ def test_a_tilted_wall_widens_every_section_by_its_middle():
     each um below 0.3.
     """
     slope = 2 * math.tan(0.05)
-    got = made.spread(STACK)
+    got = made.sections_with_growth(STACK)
     assert [layer for layer, _ in got] == list(LAYERS)
     assert [grow for _, grow in got] == pytest.approx(
         [0.24 * slope, -0.02 * slope, -0.26 * slope]
     )
-    assert made.spread(PLAIN)[0][1] == pytest.approx(0.0, abs=1e-15)
-    assert made.widening(PLAIN) == pytest.approx(-slope)
+    assert made.sections_with_growth(PLAIN)[0][1] == pytest.approx(0.0, abs=1e-15)
+    assert made.width_slope(PLAIN) == pytest.approx(-slope)
 
 
 def test_sections_are_cut_at_their_share_of_the_height(monkeypatch):
@@ -42,9 +42,9 @@ def test_sections_are_cut_at_their_share_of_the_height(monkeypatch):
         asked.append((layer, size_um, wavelength_um, grow_um))
         return grow_um
 
-    monkeypatch.setattr(made.pattern, "slab", slab)
-    monkeypatch.setattr(made, "interpolated", lambda sample: sample)
-    walls = made.walls(STACK, 0.21, 0.85, lambda grow: (grow, 2 * grow))
+    monkeypatch.setattr(made.pattern, "pillar_section", slab)
+    monkeypatch.setattr(made, "interpolate_operators", lambda sample: sample)
+    walls = made.section_walls(STACK, 0.21, 0.85, lambda grow: (grow, 2 * grow))
     assert [wall.reduced_height for wall in walls] == pytest.approx(
         [2 * math.pi / 0.85 * h for h in (0.12, 0.4, 0.08)]
     )
@@ -57,15 +57,16 @@ def test_sections_are_cut_at_their_share_of_the_height(monkeypatch):
 
 
 def test_upright_walls_are_not_interpolated(monkeypatch):
-    monkeypatch.setattr(made, "interpolated", lambda sample: None)
-    monkeypatch.setattr(made.pattern, "slab", lambda *_, grow_um: grow_um)
+    monkeypatch.setattr(made, "interpolate_operators", lambda sample: None)
+    monkeypatch.setattr(made.pattern, "pillar_section", lambda *_, grow_um: grow_um)
     upright = Cell(0.5, 0.6, Index(3.3), layers=LAYERS)
     assert [
         w.sample(0.8)
-        for w in made.walls(upright, 0.21, 0.85, lambda grow: (grow, grow))
+        for w in made.section_walls(upright, 0.21, 0.85, lambda grow: (grow, grow))
     ] == [(0, 0)] * 3
     assert [
-        w.sample for w in made.walls(STACK, 0.21, 0.85, lambda grow: (grow, grow))
+        w.sample
+        for w in made.section_walls(STACK, 0.21, 0.85, lambda grow: (grow, grow))
     ] == [None] * 3
 
 
@@ -81,7 +82,7 @@ def test_polynomials_through_eight_heights_hold_what_has_degree_seven():
         seen.append(share)
         return np.array([[one(share), 2.0]]), np.array([other(share)])
 
-    at = made.interpolated(sample)
+    at = made.interpolate_operators(sample)
     assert seen == []
     for share in (0.0, 0.17, 0.5, 0.93, 1.0):
         first, second = at(share)
@@ -92,7 +93,10 @@ def test_polynomials_through_eight_heights_hold_what_has_degree_seven():
     )
     # the next power is missed by its Chebyshev part, 2 / 4^8 of the height^8
     worst = max(
-        abs(made.interpolated(lambda s: (np.array([s**8]),) * 2)(x)[0][0] - x**8)
+        abs(
+            made.interpolate_operators(lambda s: (np.array([s**8]),) * 2)(x)[0][0]
+            - x**8
+        )
         for x in np.linspace(0, 1, 99)
     )
     assert worst == pytest.approx(2 / 4**8, rel=1e-3)
@@ -165,7 +169,7 @@ def test_a_section_s_slab_is_wider_by_its_own_and_by_what_is_asked():
         cell = Cell(
             0.5, 0.6, Index(3.3), shape=Rectangle(2 / 3, hole=hole), layers=(layer,)
         )
-        this = pattern.slab(cell, layer, 0.21, 0.85, grow_um=0.02)
+        this = pattern.pillar_section(cell, layer, 0.21, 0.85, grow_um=0.02)
         wide = (0.05 - 0.02, 0.05) if hole else (0.05, 0.05 + 0.02)
         want = [(0.21 + w) * (0.14 + w) for w in wide]
         assert [outline.area_um2 for outline in this.outlines] == pytest.approx(

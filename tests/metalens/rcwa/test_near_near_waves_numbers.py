@@ -17,7 +17,7 @@ from metalens.rcwa.near import Grid
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY
 from metalens.rcwa.orders.waves import half_space
-from metalens.rcwa.problem import problem, waves_of
+from metalens.rcwa.problem import cell_problem, waves_of
 
 WAVE, SIZE = 0.81, 0.21
 K0 = 2 * math.pi / WAVE
@@ -34,7 +34,7 @@ ABOUT = {
 }
 CELL = Cell(0.36, lattice=Lattice("rectangular", 1.3), shape=Rectangle(0.6), layers=(Layer(0.15, 0.02), Layer(0.3)),
             sidewall_rad=0.03, **FILMS, **ABOUT)  # fmt: skip
-THIS = problem(CELL, SIZE, WAVE, 0.3, 0.7)
+THIS = cell_problem(CELL, SIZE, WAVE, 0.3, 0.7)
 
 
 def test_slabs_are_films_sections_in_equal_steps_and_films():
@@ -55,7 +55,7 @@ def test_slabs_are_films_sections_in_equal_steps_and_films():
         assert slab.section.outlines[0].area_um2 == pytest.approx(
             CELL.outline(SIZE, grow_um=wide).area_um2, rel=1e-9
         )
-    assert near_waves.edges(THIS, slabs) == pytest.approx(
+    assert near_waves.interface_heights(THIS, slabs) == pytest.approx(
         K0 * (np.cumsum([0, *heights]) - 0.12)
     )
 
@@ -80,7 +80,7 @@ def test_heights_belong_to_the_slab_above_an_interface():
             0.9,
         ]
     )
-    assert near_waves.places(THIS, slabs, z).tolist() == [
+    assert near_waves.slab_indices(THIS, slabs, z).tolist() == [
         0,
         0,
         1,
@@ -122,19 +122,19 @@ def test_heights_belong_to_the_slab_above_an_interface():
 def test_the_wave_that_comes_has_its_field_along_the_axis_that_is_named(
     polarization, angle, azimuth, want
 ):
-    assert near_waves.come(Light(WAVE, angle, polarization, azimuth)) == pytest.approx(
-        want, abs=1e-15
-    )
+    assert near_waves.incident_amplitudes(
+        Light(WAVE, angle, polarization, azimuth)
+    ) == pytest.approx(want, abs=1e-15)
 
 
 def test_a_film_has_the_operators_of_plane_waves():
     """Q P of a wave is eps - kappa², its kz²; P of p waves and Q of s waves alone know
     kappa.
     """
-    space = mirrors.orders(2, pattern.frame(CELL, (IDENTITY,)))
+    space = mirrors.reduced_orders(2, pattern.lattice_frame(CELL, (IDENTITY,)))
     ways, _ = waves_of(space, CELL, THIS.light)
     for index in (1.9, 1.3 + 0.2j):
-        P, Q = near_waves.homogeneous(ways, index)
+        P, Q = near_waves.film_operators(ways, index)
         assert np.diag(P @ Q) == pytest.approx(index**2 - ways.kappa**2)
         p = ways.p_count
         assert np.diag(Q)[:p] == pytest.approx(np.full(p, index**2))
@@ -156,10 +156,10 @@ def test_sums_over_orders_unfold_the_symmetries(operations):
     sign of its operation.
     """
     straight = len(operations) > 1
-    this = problem(CELL, SIZE, WAVE, 0.0, 0.0) if straight else THIS
-    space = mirrors.orders(3, pattern.frame(CELL, operations))
+    this = cell_problem(CELL, SIZE, WAVE, 0.0, 0.0) if straight else THIS
+    space = mirrors.reduced_orders(3, pattern.lattice_frame(CELL, operations))
     x, y = np.array([0.03, -0.11, 0.2]), np.array([0.17, -0.05])
-    points = near_waves.Points(this, operations, space.reach, (x, y))
+    points = near_waves.PointSums(this, operations, space.reach, (x, y))
     px, py = CELL.lattice.periods_um(0.36)
     rng = np.random.default_rng(2)
     for part in (space.ex, space.ey, space.hz):
@@ -186,12 +186,14 @@ def test_sums_over_orders_unfold_the_symmetries(operations):
 
 
 def test_a_class_that_the_light_has_no_part_in_is_left_out():
-    this = problem(CELL, SIZE, WAVE, 0.0, 0.0)
+    this = cell_problem(CELL, SIZE, WAVE, 0.0, 0.0)
     slabs = near_waves.slabs_of(this, 1)
     for operations, held in zip(this.classes, ("x", "y"), strict=True):
-        space = mirrors.orders(1, pattern.frame(CELL, operations))
+        space = mirrors.reduced_orders(1, pattern.lattice_frame(CELL, operations))
         for polarization in "xy":
-            one = near_waves.solved(this, slabs, Light(WAVE, 0.0, polarization), space)
+            one = near_waves.solve_class(
+                this, slabs, Light(WAVE, 0.0, polarization), space
+            )
             assert (one is not None) is (polarization == held)
 
 
@@ -202,11 +204,11 @@ def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interfac
     upright = dataclasses.replace(
         CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6)))
     )
-    this = problem(upright, SIZE, WAVE, 0.3, 0.7)
+    this = cell_problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
-    space = mirrors.orders(1, pattern.frame(upright, (IDENTITY,)))
-    one = near_waves.solved(this, slabs, Light(WAVE, 0.3, "s", 0.7), space)
-    ends = near_waves.edges(this, slabs) / K0
+    space = mirrors.reduced_orders(1, pattern.lattice_frame(upright, (IDENTITY,)))
+    one = near_waves.solve_class(this, slabs, Light(WAVE, 0.3, "s", 0.7), space)
+    ends = near_waves.interface_heights(this, slabs) / K0
     gap = 1e-9
     below = near_waves._heights(this, slabs, one, ends - gap)
     above = near_waves._heights(this, slabs, one, ends + gap)
@@ -245,13 +247,17 @@ def test_the_displacement_across_interfaces_is_continuous():
     upright = dataclasses.replace(
         CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6)))
     )
-    this = problem(upright, SIZE, WAVE, 0.3, 0.7)
+    this = cell_problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
-    space = mirrors.orders(1, pattern.frame(upright, (IDENTITY,)))
-    one = near_waves.solved(this, slabs, Light(WAVE, 0.3, "p", 0.7), space)
-    ends, gap = near_waves.edges(this, slabs) / K0, 1e-9
+    space = mirrors.reduced_orders(1, pattern.lattice_frame(upright, (IDENTITY,)))
+    one = near_waves.solve_class(this, slabs, Light(WAVE, 0.3, "p", 0.7), space)
+    ends, gap = near_waves.interface_heights(this, slabs) / K0, 1e-9
     sections = [
-        mirrors.product(space, pattern.tables(s.section, upright, space.reach)[0], 2)
+        mirrors.toeplitz_product(
+            space,
+            pattern.permittivity_coefficients(s.section, upright, space.reach)[0],
+            2,
+        )
         for s in slabs[2:4]
     ]
     unit = np.eye(len(space.ez.m))
@@ -342,7 +348,7 @@ def test_points_see_the_media_that_they_lie_in():
 
 
 def test_normals_that_lie_between_the_axes_have_all_three_products():
-    this = problem(
+    this = cell_problem(
         dataclasses.replace(CELL, shape=Ellipse(0.7, 0.2), sidewall_rad=0.0),
         SIZE,
         WAVE,
@@ -382,16 +388,16 @@ def test_the_error_of_a_field_is_the_farthest_truncation_before_times_its_factor
         n: near.near_fields(cell, SIZE, light, [grid], harmonics=n)[0]
         for n in (1, 2, 3)
     }
-    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
-    crowded = near.ladder(this, 3).crowded
+    this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
+    crowded = near.truncation_sequence(this, 3).crowded
     last = fields[3].e
     farthest = max(np.linalg.norm(fields[n].e - last) for n in (1, 2)) / np.linalg.norm(
         last
     )
     assert fields[3].error == pytest.approx(
-        min(crowded * near.safety(3) * farthest, 2.0), rel=1e-9
+        min(crowded * near.safety_factor(3) * farthest, 2.0), rel=1e-9
     )
-    assert fields[1].error == pytest.approx(min(crowded * near.safety(1), 2.0))
+    assert fields[1].error == pytest.approx(min(crowded * near.safety_factor(1), 2.0))
     assert [fields[n].orders for n in (1, 2, 3)] == [5, 13, 29]
     assert [fields[n].converged for n in (1, 2, 3)] == [
         fields[n].error <= 0.05 for n in (1, 2, 3)
@@ -404,7 +410,7 @@ def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_
 ):
     cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
     light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
-    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
+    this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
     stack = near._stack(this, 1, [grid])
     every = [
         near._fields(this, stack, light, [grid], n)[0][0]
@@ -416,12 +422,12 @@ def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_
     found = near.near_fields(
         cell, SIZE, light, [grid], harmonics=harmonics, tolerance=1e-6
     )[0]
-    crowded = near.ladder(this, harmonics).crowded
+    crowded = near.truncation_sequence(this, harmonics).crowded
     assert found.error == pytest.approx(
-        crowded * (factor or near.safety(6)) * farthest, rel=1e-9
+        crowded * (factor or near.safety_factor(6)) * farthest, rel=1e-9
     )
     assert found.e == pytest.approx(every[-1], abs=1e-12)
-    assert near.safety(6) > 2.6
+    assert near.safety_factor(6) > 2.6
 
 
 def test_a_field_on_one_grid_is_that_of_its_axes():
@@ -454,7 +460,7 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
     monkeypatch.setattr(near, "_STEPS", 2)
     cell = Cell(0.36, shape=Rectangle(0.6), sidewall_rad=0.04, **ABOUT)
     light, grid = Light(WAVE, 0.0, "x"), Grid([0.02], [0.05], [0.1, 0.5])
-    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
+    this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
     fields = {
         (steps, n): near._fields(
             this, near._stack(this, steps, [grid]), light, [grid], n
@@ -466,14 +472,16 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
     size = np.linalg.norm(fields[2, 2])
     cut = np.linalg.norm(fields[1, 2] - fields[2, 2]) / size
     moved = np.linalg.norm(fields[2, 1] - fields[2, 2]) / size
-    want = near.ladder(this, 2).crowded * near.safety(2) * moved + cut
+    want = (
+        near.truncation_sequence(this, 2).crowded * near.safety_factor(2) * moved + cut
+    )
     assert cut > 1e-5
     stacks = [near._stack(this, steps, [grid]) for steps in (1, 2)]
     half, full = (
         near._fields(this, stack, light, [grid], 3)[0][0] for stack in stacks
     )  # the least of five, and two more
     told = near._staircase(
-        this, stacks[1], 2, light, [grid], near.Ladder(range(1, 6), 4, 1.0)
+        this, stacks[1], 2, light, [grid], near.TruncationSequence(range(1, 6), 4, 1.0)
     )
     assert told == pytest.approx(
         [np.linalg.norm(half - full) / np.linalg.norm(full)], rel=1e-9

@@ -43,8 +43,8 @@ def test_coefficients_of_a_coated_rectangle_are_sincs():
     )  # 0.2 x 0.12 and 0.23 x 0.15
     m, n = np.arange(-4, 5), np.arange(-6, 7)
     none = (m[:, None] == 0) & (n == 0)
-    direct, inverse = pattern.tables(
-        pattern.Slab(outlines, (INNER, FILM), OUTER), OBLONG, (2, 3)
+    direct, inverse = pattern.permittivity_coefficients(
+        pattern.PillarSection(outlines, (INNER, FILM), OUTER), OBLONG, (2, 3)
     )
     for got, power in ((direct, 1), (inverse, -1)):
         a, b, c = INNER**power, FILM**power, OUTER**power
@@ -58,8 +58,8 @@ def test_coefficients_of_a_coated_rectangle_are_sincs():
 def test_coefficients_of_a_hexagonal_cell_are_over_the_area_of_one_pillar():
     """Its rectangle holds two: only orders of even sums count, to which both add alike."""
     this = Cell(PITCH, lattice=Lattice("hexagonal"), shape=Rectangle(0.6), **ABOUT)
-    slab = pattern.Slab((this.outline(0.2),), (INNER,), OUTER)
-    direct, _ = pattern.tables(slab, this, (2, 3))
+    slab = pattern.PillarSection((this.outline(0.2),), (INNER,), OUTER)
+    direct, _ = pattern.permittivity_coefficients(slab, this, (2, 3))
     area = PITCH**2 * math.sqrt(3) / 2
     assert direct[4, 6] == pytest.approx(
         OUTER + (INNER - OUTER) * 0.2 * 0.12 / area, rel=1e-12
@@ -78,7 +78,7 @@ def test_coefficients_of_a_hexagonal_cell_are_over_the_area_of_one_pillar():
         (this, 1.0, math.sqrt(3), True),
         (OBLONG, 1.0, 1.3, False),
     ):
-        found = pattern.frame(one, (IDENTITY,))
+        found = pattern.lattice_frame(one, (IDENTITY,))
         assert (found.along, found.across) == pytest.approx((along, across), rel=1e-12)
         assert (found.centred, found.operations) == (centred, (IDENTITY,))
 
@@ -86,7 +86,10 @@ def test_coefficients_of_a_hexagonal_cell_are_over_the_area_of_one_pillar():
 def test_numbers_are_real_where_only_rounding_is_imaginary():
     for size, kept in ((0.9e-12, False), (1.1e-12, True)):
         assert (
-            np.iscomplexobj(pattern.real(np.array([3.0, -1.0 + 3.0j * size]))) is kept
+            np.iscomplexobj(
+                pattern.without_rounding(np.array([3.0, -1.0 + 3.0j * size]))
+            )
+            is kept
         )
 
 
@@ -160,7 +163,7 @@ def test_permittivity_is_that_of_the_innermost_outline_about_any_pillar():
     """Points on the lattice of rectangles, 0.41 by 0.533 um apart, and on a hexagonal
     one.
     """
-    slab = pattern.Slab(
+    slab = pattern.PillarSection(
         (OBLONG.outline(0.2), OBLONG.outline(0.2, grow_um=0.03)), (INNER, FILM), OUTER
     )
     places = {
@@ -172,12 +175,12 @@ def test_permittivity_is_that_of_the_innermost_outline_about_any_pillar():
     }
     for (x, y), eps in places.items():
         for a, b in ((0, 0), (1, 0), (-2, 3)):
-            got = pattern.permittivity(
+            got = pattern.permittivity_at(
                 slab, OBLONG, np.array([x + a * X]), np.array([y + b * Y])
             )
             assert got == pytest.approx([eps])
     this = Cell(PITCH, lattice=Lattice("hexagonal"), shape=Rectangle(0.6), **ABOUT)
-    slab = pattern.Slab((this.outline(0.2),), (INNER,), OUTER)
+    slab = pattern.PillarSection((this.outline(0.2),), (INNER,), OUTER)
     half = [edge / 2 for edge in this.lattice.periods_um(PITCH)]
     for (x, y), eps in {
         (0.09, 0.05): INNER,
@@ -185,14 +188,14 @@ def test_permittivity_is_that_of_the_innermost_outline_about_any_pillar():
         (0.0, 0.07): OUTER,
     }.items():
         for a, b in ((0, 0), (1, 1), (-1, 1), (1, -1), (2, 0)):
-            got = pattern.permittivity(
+            got = pattern.permittivity_at(
                 slab, this, np.array([x + a * half[0]]), np.array([y + b * half[1]])
             )
             assert got == pytest.approx([eps])
 
 
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6)), 0.2)
-LIGHT = problem.tangent(WAVE, 0.3, 0.4)
+LIGHT = problem.tangential_wave(WAVE, 0.3, 0.4)
 
 
 def toeplitz(table, orders, reach):
@@ -209,13 +212,13 @@ def test_operators_are_those_of_maxwells_equations_in_all_orders():
     [eps]^-1 k^T in x and y.
     """
     this = Cell(PITCH, shape=TRIANGLE, lattice=Lattice("rectangular", 1.3), **ABOUT)
-    slab = pattern.Slab((this.outline(0.24),), (INNER,), OUTER)
-    space = mirrors.orders(2, pattern.frame(this, (IDENTITY,)))
+    slab = pattern.PillarSection((this.outline(0.24),), (INNER,), OUTER)
+    space = mirrors.reduced_orders(2, pattern.lattice_frame(this, (IDENTITY,)))
     ways, _ = problem.waves_of(space, this, LIGHT)
-    P, Q = pattern.operators(space, ways, slab, this)
+    P, Q = pattern.section_operators(space, ways, slab, this)
     orders = list(zip(space.ex.m.tolist(), space.ex.n.tolist(), strict=True))
     parts = (
-        *pattern.tables(slab, this, space.reach),
+        *pattern.permittivity_coefficients(slab, this, space.reach),
         *pattern.normal_tables(slab.outlines, this, space.reach),
     )
     eps, inverse, xx, yy, xy = (toeplitz(table, orders, space.reach) for table in parts)
@@ -237,16 +240,16 @@ def test_classes_of_mirrors_share_out_the_modes_of_all_orders():
     straight light, and all of them.
     """
     slab, light = (
-        pattern.Slab((OBLONG.outline(0.2),), (INNER,), OUTER),
-        problem.tangent(WAVE, 0.0, 0.0),
+        pattern.PillarSection((OBLONG.outline(0.2),), (INNER,), OUTER),
+        problem.tangential_wave(WAVE, 0.0, 0.0),
     )
     found = []
     for some in (
         (IDENTITY,),
         *((IDENTITY, FLIP_X[w], FLIP_Y[w], HALF_TURN) for w in "xy"),
     ):
-        space = mirrors.orders(2, pattern.frame(OBLONG, some))
-        P, Q = pattern.operators(
+        space = mirrors.reduced_orders(2, pattern.lattice_frame(OBLONG, some))
+        P, Q = pattern.section_operators(
             space, problem.waves_of(space, OBLONG, light)[0], slab, OBLONG
         )
         found.append(np.linalg.eigvals(P @ Q))
@@ -264,12 +267,12 @@ def test_a_section_of_a_layer_takes_its_own_materials_or_those_of_the_cell():
         layers=(Layer(0.2), Layer(0.33, 0.02)),
         **ABOUT,
     )
-    plain = pattern.slab(this, this.layers[1], 0.2, WAVE, grow_um=0.01)
+    plain = pattern.pillar_section(this, this.layers[1], 0.2, WAVE, grow_um=0.01)
     assert plain.inside == (pytest.approx(2.7**2),)
     assert plain.outside == pytest.approx(1.1**2)
     assert plain.outlines[0].area_um2 == pytest.approx(
         this.outline(0.2, grow_um=0.03).area_um2
     )
-    assert pattern.slab(this, this.layers[1], 0.2, WAVE).outlines[
+    assert pattern.pillar_section(this, this.layers[1], 0.2, WAVE).outlines[
         0
     ].area_um2 == pytest.approx(this.outline(0.2, grow_um=0.02).area_um2)

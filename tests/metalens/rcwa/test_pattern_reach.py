@@ -42,10 +42,10 @@ def test_without_loss_the_operator_is_hermitian(angle_rad):
     """Q is eps less kappa² in orders: real permittivities make it its own adjoint,
     however complex its entries.
     """
-    space = mirrors.orders(3, pattern.frame(CELL, (IDENTITY,)))
-    light = problem.tangent(0.633, angle_rad, 0.4)
+    space = mirrors.reduced_orders(3, pattern.lattice_frame(CELL, (IDENTITY,)))
+    light = problem.tangential_wave(0.633, angle_rad, 0.4)
     ways, _ = problem.waves_of(space, CELL, light)
-    slab = pattern.Slab((CELL.outline(0.24),), (2.6**2,), 1.1**2)
-    Q = pattern.operators(space, ways, slab, CELL)[1]
+    slab = pattern.PillarSection((CELL.outline(0.24),), (2.6**2,), 1.1**2)
+    Q = pattern.section_operators(space, ways, slab, CELL)[1]
     assert np.abs(Q.imag).max() > 0.01
     assert np.abs(Q - Q.conj().T).max() < 1e-12 * np.abs(Q).max()

@@ -30,17 +30,17 @@ def cell(shape, **more):
 
 
 def test_the_tangential_wave_vector_is_the_sine_in_its_azimuth():
-    light = problem.tangent(WAVE, 0.3, 0.7)
+    light = problem.tangential_wave(WAVE, 0.3, 0.7)
     assert (light.kx, light.ky) == pytest.approx(
         (math.sin(0.3) * math.cos(0.7), math.sin(0.3) * math.sin(0.7))
     )
     assert (light.azimuth_rad, light.wavelength_um, light.normal) == (0.7, WAVE, False)
-    along_y = problem.tangent(WAVE, 0.3, math.pi / 2)
+    along_y = problem.tangential_wave(WAVE, 0.3, math.pi / 2)
     assert along_y.kx == 0.0
     assert along_y.ky == pytest.approx(math.sin(0.3))
     assert not along_y.normal
-    assert problem.tangent(WAVE, 0.3, 0.0).normal is False
-    straight = problem.tangent(WAVE, 0.0, 0.7)
+    assert problem.tangential_wave(WAVE, 0.3, 0.0).normal is False
+    straight = problem.tangential_wave(WAVE, 0.0, 0.7)
     assert (straight.kx, straight.ky, straight.azimuth_rad, straight.normal) == (
         0.0,
         0.0,
@@ -48,7 +48,7 @@ def test_the_tangential_wave_vector_is_the_sine_in_its_azimuth():
         True,
     )
     for angle, zero in ((0.9e-12, True), (1.1e-12, False)):
-        assert problem.tangent(WAVE, angle, 0.0).normal is zero
+        assert problem.tangential_wave(WAVE, angle, 0.0).normal is zero
 
 
 def test_films_are_as_thick_as_the_phase_of_vacuum_in_them():
@@ -56,8 +56,8 @@ def test_films_are_as_thick_as_the_phase_of_vacuum_in_them():
         "under": (Film(Index(1.9, 0.02), 0.07), Film(Index(1.6), 0.25)),
         "over": (Film(Index(1.3), 0.31),),
     }
-    found = problem.media(
-        cell(Rectangle(0.6), **films), problem.tangent(WAVE, 0.3, 0.7)
+    found = problem.stack_media(
+        cell(Rectangle(0.6), **films), problem.tangential_wave(WAVE, 0.3, 0.7)
     )
     k0 = 2 * math.pi / WAVE
     assert (found.substrate, found.cover) == (1.45, 1.2)
@@ -69,13 +69,13 @@ def test_films_are_as_thick_as_the_phase_of_vacuum_in_them():
 def test_light_comes_from_a_substrate_that_is_denser_than_its_sine():
     """sin 1.2 = 0.932."""
     thin = Cell(0.41, shape=Rectangle(0.6), **(ABOUT | {"substrate": Index(0.94)}))
-    light = problem.tangent(WAVE, 1.2, 0.7)
-    assert problem.media(thin, light).substrate == 0.94
+    light = problem.tangential_wave(WAVE, 1.2, 0.7)
+    assert problem.stack_media(thin, light).substrate == 0.94
     thinner = Cell(0.41, shape=Rectangle(0.6), **(ABOUT | {"substrate": Index(0.93)}))
     with pytest.raises(
         CellError, match=r"sin\(angle_rad\) = 0\.932039 in a substrate of n = 0\.93:"
     ):
-        problem.media(thinner, light)
+        problem.stack_media(thinner, light)
 
 
 BOTH = tuple((IDENTITY, FLIP_X[way], FLIP_Y[way], HALF_TURN) for way in "xy")
@@ -105,14 +105,16 @@ HALF, NONE = ((IDENTITY, HALF_TURN),), ((IDENTITY,),)
     ],
 )
 def test_fields_have_the_symmetries_that_shape_and_light_share(shape, light, want):
-    found = problem.problem(cell(shape), 0.25, WAVE, *light)
+    found = problem.cell_problem(cell(shape), 0.25, WAVE, *light)
     assert found.classes == want
-    assert (found.size_um, found.light) == (0.25, problem.tangent(WAVE, *light))
+    assert (found.size_um, found.light) == (0.25, problem.tangential_wave(WAVE, *light))
 
 
 def whole(this, operations, reach=2):
-    space = mirrors.orders(reach, pattern.frame(this, operations))
-    return space, *problem.waves_of(space, this, problem.tangent(WAVE, 0.3, 0.7))
+    space = mirrors.reduced_orders(reach, pattern.lattice_frame(this, operations))
+    return space, *problem.waves_of(
+        space, this, problem.tangential_wave(WAVE, 0.3, 0.7)
+    )
 
 
 def test_p_waves_lie_along_the_wave_vector_of_their_order_and_s_waves_across():
@@ -147,8 +149,10 @@ def test_waves_are_an_orthogonal_basis_and_straight_light_has_its_place_in_it(
     nothing elsewhere.
     """
     this = cell(Rectangle(0.6))
-    space = mirrors.orders(3, pattern.frame(this, operations))
-    ways, places = problem.waves_of(space, this, problem.tangent(WAVE, 0.0, 0.0))
+    space = mirrors.reduced_orders(3, pattern.lattice_frame(this, operations))
+    ways, places = problem.waves_of(
+        space, this, problem.tangential_wave(WAVE, 0.0, 0.0)
+    )
     count = len(space.ex.m)
     assert ways.fold.shape == (count + len(space.ey.m),) * 2
     assert ways.fold.T @ ways.fold == pytest.approx(np.eye(len(ways.m)), abs=1e-12)
@@ -180,9 +184,9 @@ def test_light_in_a_mirror_is_p_in_one_class_and_s_in_the_other(
 ):
     this, found = cell(Rectangle(0.6)), {}
     for some in operations:
-        space = mirrors.orders(3, pattern.frame(this, some))
+        space = mirrors.reduced_orders(3, pattern.lattice_frame(this, some))
         ways, places = problem.waves_of(
-            space, this, problem.tangent(WAVE, angle, azimuth)
+            space, this, problem.tangential_wave(WAVE, angle, azimuth)
         )
         ((kind, (place, sign)),) = places.items()
         found[kind] = place < ways.p_count

@@ -18,10 +18,10 @@ from metalens import rcwa
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index
 from metalens.ground.errors import CellError, MaterialError
-from metalens.rcwa.conditions import case, case_waves
-from metalens.rcwa.layer import layer, operators
-from metalens.rcwa.solver import truncated
-from metalens.rcwa.stack import respond
+from metalens.rcwa.conditions import case_waves, disc_case
+from metalens.rcwa.layer import disc_operators, solve_eigenmodes
+from metalens.rcwa.solver import solve_truncated
+from metalens.rcwa.stack import scatter_zero_order
 
 CELL = Cell(0.4, 0.7, pillar=Index(3.6), substrate=Index(1.4525))
 WAVELENGTH = 0.85
@@ -92,8 +92,8 @@ def test_hard_homogeneous_layer_is_the_film_of_the_closed_form(direction, n):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_hard_pillar_of_air_goes_through_the_modes_and_gives_the_film(direction):
-    this = case(replace(CELL, pillar="air"), Light(WAVELENGTH, **direction))
-    got = truncated(this, np.array([0.0, 0.01, 0.2, 0.4]), 4)
+    this = disc_case(replace(CELL, pillar="air"), Light(WAVELENGTH, **direction))
+    got = solve_truncated(this, np.array([0.0, 0.01, 0.2, 0.4]), 4)
     sine = math.sin(direction.get("angle_rad", 0.0))
     t, r = fresnel_stack(
         [1.4525, 1.0, 1.0],
@@ -231,10 +231,10 @@ def test_swap_of_sides_with_a_tilted_wall():
     [("x", DIRECTIONS[0]), ("p", DIRECTIONS[1]), ("s", DIRECTIONS[2])],
 )
 def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
-    this = case(CELL, Light(WAVELENGTH, **direction))
+    this = disc_case(CELL, Light(WAVELENGTH, **direction))
     assert this.symmetry == symmetry
     reduced, whole = (
-        truncated(some, np.array([0.12, 0.25]), 4)
+        solve_truncated(some, np.array([0.12, 0.25]), 4)
         for some in (this, replace(this, symmetry="none"))
     )
     assert np.abs(reduced.t - whole.t).max() < ROUNDING
@@ -242,9 +242,10 @@ def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
 
 
 def test_hard_x_and_y_are_degenerate_without_the_help_of_symmetry():
-    this = replace(case(CELL, Light(WAVELENGTH)), symmetry="none")
+    this = replace(disc_case(CELL, Light(WAVELENGTH)), symmetry="none")
     x, y = (
-        truncated(replace(this, wave=wave), np.array([0.2]), 4).t[0] for wave in "ps"
+        solve_truncated(replace(this, wave=wave), np.array([0.2]), 4).t[0]
+        for wave in "ps"
     )
     assert abs(x - y) < ROUNDING
 
@@ -416,26 +417,28 @@ def test_many_diameters_are_what_each_one_is_alone():
 
 def plain_slices(cell, diameter_um, harmonics, slices):
     """t of a staircase of upright layers, the plain way."""
-    this = case(cell, Light(WAVELENGTH))
+    this = disc_case(cell, Light(WAVELENGTH))
     ways, zero = case_waves(this, harmonics)
     step = cell.height_um * math.tan(cell.sidewall_rad) / slices
     widths = diameter_um - step * (2 * np.arange(slices) + 1 - slices)
     layers = [
-        layer(*operators(ways, np.array(w), cell.pitch_um, this.pillar, this.between))
+        solve_eigenmodes(
+            *disc_operators(ways, np.array(w), cell.pitch_um, this.pillar, this.between)
+        )
         for w in widths
     ]
     media = replace(this.media, heights=(cell.height_um * this.k0 / slices,) * slices)
-    return respond(ways, media, layers, zero).t[zero]
+    return scatter_zero_order(ways, media, layers, zero).t[zero]
 
 
 @pytest.mark.parametrize("tilt_deg", [2, -2])
 def test_tilted_wall_is_the_limit_of_plain_slices(tilt_deg):
     cell = replace(CELL, sidewall_rad=math.radians(tilt_deg))
-    this = case(cell, Light(WAVELENGTH))
+    this = disc_case(cell, Light(WAVELENGTH))
     coarse, fine = (plain_slices(cell, 0.15, 3, slices) for slices in (32, 64))
     limit = fine + (fine - coarse) / 3  # second order, Richardson: 1e-6 left
     t = {
-        stages: truncated(this, np.array([0.15]), 3, stages).t[0]
+        stages: solve_truncated(this, np.array([0.15]), 3, stages).t[0]
         for stages in (4, 5, 6)
     }
     assert abs(t[6] - limit) < 1e-5

@@ -20,8 +20,8 @@ from metalens.cell.shapes import (
     Ring,
 )
 from metalens.ground.errors import CellError
-from metalens.rcwa.any_shape import ladder
-from metalens.rcwa.problem import problem
+from metalens.rcwa.any_shape import truncation_sequence
+from metalens.rcwa.problem import cell_problem
 
 ABOUT = {
     "height_um": 0.5,
@@ -126,14 +126,14 @@ def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(
     """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are
     wide.
     """
-    this = problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0)
-    found = ladder(this, None)
+    this = cell_problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0)
+    found = truncation_sequence(this, None)
     assert found.before == before
     assert found.reaches == range(
         7 - before, 16
     )  # seven orders may be the last ones; 15 of four mirrors
-    assert ladder(this, 9).reaches == range(9 - before, 10)
-    assert ladder(this, 4).reaches == range(1, 5)
+    assert truncation_sequence(this, 9).reaches == range(9 - before, 10)
+    assert truncation_sequence(this, 4).reaches == range(1, 5)
     assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
 
 

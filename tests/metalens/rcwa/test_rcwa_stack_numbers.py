@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from metalens.rcwa import stack
-from metalens.rcwa.layer import layer
+from metalens.rcwa.layer import solve_eigenmodes
 from metalens.rcwa.orders import basis
-from metalens.rcwa.orders.waves import half_space, normal_component, waves
-from metalens.rcwa.stack import Media
+from metalens.rcwa.orders.waves import half_space, normal_component, plane_waves
+from metalens.rcwa.stack import StackMedia
 
-WAYS = waves(
-    basis.basis(1, "none"),
+WAYS = plane_waves(
+    basis.disc_basis(1, "none"),
     pitch_um=0.47,
     wavelength_um=0.83,
     kx=0.31,
@@ -37,7 +37,7 @@ def drawn(seed, *, symmetric, batch=()):
     p = np.arange(N) < WAYS.p_count
     P = P + np.diag(np.where(p, 1 - WAYS.kappa**2 / 5, 1.0))
     Q = Q + np.diag(np.where(p, 5.0, 5.0 - WAYS.kappa**2))
-    return layer(P, Q, symmetric=symmetric)
+    return solve_eigenmodes(P, Q, symmetric=symmetric)
 
 
 def film(index, height):
@@ -103,7 +103,7 @@ def test_fields_between_half_spaces_are_those_of_all_equations_at_once(
     rng = np.random.default_rng(4)
     incident = rng.normal(size=N) + 1j * rng.normal(size=N)
     below, above = half_space(WAYS, BELOW), half_space(WAYS, ABOVE)
-    found = stack.match(
+    found = stack.match_layers(
         parts, heights, above, below, 2 * below[0] * below[1] * incident
     )
     r, layers, t = directly(inner_of(parts, heights), incident)
@@ -114,7 +114,9 @@ def test_fields_between_half_spaces_are_those_of_all_equations_at_once(
     for got, want in zip(zip(found.up, found.down, strict=True), layers, strict=True):
         assert got[0] == pytest.approx(want[0], abs=1e-8)
         assert got[1] == pytest.approx(want[1], abs=1e-8)
-    assert stack.outgoing(above, found.u_top, found.w_top) == pytest.approx(t, abs=1e-9)
+    assert stack.outgoing_amplitudes(above, found.u_top, found.w_top) == pytest.approx(
+        t, abs=1e-9
+    )
 
 
 def test_a_batch_is_each_of_its_layers_alone():
@@ -122,9 +124,11 @@ def test_a_batch_is_each_of_its_layers_alone():
     part = drawn(7, symmetric=True, batch=(2,))
     below, above = half_space(WAYS, BELOW), half_space(WAYS, ABOVE)
     source = 2 * below[0] * below[1] * (1 + np.arange(N))
-    both = stack.match([part], (9.0,), above, below, source)
+    both = stack.match_layers([part], (9.0,), above, below, source)
     for i in range(2):
-        alone = stack.match([layer(part.P[i], part.Q[i])], (9.0,), above, below, source)
+        alone = stack.match_layers(
+            [solve_eigenmodes(part.P[i], part.Q[i])], (9.0,), above, below, source
+        )
         for name in ("u", "w", "u_top", "w_top"):
             assert getattr(both, name)[i] == pytest.approx(
                 getattr(alone, name), abs=1e-9
@@ -144,8 +148,8 @@ def test_amplitudes_of_a_whole_stack_are_those_of_all_equations_at_once(
         [drawn(seed, symmetric=symmetric) for seed in (1, 2)[:layers]],
         (1.1, 0.6)[:layers],
     )
-    media = Media(BELOW, ABOVE, UNDER, OVER, heights)
-    got = stack.respond(WAYS, media, parts, zero)
+    media = StackMedia(BELOW, ABOVE, UNDER, OVER, heights)
+    got = stack.scatter_zero_order(WAYS, media, parts, zero)
     incident = np.zeros(N, complex)
     incident[zero] = 1.0
     inner = [
@@ -170,15 +174,19 @@ def test_power_is_that_of_waves_that_propagate():
         np.array([0.8, 0.3j, 2.0, 1.0, 1.0]),
         np.array([1.5, 2.0, 0.5 + 0.5j, 2.9e-12 + 3j, 3.1e-12 + 3j]),
     )
-    assert stack.flux((u, v)) == pytest.approx([1.2, 0.0, 1.0, 0.0, 3.1e-12], rel=1e-9)
+    assert stack.power_flux((u, v)) == pytest.approx(
+        [1.2, 0.0, 1.0, 0.0, 3.1e-12], rel=1e-9
+    )
 
 
 def test_an_amplitude_is_read_from_whichever_field_is_large():
     a = np.array([2.0 - 1j, 0.3j, 5.0])
     U, V = np.array([1e-14, 3.0 + 1j, 2.0]), np.array([4.0 - 2j, 1e-14, -1.5j])
-    assert stack.outgoing((U, V), U * a, V * a) == pytest.approx(a, rel=1e-12)
+    assert stack.outgoing_amplitudes((U, V), U * a, V * a) == pytest.approx(
+        a, rel=1e-12
+    )
     # of fields that do not belong together it is the nearest in both
-    off = stack.outgoing((U[2:], V[2:]), U[2:] * a[2] + 0.1, V[2:] * a[2])
+    off = stack.outgoing_amplitudes((U[2:], V[2:]), U[2:] * a[2] + 0.1, V[2:] * a[2])
     assert off == pytest.approx([5.0 + 2 * 0.1 / (4 + 2.25)], rel=1e-12)
 
 

@@ -11,19 +11,19 @@ from metalens import rcwa
 from metalens.cell import Cell, Index, Layer, Light
 from metalens.cell.shapes import Rectangle
 from metalens.rcwa import wall
-from metalens.rcwa.conditions import case
-from metalens.rcwa.solver import truncated, wall_stages
-from metalens.rcwa.wall import EDGES, Wall, gauss, panel
+from metalens.rcwa.conditions import disc_case
+from metalens.rcwa.solver import solve_truncated, wall_stages
+from metalens.rcwa.wall import EDGES, TiltedWall, collocate_panel, gauss_collocation
 
 TILTED = Cell(0.31, 0.63, Index(3.5), Index(1.47), Index(1.03), sidewall_rad=0.034)
 
 
 def of(cell):
-    return case(cell, Light(0.87))
+    return disc_case(cell, Light(0.87))
 
 
 def test_gauss_integrals_are_those_of_polynomials():
-    c, b, a = gauss(4)
+    c, b, a = gauss_collocation(4)
     for power in range(4):
         assert np.abs(a @ c**power - c ** (power + 1) / (power + 1)).max() < 1e-14
     assert abs(b @ c**7 - 1 / 8) < 1e-14  # exact to degree 2 m - 1, and rounding
@@ -32,8 +32,8 @@ def test_gauss_integrals_are_those_of_polynomials():
 def test_uniform_wall_is_an_exponential():
     """P = 1, Q = q²: u'' = -q² u, over a panel of 0.4 rad; five stages leave 1e-13."""
     q, height = 1.7, 2.3
-    this = Wall(lambda share: (np.eye(1), q**2 * np.eye(1)), height)
-    got = panel(this, 0.4, 0.5, 5).downwards
+    this = TiltedWall(lambda share: (np.eye(1), q**2 * np.eye(1)), height)
+    got = collocate_panel(this, 0.4, 0.5, 5).downwards
     phase = q * height * 0.1
     want = np.array(
         [
@@ -56,7 +56,7 @@ def test_error_of_the_wall_does_not_grow_with_the_harmonics(reach):
     with every few harmonics.
     """
     t = {
-        stages: truncated(of(TILTED), np.array([0.17]), reach, stages).t[0]
+        stages: solve_truncated(of(TILTED), np.array([0.17]), reach, stages).t[0]
         for stages in (4, 5, 6)
     }
     assert abs(t[5] - t[6]) < 1e-4
@@ -67,17 +67,17 @@ def test_power_and_the_error_that_is_told():
     this = of(TILTED)
     stages, left = wall_stages(this, np.array([0.17]), 1e-3)
     assert left <= 1e-4
-    found = truncated(this, np.array([0.17]), 5, stages)
+    found = solve_truncated(this, np.array([0.17]), 5, stages)
     assert (
         abs(found.energy[0] - 1) < 1e-10
     )  # Gauss collocation keeps quadratic invariants
-    assert abs(found.t[0] - truncated(this, np.array([0.17]), 5, 8).t[0]) <= left
+    assert abs(found.t[0] - solve_truncated(this, np.array([0.17]), 5, 8).t[0]) <= left
 
 
 def test_upright_limit_is_the_upright_pillar():
     flat = Cell(0.31, 0.63, Index(3.5), Index(1.47), Index(1.03))
-    want = truncated(of(flat), np.array([0.17]), 4)
-    got = truncated(of(flat), np.array([0.17]), 4, 6)
+    want = solve_truncated(of(flat), np.array([0.17]), 4)
+    got = solve_truncated(of(flat), np.array([0.17]), 4, 6)
     assert abs(got.t[0] - want.t[0]) < 1e-8
     assert abs(got.r[0] - want.r[0]) < 1e-8
 
@@ -124,6 +124,6 @@ def test_layers_tilt_on_their_own_and_keep_power():
 
 
 def test_stages_stop_at_the_most():
-    stages, left = wall.enough(lambda count: np.array([1.0 / count]), 1e-9)
+    stages, left = wall.choose_stage_count(lambda count: np.array([1.0 / count]), 1e-9)
     assert stages == wall.MOST
     assert left > 1e-9

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from metalens.rcwa.orders import mirrors
-from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Frame
+from metalens.rcwa.orders.mirrors import (
+    FLIP_X,
+    FLIP_Y,
+    HALF_TURN,
+    IDENTITY,
+    LatticeFrame,
+)
 
 RNG = np.random.default_rng(7)
 
@@ -59,7 +65,9 @@ def test_signs_are_those_of_electric_and_magnetic_fields_in_a_mirror():
 def test_orders_fill_a_circle_of_the_area_of_as_many_square_ones(
     harmonics, along, across, centred, count, reach
 ):
-    space = mirrors.orders(harmonics, Frame(along, across, centred, (IDENTITY,)))
+    space = mirrors.reduced_orders(
+        harmonics, LatticeFrame(along, across, centred, (IDENTITY,))
+    )
     assert space.reach == reach
     area = along * across / (2 if centred else 1)
     want = {
@@ -112,7 +120,8 @@ def test_one_amplitude_stands_for_an_orbit_and_products_are_those_of_all_orders(
     """
     operations, frame = CLASSES[name], (1.3, 1.0, False)
     space, whole = (
-        mirrors.orders(3, Frame(*frame, some)) for some in (operations, (IDENTITY,))
+        mirrors.reduced_orders(3, LatticeFrame(*frame, some))
+        for some in (operations, (IDENTITY,))
     )
     orders = list(zip(whole.ex.m.tolist(), whole.ex.n.tolist(), strict=True))
     r, q = space.reach
@@ -145,15 +154,17 @@ def test_one_amplitude_stands_for_an_orbit_and_products_are_those_of_all_orders(
                     own * np.sign(own[orders.index((a, b))])
                 )  # a representative counts as itself
             vectors.append(np.array(found).reshape(len(found), len(orders)))
-        got = mirrors.product(space, alike, pair)
+        got = mirrors.toeplitz_product(space, alike, pair)
         assert got == pytest.approx(vectors[0] @ full @ vectors[1].T, abs=1e-12)
 
 
 def test_a_function_that_turns_one_class_into_another_couples_them():
     """f(g r) = s(g) f(r), s = -1 for both mirrors: fields along x into those along y."""
     sides = [CLASSES["all, fields along y"], CLASSES["all, fields along x"]]
-    rows, columns = (mirrors.orders(3, Frame(1.3, 1.0, False, some)) for some in sides)
-    whole = mirrors.orders(3, Frame(1.3, 1.0, False, (IDENTITY,)))
+    rows, columns = (
+        mirrors.reduced_orders(3, LatticeFrame(1.3, 1.0, False, some)) for some in sides
+    )
+    whole = mirrors.reduced_orders(3, LatticeFrame(1.3, 1.0, False, (IDENTITY,)))
     orders = list(zip(whole.ex.m.tolist(), whole.ex.n.tolist(), strict=True))
     r, q = rows.reach
     table = RNG.normal(size=(4 * r + 1, 4 * q + 1))
@@ -172,6 +183,8 @@ def test_a_function_that_turns_one_class_into_another_couples_them():
                 (own,) = [v for v in side.values() if v[orders.index((a, b))]]
                 found.append(own * np.sign(own[orders.index((a, b))]))
             vectors.append(np.array(found))
-        got = mirrors.product_by(mirrors.link(row, column, sides[1], rows.reach), odd)
+        got = mirrors.product_by(
+            mirrors.link_sets(row, column, sides[1], rows.reach), odd
+        )
         assert got == pytest.approx(vectors[0] @ full @ vectors[1].T, abs=1e-12)
         assert np.abs(got).max() > 0.1

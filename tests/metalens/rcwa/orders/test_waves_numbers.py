@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from metalens.rcwa.orders import basis
-from metalens.rcwa.orders.waves import half_space, normal_component, waves
+from metalens.rcwa.orders.waves import half_space, normal_component, plane_waves
 
 PITCH, WAVELENGTH, KX, KY, AZIMUTH = 0.47, 0.83, 0.31, -0.17, 0.6
 
 
 def made(symmetry="none", kx=KX, ky=KY, azimuth=AZIMUTH):
-    return waves(
-        basis.basis(2, symmetry),
+    return plane_waves(
+        basis.disc_basis(2, symmetry),
         pitch_um=PITCH,
         wavelength_um=WAVELENGTH,
         kx=kx,
@@ -28,7 +28,7 @@ def test_p_waves_lie_along_the_wave_vector_and_s_waves_across(kx, ky):
     """The orders (m, n) of Ex, then of Ey: E of unit length at one order only; without
     a direction the azimuth's.
     """
-    these, circle = made(kx=kx, ky=ky), basis.basis(2, "none").ex
+    these, circle = made(kx=kx, ky=ky), basis.disc_basis(2, "none").ex
     count = len(circle.m)
     for i, (m, n) in enumerate(zip(circle.m.tolist(), circle.n.tolist(), strict=True)):
         x, y = kx + m * WAVELENGTH / PITCH, ky + n * WAVELENGTH / PITCH

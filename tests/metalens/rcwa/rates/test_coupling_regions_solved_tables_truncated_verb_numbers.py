@@ -11,9 +11,9 @@ import pytest
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import Ellipse, Polygon, Rectangle
 from metalens.rcwa import any_shape, pattern
-from metalens.rcwa.problem import problem
+from metalens.rcwa.problem import cell_problem
 from metalens.rcwa.rates import coupling, regions, solved, tables, truncated, verb
-from metalens.rcwa.rates.parameters import motion, parameters
+from metalens.rcwa.rates.parameters import parameter_motion, pillar_parameters
 from tests.metalens.rcwa.rates.test_jones_derivatives import differenced, varied
 
 WAVE, SIZE = 0.73, 0.25
@@ -76,7 +76,9 @@ def one_normal_field(monkeypatch):
 
 
 def values(cell, size_um, light, stages, reach=1):
-    return truncated.truncated(problem(cell, size_um, WAVE, *light), reach, stages, {})
+    return truncated.solve_with_rates(
+        cell_problem(cell, size_um, WAVE, *light), reach, stages, {}
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -91,10 +93,10 @@ def test_derivatives_of_the_least_truncation_are_its_differences(
     reach = (
         2 if case == "mirrors" else 1
     )  # orders along the axes alone turn no light from x to y
-    known = parameters(cell, SIZE, WAVE)
-    motions = {name: motion(known[name], WAVE) for name in ASKED[case]}
-    found = truncated.truncated(
-        problem(cell, SIZE, WAVE, *light), reach, stages, motions
+    known = pillar_parameters(cell, SIZE, WAVE)
+    motions = {name: parameter_motion(known[name], WAVE) for name in ASKED[case]}
+    found = truncated.solve_with_rates(
+        cell_problem(cell, SIZE, WAVE, *light), reach, stages, motions
     )
     plain = any_shape.jones(
         cell, SIZE, WAVE, angle_rad=light[0], azimuth_rad=light[1], harmonics=reach
@@ -134,18 +136,22 @@ def test_energy_is_the_power_of_all_orders_that_leave():
 
 def test_an_error_is_how_far_derivatives_moved_from_truncation_to_truncation():
     cell = Cell(0.41, shape=Rectangle(0.6), **ABOUT)
-    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
-    climb = any_shape.ladder(this, 2)
-    move = {"height_um": motion(parameters(cell, SIZE, WAVE)["height_um"], WAVE)}
+    this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
+    climb = any_shape.truncation_sequence(this, 2)
+    move = {
+        "height_um": parameter_motion(
+            pillar_parameters(cell, SIZE, WAVE)["height_um"], WAVE
+        )
+    }
     history = [
-        truncated.truncated(this, reach, 0, move).by["height_um"]
+        truncated.solve_with_rates(this, reach, 0, move).by["height_um"]
         for reach in climb.reaches
     ]
     assert len(history) == 2
     found = verb.jones_derivatives(
         cell, SIZE, WAVE, harmonics=2, by=["height_um"], tolerance=1e-2
     )
-    want = climb.crowded * any_shape.moved(history, 2, climb.before)
+    want = climb.crowded * any_shape.estimate_error(history, 2, climb.before)
     assert found.by["height_um"].error == pytest.approx(want, rel=1e-9)
     assert np.stack(
         [found.by["height_um"].t, found.by["height_um"].r]
@@ -160,11 +166,16 @@ def test_an_error_is_how_far_derivatives_moved_from_truncation_to_truncation():
 def test_an_error_holds_what_a_stage_more_of_a_tilted_wall_changes():
     cell = Cell(0.41, shape=Rectangle(0.6), sidewall_rad=0.05, **ABOUT)
     this, move = (
-        problem(cell, SIZE, WAVE, 0.0, 0.0),
-        {"height_um": motion(parameters(cell, SIZE, WAVE)["height_um"], WAVE)},
+        cell_problem(cell, SIZE, WAVE, 0.0, 0.0),
+        {
+            "height_um": parameter_motion(
+                pillar_parameters(cell, SIZE, WAVE)["height_um"], WAVE
+            )
+        },
     )
     few, more = (
-        truncated.truncated(this, 1, stages, move).by["height_um"] for stages in (1, 2)
+        truncated.solve_with_rates(this, 1, stages, move).by["height_um"]
+        for stages in (1, 2)
     )
     left = float(np.abs(few - more).max())
     assert verb._left_by_collocation(this, move, 2, 1) == {
@@ -176,9 +187,9 @@ def test_an_error_holds_what_a_stage_more_of_a_tilted_wall_changes():
 
 def test_sections_are_told_at_foot_and_top_or_at_eight_nodes():
     upright, tilted = CASES["mirrors"][0], CASES["tilted"][0]
-    assert truncated.shares(upright) == (0.0, 1.0)
+    assert truncated.sampled_heights(upright) == (0.0, 1.0)
     nodes = (1 - np.cos(np.pi * (2 * np.arange(8) + 1) / 16)) / 2
-    assert truncated.shares(tilted) == pytest.approx(nodes)
+    assert truncated.sampled_heights(tilted) == pytest.approx(nodes)
     layer = tilted.sections[0]
     for share in (0.0, 0.25, 1.0):
         got = (
@@ -195,23 +206,28 @@ def test_sections_are_told_at_foot_and_top_or_at_eight_nodes():
 def test_a_change_that_keeps_the_mirrors_does_not_couple_their_classes():
     """Of width or index; a turn has nothing but the coupling."""
     cell, light = CASES["mirrors"]
-    this = problem(cell, SIZE, WAVE, *light)
-    classes = [solved.solved(this, operations, 2, 0) for operations in this.classes]
+    this = cell_problem(cell, SIZE, WAVE, *light)
+    classes = [
+        solved.solve_adjoint_class(this, operations, 2, 0)
+        for operations in this.classes
+    ]
     slabs = [
         truncated.slab_at(cell, (cell.sections[0], 0.0), SIZE, WAVE, share)
         for share in (0.0, 1.0)
     ]
-    known = parameters(cell, SIZE, WAVE)
+    known = pillar_parameters(cell, SIZE, WAVE)
     for name, within in (
         ("size_um", True),
         ("pillar.n", True),
         ("shape.angle_rad", False),
     ):
-        rates = motion(known[name], WAVE).numbers[0]
-        table = tables.coefficients(slabs[0], cell, classes[0].space.reach, rates[0])
+        rates = parameter_motion(known[name], WAVE).numbers[0]
+        table = tables.coefficient_rates(
+            slabs[0], cell, classes[0].space.reach, rates[0]
+        )
         for i, rows in enumerate(classes):
             for j, columns in enumerate(classes):
-                pair = coupling.Coupling(rows, columns, 0, cell, slabs)
+                pair = coupling.ClassCoupling(rows, columns, 0, cell, slabs)
                 rate = pair.rate([table, None])
                 assert rate.shape == (2, 1, 1)
                 assert bool(np.abs(rate).max() > 1e-6) is ((i == j) is within), (
@@ -227,7 +243,7 @@ def test_numbers_of_a_section_change_its_coefficients_as_differences_say():
     """
     cell = CASES["films and layers"][0]
     slab = truncated.slab_at(cell, (cell.layers[1], 0.0), SIZE, WAVE, 0.5)
-    assert tables.numbers(slab)[-3:] == pytest.approx(
+    assert tables.section_parameters(slab)[-3:] == pytest.approx(
         [(2.7 + 0.03j) ** 2, 1.9**2, 1.1**2]
     )
     for name in (
@@ -238,16 +254,18 @@ def test_numbers_of_a_section_change_its_coefficients_as_differences_say():
         "between.n",
         "pillar.n",
     ):
-        one = parameters(cell, SIZE, WAVE)[name]
-        rates = motion(one, WAVE).numbers[1]
-        got = tables.coefficients(slab, cell, (2, 3), (rates[0] + rates[1]) / 2)
+        one = pillar_parameters(cell, SIZE, WAVE)[name]
+        rates = parameter_motion(one, WAVE).numbers[1]
+        got = tables.coefficient_rates(slab, cell, (2, 3), (rates[0] + rates[1]) / 2)
 
         def at(x, one=one):
             now = one.moved(x)
             moved = truncated.slab_at(
                 now.cell, (now.cell.layers[1], now.grow_um), now.size_um, WAVE, 0.5
             )
-            return np.stack(pattern.tables(moved, now.cell, (2, 3))).astype(complex)
+            return np.stack(
+                pattern.permittivity_coefficients(moved, now.cell, (2, 3))
+            ).astype(complex)
 
         want = differenced(at, 1e-5)
         assert np.stack(got) == pytest.approx(want, abs=1e-7 * np.abs(want).max()), name
@@ -256,7 +274,7 @@ def test_numbers_of_a_section_change_its_coefficients_as_differences_say():
 def test_fields_beside_others_and_upside_down():
     rng = np.random.default_rng(3)
     one, other = (
-        regions.Fields(
+        regions.RegionFields(
             rng.normal(size=(2, k)), rng.normal(size=(2, k)), rng.normal(size=(3, 4, k))
         )
         for k in (2, 3)

@@ -21,10 +21,10 @@ from metalens.cell.shapes import (
 )
 from metalens.ground.errors import CellError
 from metalens.rcwa import any_shape, pattern
-from metalens.rcwa.problem import problem
+from metalens.rcwa.problem import cell_problem
 from metalens.rcwa.rates import verb
-from metalens.rcwa.rates.parameters import motion, parameters
-from metalens.rcwa.rates.truncated import truncated
+from metalens.rcwa.rates.parameters import parameter_motion, pillar_parameters
+from metalens.rcwa.rates.truncated import solve_with_rates
 
 WAVE = 0.73
 ABOUT = {
@@ -207,10 +207,16 @@ def test_what_the_last_stage_of_a_tilted_wall_changes_is_told_of_every_derivativ
 
     def values(stages, x):
         moved = dataclasses.replace(cell, height_um=cell.height_um + x)
-        return truncated(problem(moved, 0.25, WAVE, 0.15, 0.1), 1, stages, {}).both
+        return solve_with_rates(
+            cell_problem(moved, 0.25, WAVE, 0.15, 0.1), 1, stages, {}
+        ).both
 
-    this = problem(cell, 0.25, WAVE, 0.15, 0.1)
-    motions = {"height_um": motion(parameters(cell, 0.25, WAVE)["height_um"], WAVE)}
+    this = cell_problem(cell, 0.25, WAVE, 0.15, 0.1)
+    motions = {
+        "height_um": parameter_motion(
+            pillar_parameters(cell, 0.25, WAVE)["height_um"], WAVE
+        )
+    }
     few, more = (
         differenced(lambda x, count=count: values(count, x), 3e-5) for count in (2, 3)
     )
@@ -381,23 +387,27 @@ def test_an_error_is_what_truncations_moved_as_that_of_t_and_what_a_stage_fewer_
         (upright, 4, ("size_um", "pillar.n")),
         (tilted, 2, ("height_um",)),
     ):
-        this = problem(cell, 0.3, WAVE, 0.0, 0.0)
-        climb = any_shape.ladder(this, most, collocated=cell is tilted)
+        this = cell_problem(cell, 0.3, WAVE, 0.0, 0.0)
+        climb = any_shape.truncation_sequence(this, most, collocated=cell is tilted)
         about = {"by": names, "tolerance": 1e-2}
         parts = [
             rcwa.jones_derivatives(cell, 0.3, WAVE, **about, harmonics=reach).by
             for reach in climb.reaches
         ]
         assert len(parts) > 1
-        stages = any_shape.collocation(this, climb, 1e-2)[0]
+        stages = any_shape.choose_stages(this, climb, 1e-2)[0]
         assert (stages > 0) is (cell is tilted)
         for name in names:
             history = [np.stack([one[name].t, one[name].r]) for one in parts]
-            want = climb.crowded * any_shape.moved(history, most, climb.before)
+            want = climb.crowded * any_shape.estimate_error(history, most, climb.before)
             if stages:
-                moves = {name: motion(parameters(cell, 0.3, WAVE)[name], WAVE)}
+                moves = {
+                    name: parameter_motion(
+                        pillar_parameters(cell, 0.3, WAVE)[name], WAVE
+                    )
+                }
                 ends = [
-                    truncated(this, climb.reaches[0], count, moves).by[name]
+                    solve_with_rates(this, climb.reaches[0], count, moves).by[name]
                     for count in (stages - 1, stages)
                 ]
                 left = np.abs(ends[1] - ends[0]).max()
@@ -444,11 +454,13 @@ def test_a_film_of_no_thickness_can_have_some():
 
 
 def test_a_number_without_a_point_is_a_number_and_a_count_of_sides_is_none():
-    whole, plain = (parameters(Cell(0.41, shape=shape, **ABOUT), 0.15, WAVE) for shape in
+    whole, plain = (pillar_parameters(Cell(0.41, shape=shape, **ABOUT), 0.15, WAVE) for shape in
                     (Rectangle(2, 0), Rectangle(2.0, 0.0)))  # fmt: skip
     assert set(whole) == set(plain) > {"shape.ratio", "shape.angle_rad"}
     assert whole["shape.ratio"].moved(1e-3).cell.shape == Rectangle(2.001)
-    pentagon = parameters(Cell(0.41, shape=RegularPolygon(5), **ABOUT), 0.15, WAVE)
+    pentagon = pillar_parameters(
+        Cell(0.41, shape=RegularPolygon(5), **ABOUT), 0.15, WAVE
+    )
     assert {name for name in pentagon if name.startswith("shape.")} == {
         "shape.angle_rad"
     }

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from metalens.rcwa.layer import Layer
+from metalens.rcwa.layer import FourierModes
 from metalens.rcwa.rates import kernels
-from metalens.rcwa.rates.regions import Fields, Modes
+from metalens.rcwa.rates.regions import RegionFields, RegionModes
 
 HEIGHT = 2.3
 ROWS = np.array([1.7 + 0.02j, 2.9, 0.4j, 1.31 + 0.6j])
@@ -20,7 +20,7 @@ COLUMNS = np.array(
 
 
 def modes(q):
-    return Modes(SimpleNamespace(q=q), HEIGHT)
+    return RegionModes(SimpleNamespace(q=q), HEIGHT)
 
 
 def quadrature(wave):
@@ -33,7 +33,10 @@ def quadrature(wave):
 
 @pytest.mark.parametrize(
     ("integrals", "factor"),
-    [(kernels.plain, lambda z: 1.0), (kernels.sloped, lambda z: z / HEIGHT - 0.5)],
+    [
+        (kernels.mode_integrals, lambda z: 1.0),
+        (kernels.weighted_mode_integrals, lambda z: z / HEIGHT - 0.5),
+    ],
 )
 def test_integrals_of_two_modes_are_those_of_their_exponentials(integrals, factor):
     same, opposite = integrals(modes(ROWS), modes(COLUMNS))
@@ -58,7 +61,7 @@ def test_slopes_between_modes_that_hardly_differ_follow_their_series_to_its_end(
     q = np.array([1.1])
     for half in (0.0, 0.02, 0.17, 0.29, 0.31, 0.34):
         p = q - 2 * half / HEIGHT
-        _, opposite = kernels.sloped(modes(q), modes(p))
+        _, opposite = kernels.weighted_mode_integrals(modes(q), modes(p))
         want = quadrature(
             lambda z, p=p: complex(
                 (z / HEIGHT - 0.5) * np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z))
@@ -67,7 +70,7 @@ def test_slopes_between_modes_that_hardly_differ_follow_their_series_to_its_end(
         assert opposite[0, 0] == pytest.approx(
             want, abs=1e-11
         )  # 0.3⁹ / 4e6: the next term
-        _, opposite = kernels.plain(modes(q), modes(p))
+        _, opposite = kernels.mode_integrals(modes(q), modes(p))
         want = quadrature(
             lambda z, p=p: complex(np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z)))
         )
@@ -82,14 +85,14 @@ def layer(seed, n=3):
     q = rng.uniform(0.5, 2, n) + 1j * rng.uniform(0.1, 0.4, n)
     V = Q @ W / q
     P = W * q @ np.linalg.inv(V)
-    return Layer(P, Q, q, W, V, symmetric=False)
+    return FourierModes(P, Q, q, W, V, symmetric=False)
 
 
 def waves(rng, n, k):
     up, down = (
         rng.normal(size=(n, k)) + 1j * rng.normal(size=(n, k)) for _ in range(2)
     )
-    return Fields(up, down, np.zeros((1, 0, k)))
+    return RegionFields(up, down, np.zeros((1, 0, k)))
 
 
 def field(part, waves, z):
@@ -110,11 +113,11 @@ def test_rates_of_an_upright_layer_are_the_integrals_of_its_fields():
     dP, dQ = rng.normal(size=(2, 2)), rng.normal(size=(3, 3))
     nodes, weights = np.polynomial.legendre.leggauss(40)
     heights = HEIGHT * (nodes + 1) / 2
-    sides = Modes(back, HEIGHT), Modes(light, HEIGHT)
+    sides = RegionModes(back, HEIGHT), RegionModes(light, HEIGHT)
     turned = kernels.in_modes(*sides, z, (dP, dQ))
     for integrals, sign, factor in (
-        (kernels.plain, 1, 1 + 0 * nodes),
-        (kernels.sloped, -1, nodes / 2),
+        (kernels.mode_integrals, 1, 1 + 0 * nodes),
+        (kernels.weighted_mode_integrals, -1, nodes / 2),
     ):
         want = 0
         for height, weight in zip(heights, weights * factor * HEIGHT / 2, strict=True):
@@ -125,15 +128,15 @@ def test_rates_of_an_upright_layer_are_the_integrals_of_its_fields():
             want = want + weight * 1j * (
                 u_back.T @ dQ @ u - w_back[z[0]].T @ dP @ w[z[1]]
             )
-        got = kernels.upright(turned, integrals(*sides), sign, sent, comes)
+        got = kernels.upright_rates(turned, integrals(*sides), sign, sent, comes)
         assert got == pytest.approx(want, abs=1e-10)
 
 
 def test_a_unit_of_height_adds_what_the_operators_make_of_the_fields_at_the_foot():
     rng = np.random.default_rng(6)
     part, n = layer(3), 3
-    turned = Modes(
-        Layer(
+    turned = RegionModes(
+        FourierModes(
             part.P.T,
             part.Q.T,
             part.q,
@@ -146,8 +149,8 @@ def test_a_unit_of_height_adds_what_the_operators_make_of_the_fields_at_the_foot
     sent, comes = waves(rng, n, 2), waves(rng, n, 4)
     (u, w), (u_back, w_back) = field(part, comes, 0.0), field(turned.part, sent, 0.0)
     want = 1j * (u_back.T @ part.Q @ u - w_back.T @ part.P @ w)
-    this = SimpleNamespace(plain=Modes(part, HEIGHT), transposed=turned)
-    assert kernels.stretch(this, sent, comes) == pytest.approx(want, rel=1e-10)
+    this = SimpleNamespace(plain=RegionModes(part, HEIGHT), transposed=turned)
+    assert kernels.height_rates(this, sent, comes) == pytest.approx(want, rel=1e-10)
     (later, late), (back, backs) = (
         field(part, comes, 0.7),
         field(turned.part, sent, 0.7),

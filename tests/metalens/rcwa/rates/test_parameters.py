@@ -8,7 +8,7 @@ import pytest
 
 from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Polygon
-from metalens.rcwa.rates.parameters import parameters
+from metalens.rcwa.rates.parameters import pillar_parameters
 
 CELL = Cell(
     0.41, 0.53, Index(2.7, 0.03), Index(1.45), Index(1.0), Index(1.1), 0.02,
@@ -45,11 +45,13 @@ def flat(value, path=""):
 
 def test_a_pillar_has_these_numbers_and_no_other():
     assert {
-        name: one.step for name, one in parameters(CELL, SIZE, WAVE).items()
+        name: one.step for name, one in pillar_parameters(CELL, SIZE, WAVE).items()
     } == pytest.approx({name: 1e-4 * of for name, of in STEPS.items()}, rel=1e-12)
     plain = dataclasses.replace(CELL, layers=(), under=(Film(Index(1.9), 0.0),))
-    assert parameters(plain, SIZE, WAVE)["height_um"].step == pytest.approx(1e-4 * 0.53)
-    assert parameters(plain, SIZE, WAVE)["height_um"].moved(
+    assert pillar_parameters(plain, SIZE, WAVE)["height_um"].step == pytest.approx(
+        1e-4 * 0.53
+    )
+    assert pillar_parameters(plain, SIZE, WAVE)["height_um"].moved(
         0.01
     ).cell.height_um == pytest.approx(0.54)
 
@@ -59,7 +61,7 @@ def test_a_number_that_changes_is_that_one_alone(name):
     """The height of a pillar is that of its layers; a film thinner than 0.1 um is
     looked at as if it had that.
     """
-    changed = parameters(CELL, SIZE, WAVE)[name].moved(0.007)
+    changed = pillar_parameters(CELL, SIZE, WAVE)[name].moved(0.007)
     was, now = flat(dataclasses.asdict(CELL)), flat(dataclasses.asdict(changed.cell))
     assert now.keys() == was.keys()
     apart = {key: now[key] - was[key] for key in was if now[key] != was[key]}
