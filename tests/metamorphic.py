@@ -68,7 +68,12 @@ def cell_scale(solve, rng):
 def cell_reciprocity(solve, rng):
     cell, d, wave = pillar(rng)
     turned = dataclasses.replace(
-        cell, substrate=cell.cover, cover=cell.substrate, under=(), over=cell.under
+        cell,
+        substrate=cell.cover,
+        cover=cell.substrate,
+        between=cell.fill,
+        under=(),
+        over=cell.under,
     )
     one = solve(cell, d, wave, tolerance=3e-3)
     other = solve(turned, d, wave, tolerance=3e-3)

@@ -113,6 +113,7 @@ def tilted_row() -> Row:
         cell,
         substrate=cell.cover,
         cover=cell.substrate,
+        between=cell.fill,
         sidewall_rad=-cell.sidewall_rad,
     )
     there = rcwa.solve(cell, 0.2, 0.85, harmonics=7)

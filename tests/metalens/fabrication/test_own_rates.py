@@ -67,7 +67,7 @@ def few_orders(monkeypatch):
     monkeypatch.setattr(
         pattern,
         "normal_tables",
-        lambda outlines, cell, reach: own_tables(fixed, cell, reach),
+        lambda outlines, cell, reach, *_: own_tables(fixed, cell, reach),
     )
     monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
 

@@ -170,6 +170,7 @@ def turned_over(cell):
         cell,
         substrate=cell.cover,
         cover=cell.substrate,
+        between=cell.fill,
         under=cell.over[::-1],
         over=cell.under[::-1],
         sidewall_rad=-cell.sidewall_rad,

@@ -69,7 +69,7 @@ def one_normal_field(monkeypatch):
     monkeypatch.setattr(
         pattern,
         "normal_tables",
-        lambda outlines, cell, reach: own(
+        lambda outlines, cell, reach, *_: own(
             fixed, Cell(0.41, lattice=cell.lattice), reach
         ),
     )

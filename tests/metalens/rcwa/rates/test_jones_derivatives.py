@@ -113,7 +113,9 @@ def one_normal_field(monkeypatch):
     """
     own, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
     monkeypatch.setattr(
-        pattern, "normal_tables", lambda outlines, cell, reach: own(fixed, cell, reach)
+        pattern,
+        "normal_tables",
+        lambda outlines, cell, reach, *_: own(fixed, cell, reach),
     )
 
 
