@@ -103,10 +103,6 @@ VERBS: dict[str, tuple[str, str]] = {
         "codesign.commands.options.budget",
         "lens.h5 -> error of every link of the chain: phase, PSF, gaze",
     ),
-    "plan": (
-        "codesign.commands.options.plan",
-        "a gaze error -> the tolerances, depths and wavelengths that suffice",
-    ),
     "demo": (
         "metalens.commands.demo",
         "the chain on a small lens, ending in report.html",
@@ -407,8 +403,8 @@ def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
 
 
 _INTERRUPTED = """
-An interrupted command leaves what stood at its output. library, study, budget, plan and evaluate paper go on with the
-same command, codesign, retrain and demo with --resume; all others begin anew.
+An interrupted command leaves what stood at its output. library, study and evaluate paper go on with the same
+command, codesign, retrain and demo with --resume; all others begin anew.
 """
 
 

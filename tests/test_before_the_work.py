@@ -90,7 +90,6 @@ NEEDS = {
     "codesign": ("run.toml", "codesign.commands.codesign:_work"),
     "evaluate": ("optics lens.h5", "codesign.commands.evaluate_optics:_measure"),
     "budget": ("lens.h5", "codesign.commands.budget:bench"),
-    "plan": ("--gaze-error 1deg", "codesign.budget.floor:floor"),
     "check": ("mask.gds", "layout.drc:check_library"),
     "study": ("", "metalens.pillars.study:run"),
     "view": ("lens.h5", "metalens.commands.view:_shown"),
@@ -440,7 +439,6 @@ def test_room_is_asked_for_as_soon_as_the_size_is_known(
         "study cell.toml -o o",
         "psf lens.h5 --config cell.toml -o o.h5",
         "codesign cell.toml -o o",
-        "plan --gaze-error 1deg --config cell.toml -o o",
         "evaluate optics lens.h5 --config cell.toml -o o",
     ],
 )

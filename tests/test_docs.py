@@ -50,7 +50,6 @@ def _records():
     from characterize.bench.bench import Truth
     from characterize.bench.protocol import Protocol
     from characterize.pupil.record import PupilSpec
-    from codesign.budget.plan import PlanConfig
     from codesign.commands.evaluate_optics import Settings as Optics
     from layout.arrange import Arrangement
     from layout.process.process import Process
@@ -65,7 +64,6 @@ def _records():
         "TRUTH.toml": Truth,
         "PROTOCOL.toml": Protocol,
         "PUPIL.toml": PupilSpec,
-        "PLAN.toml": PlanConfig,
         "CHAIN.toml": ChainFiles,
         "ARRANGEMENT.toml": Arrangement,
         "OPTICS.toml": Optics,

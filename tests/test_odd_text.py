@@ -41,7 +41,6 @@ SETTINGS = {
     "codesign": ("codesign s.toml -o o", "preset = 'smoke'\n", WORK["codesign"]),
     "evaluate": ("evaluate optics lens.h5 --config s.toml -o o", "[axial]\ncount = 3\n", WORK["evaluate"]),
     "budget": ("budget lens.h5 --process s.toml -o o.h5", "name = 'x'\n", WORK["budget"]),
-    "plan": ("plan --gaze-error 1deg --config s.toml -o o", "aperture_mm = 0.3\n", WORK["plan"]),
     "demo": ("demo o --config s.toml", CHAIN, "metalens.commands.demo:_chain"),
 }  # fmt: skip
 

@@ -6,7 +6,6 @@ import math
 import shutil
 from dataclasses import replace
 from functools import partial
-from typing import get_args
 
 import numpy as np
 import torch
@@ -18,9 +17,8 @@ from codesign.batches import pool
 from codesign.batches.flat import depth_um, flattened, irradiance
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import EyeScenes, SceneConfig
-from codesign.network import architecture, baselines, blur, cost
+from codesign.network import architecture, blur, cost
 from codesign.network.architecture import Architecture, Space
-from codesign.network.baselines import Name
 from codesign.network.supernet import Supernet
 from codesign.optics import formed
 from codesign.optics import stack as optics
@@ -55,13 +53,11 @@ def rows() -> list[Row]:
     trained = [
         row for optics in (OPTICS, TRUE) for row in _training(threads, made, optics)
     ]
-    baselines = _baselines(threads, made)
     return [
         *_counts(),
         *_optics(threads),
         *_stages(threads, made),
         *trained,
-        *baselines,
         *_compiled(threads),
     ]
 
@@ -320,13 +316,12 @@ def _trainer(
     of: OpticsConfig,
     *,
     live: bool,
-    network: Name = "supernet",
 ) -> Trainer:
     lens, pitch = (Schedule(rate if live else 0.0, 0.0, 0.9) for rate in (0.02, 0.005))
     settings = InnerConfig(
         steps=10_000, batch=BATCH, optics=lens, pitch=pitch, optics_weight=0.0
     )
-    fresh = inner.model(of, pitch_um=9.0, seed=0, space=SPACE, network=network)
+    fresh = inner.model(of, pitch_um=9.0, seed=0, space=SPACE)
     return Trainer(
         settings, of, SENSOR, PoolScenes(made, 16, 0.2, 0), fresh, architecture=member
     )
@@ -437,27 +432,6 @@ def _forward(member: Architecture) -> float:
             net(frames, member)
 
     return fastest(look, repeats=4) / BATCH
-
-
-def _baselines(threads: int, made: pool.Pool) -> list[Row]:
-    out = []
-    for name in get_args(Name)[1:]:
-        net = baselines.make(name)
-        macs = float(net.counts(_member(0.5, 2), np.array([128]))[0]) / 1e6
-        steps = _trainer(made, None, OPTICS, live=False, network=name).run()
-        seconds = fastest(partial(next, steps)) / BATCH
-        out.append(
-            Row(
-                f"{name}, {macs:.1f} MMACs",
-                "training step",
-                seconds,
-                NONE,
-                "-",
-                threads,
-                goal=_rate(seconds),
-            )
-        )
-    return out
 
 
 def _compiled(threads: int) -> list[Row]:

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks import Row
 from codesign.eye import dataset
-from codesign.referee import pathtraced
+from tests.referees import pathtraced
 
 STATES = (1, 3, 5, 8)
 SAMPLES = 512

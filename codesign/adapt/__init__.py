@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from codesign.adapt.settings import RetrainConfig as RetrainConfig
     from codesign.adapt.source import Source as Source
     from codesign.adapt.train import Lenses as Lenses
-    from codesign.adapt.train import network as network
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -24,7 +23,6 @@ __getattr__, __dir__, __all__ = attach(
         "Source": "source",
         "bootstrap": "reading",
         "correction": "",
-        "network": "train",
         "report": "",
         "retrained": "",
         "sure": "",

@@ -168,6 +168,18 @@ def next_lenses(
     return out
 
 
+def worse(before: Proposal, after: Proposal) -> str:
+    """Why a step of the correction is not written: the simulated lens is worse with it;
+    empty where it is not.
+    """
+    if after.strehl >= before.strehl:
+        return ""
+    return (
+        f"no correction: the simulated lens is worse with it, Strehl ratio "
+        f"{after.strehl:.3f} ({after.name}) against {before.strehl:.3f} ({before.name})"
+    )
+
+
 def overlap(one: Array, other: Array) -> float:
     """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a>
     <b, b>), best piston.

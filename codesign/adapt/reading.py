@@ -18,11 +18,14 @@ class Accuracy:
 
     above: why the error of the images that were read is above what their run asks for;
     empty where it is not.
+    finer: the same on images formed at a quarter of the tolerance; None where they are
+    not known.
     """
 
     error_mm: Tensor
     iou: Tensor
     above: str = ""
+    finer: "Accuracy | None" = None
 
     @property
     def slip_mm(self) -> float:
@@ -46,10 +49,18 @@ class Accuracy:
         )
         return low, high
 
+    def _beside(self, fine: "Accuracy") -> dict[str, float]:
+        return {
+            "finer_slip_mm": fine.slip_mm,
+            "finer_axial_mm": fine.axial_mm,
+            "finer_ratio": fine.slip_mm / self.slip_mm,
+        }
+
     def values(self) -> dict[str, float]:
         """The numbers by name, for tables and JSON."""
         low, high = self.interval_mm()
-        return {
+        fine = {} if self.finer is None else self._beside(self.finer)
+        return fine | {
             "slip_mm": self.slip_mm,
             "slip_low_mm": low,
             "slip_high_mm": high,

@@ -12,7 +12,7 @@ from characterize.bench import Truth
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
 from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.source import Source, is_retraining
+from codesign.adapt.source import Source, is_retraining, lens_file
 from codesign.optics import MadeLens
 from codesign.train import RunConfig, checkpoint
 from metalens import lens as lenses
@@ -103,7 +103,8 @@ def load(path: Path) -> Source:
         )
         built = asbuilt.load(_known(places["asbuilt"]))
         truth = None if places["truth"] is None else config.load(places["truth"], Truth)
-        design = lenses.load_plain(_known(places["run"]) / "lens.h5")
+        run_dir, budget = _known(places["run"]), source.row["budget_mmacs"]
+        design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
         made = MadeLens(design, source.settings.optics, response=built.response)
         found = retraining.lenses(made, built, recipe.settings, truth)
         if (

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from characterize.inference import AsBuilt
-from codesign.network import Architecture, Baseline, check, smallest
+from codesign.network import Architecture, check, subnet
 from codesign.optics import Stack
-from codesign.train import Run, RunConfig
+from codesign.train import Run, RunConfig, checkpoint
 from codesign.train import run as runs
 from metalens.ground import manifest, reading
 from metalens.ground.errors import FitError, TrainingError
@@ -40,7 +41,9 @@ class Source:
 
 
 def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
-    """A finished run and its network of this budget.
+    """A finished run and its network of this budget, as result.json judged it.
+
+    The weights are those of the network's own file, fine-tuned where the run did so.
 
     Raises:
         TrainingError: no run folder, half written, unfinished, of another version, or
@@ -70,16 +73,44 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
         else rows[-1:]
     )
     if not found:
-        have = ", ".join(
-            "none" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:g}"
-            for r in rows
-        )
+        have = ", ".join(f"{r['budget_mmacs']:g}" for r in rows)
         raise TrainingError(
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
         )
-    return Source(
-        made, architecture_of(found[0]["architecture"], made, folder), found[0]
-    )
+    architecture = architecture_of(found[0]["architecture"], made, folder)
+    with reading.steady(folder):
+        restore_weights(made, found[0], folder)
+    return Source(made, architecture, found[0])
+
+
+def weights_file(folder: Path, budget_mmacs: float) -> Path:
+    """Where the weights of one network of a run lie."""
+    return folder / f"subnet_{budget_mmacs:g}.safetensors"
+
+
+def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
+    """The lens of one network of a run: the run's, or its own."""
+    name = f"lens_{budget_mmacs:g}" if settings.search.inner_steps else "lens"
+    return folder / f"{name}.h5"
+
+
+def restore_weights(run: Run, row: dict[str, Any], folder: Path) -> None:
+    """Give the run's network the weights that a row of result.json was judged with.
+
+    Without fine-tuning those are the checkpoint's own; networks with optics of their
+    own (``search.inner_steps``) bring lens and pitch.
+
+    Raises:
+        TrainingError: the file is missing, cut short, or of another space.
+    """
+    if not (run.settings.run.finetune_steps or run.settings.search.inner_steps):
+        return
+    state = checkpoint.load_network(weights_file(folder, row["budget_mmacs"]))
+    model = run.trainer.model
+    with torch.no_grad():
+        for name in ("coefficients_rad", "log_pitch"):
+            getattr(model, name).copy_(state.pop(f"optics.{name}"))
+    subnet.restore(model.net, state)
 
 
 def is_retraining(folder: Path) -> bool:
@@ -125,15 +156,11 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 def architecture_of(
     entry: dict[str, Any] | None, run: Run, folder: Path
 ) -> Architecture:
-    """The architecture in a row of result.json; the only one of a baseline network,
-    whose row names none.
+    """The architecture in a row of result.json.
 
     Raises:
         TrainingError: of another version, or outside the run's space.
     """
-    net = run.trainer.model.net
-    if isinstance(net, Baseline):
-        return smallest(net.space)
     named = (entry or {}).items()
     values: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v

@@ -20,9 +20,16 @@ from characterize.inference import AsBuilt
 from codesign.adapt import reading
 from codesign.adapt.reading import Accuracy
 from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.source import Source, architecture_of, check_lens, load, rows_of
+from codesign.adapt.source import (
+    Source,
+    architecture_of,
+    check_lens,
+    lens_file,
+    load,
+    rows_of,
+)
 from codesign.batches import TEST
-from codesign.network import Supernet, recalibrate
+from codesign.network import recalibrate
 from codesign.optics import MadeLens, Stack, built
 from codesign.train import (
     Batch,
@@ -30,13 +37,13 @@ from codesign.train import (
     Record,
     Scenes,
     Schedule,
+    Seen,
     Trainer,
     assess,
     checkpoint,
     model,
     place,
 )
-from metalens.ground.errors import TrainingError
 
 APART = 7919  # between the seeds of retrainings: no step of one is a step of another
 JOBS = (
@@ -146,7 +153,6 @@ def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> T
     settings, origin = source.settings, source.run.trainer
     fresh = model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
-        network=settings.network,
     )  # fmt: skip
     fresh.net.load_state_dict(origin.model.net.state_dict())
     with torch.no_grad():
@@ -180,20 +186,6 @@ def job(source: Source, config: RetrainConfig, found: Lenses, name: str) -> Trai
     )
 
 
-def network(going: Trainer) -> Supernet:
-    """The network of a trainer.
-
-    Raises:
-        TrainingError: a baseline of fixed shape.
-    """
-    net = going.model.net
-    if not isinstance(net, Supernet):
-        raise TrainingError(
-            f"the run trained a {type(net).__name__}; only elastic networks are retrained"
-        )
-    return net
-
-
 def jobs(found: Lenses) -> tuple[str, ...]:
     """Networks that can be trained: with the truth only where it is known."""
     return JOBS if found.known else JOBS[:2]
@@ -223,7 +215,7 @@ def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
         made = going.light.stacks[number % len(going.light.stacks)]
         step = _Step(going.scenes, number)
         frames.append(assess.frames(going, step, 1, stack=made).frames)
-    recalibrate(network(going), source.architecture, frames)
+    recalibrate(going.model.net, source.architecture, frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,21 +266,36 @@ def judge(
     stacks: Sequence[Stack],
     *,
     frames: Held | None = None,
+    finer: bool = True,
 ) -> Accuracy:
     """Errors on test frames, each the mean over these lenses: the frames are what all
     cases share.
 
-    frames: of :func:`held`, where several cases are judged.
+    Args:
+        frames: of :func:`held`, where several cases are judged.
+        finer: judge on images formed at a quarter of the tolerance too.
     """
     settle(going, source)
     frames = frames or held(source, config)
-    parts = []
+    own, fine = [], []
     for made in stacks[: config.judge]:
         seen = assess.frames(going, frames, config.test_batches, stack=made)
-        answers = assess.predict(
-            going.model.net, source.architecture, seen, going.inner
-        )
-        parts.append(reading.accuracy(answers, seen))
+        own.append(_read(going, source, seen))
+        more = (going, frames, config.test_batches) if finer else None
+        exact = more and assess.finer_frames(*more, stack=made)
+        if exact is not None:
+            fine.append(_read(going, source, exact))
+    whole = _mean(own)
+    return replace(whole, finer=_mean(fine)) if len(fine) == len(own) else whole
+
+
+def _read(going: Trainer, source: Source, seen: Seen) -> Accuracy:
+    answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
+    return reading.accuracy(answers, seen)
+
+
+def _mean(parts: Sequence[Accuracy]) -> Accuracy:
+    """Errors frame by frame, each the mean over lenses."""
     error, iou = (
         torch.stack([getattr(p, name) for p in parts]).mean(0)
         for name in ("error_mm", "iou")
@@ -338,7 +345,9 @@ def retrain(
 
     config = config or RetrainConfig()
     source = load(folder, budget_mmacs=config.budget_mmacs)
-    design = lens_files.load(folder / "lens.h5")
+    design = lens_files.load(
+        lens_file(folder, source.settings, source.row["budget_mmacs"])
+    )
     check_lens(design, result)
     found = lenses(
         MadeLens(design, source.settings.optics, response=result.response),
@@ -355,6 +364,6 @@ def retrain(
 
 __all__ = [
     "Accuracy", "Held", "Lenses", "Outcome", "RetrainConfig", "Source", "architecture_of", "check_lens",
-    "fine_tuning", "held", "job", "jobs", "judge", "lenses", "load", "network", "outcome", "retrain", "rows_of",
+    "fine_tuning", "held", "job", "jobs", "judge", "lenses", "load", "outcome", "retrain", "rows_of",
     "train", "trainer",
 ]  # fmt: skip

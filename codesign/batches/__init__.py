@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from codesign.batches.pool import Pool as Pool
     from codesign.batches.pool import PoolScenes as PoolScenes
     from codesign.batches.pool import fill as fill
+    from codesign.batches.scenes import CALIBRATION as CALIBRATION
     from codesign.batches.scenes import EXPERIMENT as EXPERIMENT
     from codesign.batches.scenes import TEST as TEST
     from codesign.batches.scenes import VALIDATION as VALIDATION
@@ -30,6 +31,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Batch": "batch",
+        "CALIBRATION": "scenes",
         "EXPERIMENT": "scenes",
         "EyeScenes": "scenes",
         "Flat": "flat",

@@ -7,8 +7,9 @@ Candidates of a search are judged by one process each.
 Outside ``torchrun`` there is one process and nothing here costs anything.
 """
 
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -41,14 +42,28 @@ def leave() -> None:
         dist.destroy_process_group()
 
 
+_alone = False
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Work that this process does by itself, though others train along with it."""
+    global _alone
+    before, _alone = _alone, True
+    try:
+        yield
+    finally:
+        _alone = before
+
+
 def rank() -> int:
     """Number of this process."""
-    return dist.get_rank() if dist.is_initialized() else 0
+    return dist.get_rank() if dist.is_initialized() and not _alone else 0
 
 
 def ranks() -> int:
     """Processes that train together."""
-    return dist.get_world_size() if dist.is_initialized() else 1
+    return dist.get_world_size() if dist.is_initialized() and not _alone else 1
 
 
 def wait() -> None:
@@ -103,6 +118,21 @@ def average(parameters: Iterable[nn.Parameter]) -> None:
         for grad in mine:
             grad.copy_(joined[start : start + grad.numel()].view_as(grad))
             start += grad.numel()
+
+
+def shared_rows(count: int) -> Tensor:
+    """Rows out of ``count`` that this process computes."""
+    return torch.arange(rank(), count, ranks())
+
+
+def gathered(part: Tensor, rows: Tensor, count: int) -> Tensor:
+    """(count, ...) rows of all processes from those of each (:func:`shared_rows`);
+    differentiable: every process's loss depends on every process's rows.
+    """
+    if ranks() == 1:
+        return part
+    whole = part.new_zeros((count, *part.shape[1:]))
+    return _summed(whole.index_copy(0, rows.to(part.device), part))
 
 
 def mean_of(values: list[float]) -> list[float]:

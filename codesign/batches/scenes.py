@@ -19,17 +19,15 @@ from codesign.eye import (
     States,
     Trait,
     drawn,
-    dressed,
-    pigmented,
-    render,
-    viewed,
+    render_dressed,
 )
 from codesign.eye import population as eye
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames
 
-# streams of the random generator: frames of one are never seen by another
-TRAINING, VALIDATION, TEST, EXPERIMENT = 0, 1, 2, 9
+# Streams of the random generator. Training, the search's selection, the calibration of
+# intervals and the test each have frames that no other one uses.
+TRAINING, VALIDATION, TEST, CALIBRATION, EXPERIMENT = 0, 1, 2, 3, 9
 ALBEDOS = ("iris", "sclera", "skin", "pupil", "exposure")
 LOOKS = (
     *ALBEDOS, "iris_contrast", "veins", "pores", "lashes", "brow", "glint", "ambient", "fissure_upper_um",
@@ -192,13 +190,8 @@ def worn(
     states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[int, ...]
 ) -> Rendered:
     """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1."""
-    if variety <= 1:
-        return render(states, rig=rig, camera=camera)
     found = drawn(len(states), variety, np.random.default_rng(seed))
-    return dressed(
-        render(pigmented(states, found), rig=rig, camera=camera, view=viewed(found)),
-        found,
-    )
+    return render_dressed(states, found, rig=rig, camera=camera)
 
 
 def varied(variety: float) -> Motion:

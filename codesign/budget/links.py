@@ -12,7 +12,7 @@ in a file that is given.
 
 import math
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,17 +20,22 @@ import torch
 from characterize.model import PLACE, state
 from codesign.budget import task
 from codesign.budget.entry import MEASURED, NONE, Entry, total
-from codesign.budget.journal import Journal
 from codesign.budget.person import person
 from codesign.budget.prepared import Bench
 from codesign.budget.response import between, put_right, scatter_rad
 from codesign.evaluate import AXIAL
 from codesign.optics import psf_difference
+from codesign.train import assess
 from metalens.cell import Light
 from metalens.design import neighbours as supercell
 from metalens.fabrication import State, biased, draws, sensitivity, transmission
 from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, LensError
+from metalens.ground.errors import (
+    CellError,
+    LensError,
+    PropagationError,
+    SceneError,
+)
 from metalens.lens import Neighbours
 from metalens.pillars import PillarLibrary, engines
 
@@ -38,43 +43,30 @@ SOLVED = 12  # diameters at which the pillar model is solved again
 FINER = 30.0  # how much more precisely
 
 
-def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
+def entries(about: Bench) -> Iterator[Entry]:
     """The budget, link by link from the answered gaze back to the pillars, ending with
     the sum.
-
-    Args:
-        journal: of the links that an interrupted run has done.
 
     Raises:
         LensError: the as-built file is of another lens.
     """
-    journal, found = journal or Journal(), list[Entry]()
-    if (
-        about.reading is not None
-    ):  # later links are judged with the persons that these calibrate
-        for entry in about.reading.path():
+    found: list[Entry] = []
+    first = (answer,) if about.reading is None else (_read,)
+    parts = (*first, image, device, pillars, neighbours, mask, process, calibration)
+    for part in (*parts, numerics):
+        for entry in part(about):
             found.append(entry)
             yield entry
-    first = (answer,) if about.reading is None else ()
-    for part in (
-        *first,
-        device,
-        pillars,
-        neighbours,
-        mask,
-        process,
-        calibration,
-        numerics,
-    ):
-        done = journal.part(
-            part.__name__,
-            lambda part=part: [astuple(entry) for entry in part(about)],  # type: ignore[misc]
-        )
-        links = [Entry(*values) for values in done]
-        found += links
-        yield from links
     yield from measured(about)
     yield total(found)
+
+
+def _read(about: Bench) -> Iterator[Entry]:
+    """Of a run's network; later links are judged with the persons that these
+    calibrate.
+    """
+    if about.reading is not None:
+        yield from about.reading.path()
 
 
 def answer(about: Bench) -> Iterator[Entry]:
@@ -104,6 +96,18 @@ def answer(about: Bench) -> Iterator[Entry]:
         yield replace(about.entry("spectrum", one, said), counted=False)
     else:
         yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
+
+
+def image(about: Bench) -> Iterator[Entry]:
+    """The tolerance of the image itself: one formed at a quarter of it."""
+    link, tolerance = "image tolerance", about.image_tolerance
+    said = f"image formed at {tolerance / assess.FINER:g} in place of {tolerance:g}"
+    try:
+        turn = about.turned_on_finer_image()
+    except (SceneError, PropagationError) as problem:
+        yield Entry(link, NONE, NONE, NONE, f"not known: {problem}")
+        return
+    yield Entry(link, NONE, NONE, turn, said)
 
 
 def device(about: Bench) -> Iterator[Entry]:
@@ -350,8 +354,7 @@ def numerics(about: Bench) -> Iterator[Entry]:
     """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its
     setting, the rest at its finest.
 
-    Read by the linear estimator, run or not: they are the settings of ``metalens psf``
-    and of the planner.
+    Read by the linear estimator, run or not: they are the settings of ``metalens psf``.
     """
     n = about.given.numerics
     cases = [

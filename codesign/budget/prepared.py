@@ -25,6 +25,7 @@ from codesign.optics import (
     image_difference,
     kernels,
 )
+from codesign.train import assess
 from metalens.fabrication import Printed
 from metalens.ground.errors import LensError
 from metalens.image import Grid, Imager, PsfBasis
@@ -87,6 +88,39 @@ class Bench:
             self.device.above,
             *([] if self.reading is None else [self.reading.true.above]),
         ]
+
+    @property
+    def image_tolerance(self) -> float:
+        """Of the image that the reader sees."""
+        if self.reading is None:
+            return self.device.tolerance
+        return self.reading.true.tolerance
+
+    def turned_on_finer_image(self) -> float:
+        """Mean angle, rad, between answers to the image and to one of a finer
+        tolerance.
+
+        Raises:
+            SceneError, PropagationError: it cannot be formed.
+        """
+        if self.reading is not None:
+            return self.reading.turned_on_finer_image()
+        here = self.device
+        fine = device(
+            here.wave,
+            here.whole.grid,
+            layers=here.layers,
+            distance_um=here.distance_um,
+            spectrum=self.source,
+            tolerance=here.tolerance / assess.FINER,
+        )
+        return task.gaze_mean(self.shift(fine.whole, here.whole))
+
+    @property
+    def source(self) -> Source | None:
+        """The diode; None for one wavelength."""
+        width = self.given.fwhm_nm
+        return Source(self.lens.wavelength_um * 1e3, width) if width else None
 
     def gathered(
         self, phase: torch.Tensor, level: torch.Tensor, *, lens: Lens | None = None
@@ -185,7 +219,8 @@ def finest_of(numerics: Numerics, *, fwhm_nm: float) -> Numerics:
 
 
 def same_lens(lens: Lens, optics: OpticsConfig) -> None:
-    """:func:`same_geometry` of a lens file.
+    """Refuse a reader that was trained before another lens: one that differs by more
+    than 2 %.
 
     Raises:
         LensError: sensor distance, wavelength or aperture differ.
@@ -195,26 +230,10 @@ def same_lens(lens: Lens, optics: OpticsConfig) -> None:
         lens.wavelength_um * 1e3,
         2e-3 * lens.diameters.radius_um,
     )
-    same_geometry(mine, optics, "the lens file; give the lens.h5 of the run")
-
-
-def same_geometry(
-    mine: tuple[float, float, float], optics: OpticsConfig, where: str
-) -> None:
-    """Refuse a reader that was trained before another lens: one that differs by more
-    than 2 %.
-
-    Args:
-        mine: sensor distance in mm, wavelength in nm and aperture in mm. where: they
-            stand, and what to do.
-
-    Raises:
-        LensError: sensor distance, wavelength or aperture differ.
-    """
     its = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
     if any(abs(a - b) > 0.02 * b for a, b in zip(mine, its, strict=True)):
         raise LensError(
             "the run's reader was trained before another lens: sensor distance, wavelength, aperture are "
             f"{its[0]:g} mm, {its[1]:g} nm, {its[2]:g} mm there and {mine[0]:g} mm, {mine[1]:g} nm, {mine[2]:g} mm in "
-            f"{where}"
+            "the lens file; give the lens.h5 of the run"
         )

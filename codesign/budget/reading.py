@@ -30,7 +30,7 @@ from codesign.batches import EXPERIMENT
 from codesign.budget.entry import NONE, Entry, more
 from codesign.budget.person import told
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
-from codesign.eye import Rendered, render
+from codesign.eye import Rendered
 from codesign.gaze import Calibrator, Person, Readings, angle_deg
 from codesign.optics import Device, OpticsConfig, device, formed, image_difference
 from codesign.train import assess
@@ -62,6 +62,7 @@ class Reading:
     ) -> None:
         self.source, self.config = source, config
         self.scenes = source.run.scenes(EXPERIMENT)
+        self.sensor = gaze_experiment.lighting([source], config)[0]
         believed = source.run.trainer.optics
         width = fwhm_nm or believed.fwhm_nm
         self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
@@ -72,7 +73,7 @@ class Reading:
         for subject in range(config.subjects):
             states, trial = gaze_experiment.states_of(config, subject, self.scenes)
             self.subjects.append(
-                render(states, rig=self.scenes.rig, camera=self.scenes.camera)
+                gaze_experiment.render_subject(states, config, subject, self.scenes)
             )
             trials.append(trial)
         self.trial = gaze_experiment.joined(trials)
@@ -248,6 +249,14 @@ class Reading:
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
+    def turned_on_finer_image(self) -> float:
+        """:meth:`turned` from the device's image to one of a quarter of its
+        tolerance.
+        """
+        tolerance = self.optics.image_tolerance / assess.FINER
+        fine = self._device(replace(self.optics, image_tolerance=tolerance))
+        return self.turned(fine.whole, self.true.whole)
+
     def _settle(self, read: Readings, how: Calibrator) -> None:
         """Keep the persons of the last state, what it measured, and a thin sample of
         the judged frames.
@@ -308,7 +317,9 @@ class Reading:
         if self._before is None or self._before[0] is not optics:
             self._before = (
                 optics,
-                gaze_experiment.calibrator(self.source, optics, self.config),
+                gaze_experiment.calibrator(
+                    self.source, optics, self.config, self.sensor
+                ),
             )
         return self._frames(self.subjects, optics, quiet=quiet), self._before[1]
 
@@ -331,7 +342,7 @@ class Reading:
                 made,
                 optics,
                 seed=gaze_experiment.NOISE + subject,
-                snr_db=self.config.snr_db,
+                sensor=self.sensor,
                 quiet=quiet,
             )
             found.append(assess.predict(net, self.source.architecture, seen, inner))

@@ -275,35 +275,3 @@ def gaze_rms(shift: Tensor) -> float:
 def gaze_mean(shift: Tensor) -> float:
     """Mean over eyes (and draws) of the gaze error, rad, from shifts (..., unknowns)."""
     return float(shift[..., :2].pow(2).sum(-1).sqrt().mean())
-
-
-def settle(
-    image: Tensor,
-    optics: PsfBasis | Imager,
-    states: States,
-    setting: TaskSetting,
-    *,
-    seen: Views,
-    steps: int,
-) -> Tensor:
-    """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels),
-    starting from the true states.
-
-    Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen``
-    are those of the true states.
-    """
-    prior = precision()
-    found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
-    for step in range(steps):
-        if step:
-            moved = states
-            for k in range(len(NAMES) - 1):
-                moved = shifted(moved, k, found[:, k])
-            seen = views(setting, moved, exposed=states)
-        reader = linear(seen, optics, setting)
-        pulled = (
-            reader.shift(image / (1 + found[:, -1:]))
-            - (reader.covariance @ (found @ prior)[..., None])[..., 0]
-        )
-        found = found + pulled
-    return found

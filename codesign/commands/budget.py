@@ -1,8 +1,5 @@
 """lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each
 with how it was found.
-
-Links that are done are kept beside the output (NAME.resume): after an interruption the
-same command goes on.
 """
 
 import dataclasses
@@ -14,12 +11,12 @@ import numpy as np
 
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
-from codesign.budget import MEASURED, Entry, Given, Journal, bench
+from codesign.budget import MEASURED, Entry, Given, bench
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
 from codesign.commands.options.budget import Options
 from codesign.optics import Numerics
-from metalens import __version__, lens, library
+from metalens import lens, library
 from metalens.fabrication import of_process
 from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
@@ -41,15 +38,12 @@ def run(options: Options) -> int:
         )  # refused now, not after the work
     with options.claim(target, beside=(".html", ".png")) as draft:
         origin = _provenance(options, given)
-        title = f"{__version__}\n{origin.config}{origin.inputs}{given.frames}"
-        journal = Journal(target.with_name(target.name + ".resume"), title)
         about = bench(made, given)
-        links = budget.entries(about, journal)
-        rows = list(options.console.track(links, total=18, label="links"))
+        links = budget.entries(about)
+        rows = list(options.console.track(links, total=19, label="links"))
         save(draft.path, rows, origin)
         budget_page.write(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
-    journal.finish()
     values = {"rows": [dataclasses.asdict(row) for row in rows], **summary(rows)}
     light = of_light(made)
     words = "\n".join(filter(None, [text(rows), light]))

@@ -3,6 +3,7 @@ under compute budgets.
 """
 
 import contextlib
+import io
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -11,21 +12,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import image as plt_image
 from torch import Tensor
 
+from codesign.adapt.source import lens_file, weights_file
 from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
-from codesign.network import Baseline, Subnet
+from codesign.network import Subnet
 from codesign.optics import OpticsConfig, formed
 from codesign.optics import stack as trained
 from codesign.train import (
     End,
-    Journal,
     Part,
     Record,
     Run,
     RunConfig,
+    assess,
     best,
     checkpoint,
     device_of,
@@ -33,6 +36,7 @@ from codesign.train import (
     pareto,
     pictures,
     place,
+    search,
 )
 from codesign.train import run as runs
 from metalens import design, lens, library
@@ -50,10 +54,6 @@ def run(options: Options) -> int:
     run asks for.
     """
     settings = _frozen(runs.load(options.config), options.freeze)
-    if options.export and settings.network != "supernet":
-        raise ConfigError(
-            f"--export writes elastic networks; network = {settings.network!r} has no such export"
-        )
     device = device_of(options.device)
     parallel.join(device)
     if parallel.rank():
@@ -87,12 +87,12 @@ def _work(
         console.say(_of_samples(settings))
     place(going.trainer, device)
     parallel.wait()
-    journal = Journal(folder) if options.events else None
+    writer = _writer(folder, going.trainer.step) if options.events else None
     held = False
     for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
         _log(folder, {"kind": "step", **asdict(record)})
-        if journal:
-            _events(journal, going, record)
+        if writer:
+            _events(writer, going, record)
         if (limit := going.trainer.pitch_held_um) is not None and not held:
             held = True
             console.say(f"step {record.step}: {_of_pitch(going, limit)}")
@@ -101,13 +101,13 @@ def _work(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
-    for budget, born in runs.search(going, folder / CHECKPOINT):
+    for budget, born in search.search(going, folder / CHECKPOINT):
         one = {"budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6}
         _log(
             folder, {"kind": "birth", **one, "architecture": asdict(born.architecture)}
         )
         console.say(
-            f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs"
+            f"budget {budget:g} MMACs: gaze error {born.error:.2f} deg at {born.macs / 1e6:.2f} MMACs"
         )
     parallel.leave()
     ends = finished(going)
@@ -152,12 +152,11 @@ def _image(going: Run) -> dict[str, Any]:
 
 def _export(folder: Path, going: Run, ends: list[End]) -> None:
     """Every budget's network as ONNX."""
-    for end, state in zip(ends, going.searches, strict=False):
-        if not isinstance(end.model.net, Baseline):
-            path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
-            onnx_file.write(
-                path, going, end.model.net, best(state.history).architecture
-            )
+    for end, state in zip(ends, going.searches, strict=True):
+        path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
+        own = replace(going, trainer=end.trainer)
+        net = end.trainer.model.net
+        onnx_file.write(path, own, net, best(state.history).architecture)
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
@@ -169,7 +168,7 @@ def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     place(going.trainer, device)
     for _ in runs.train(going, folder / CHECKPOINT):
         pass
-    for _ in runs.search(going, folder / CHECKPOINT):
+    for _ in search.search(going, folder / CHECKPOINT):
         pass
     parallel.leave()
     return 0
@@ -180,12 +179,30 @@ def _frozen(settings: RunConfig, parts: tuple[Part, ...]) -> RunConfig:
     return replace(settings, run=replace(settings.run, frozen=both))
 
 
-def _events(journal: Journal, going: Run, record: Record) -> None:
-    values = {k: float(v) for k, v in asdict(record).items() if k != "step"}
-    journal.scalars(record.step, values)
+def _writer(folder: Path, step: int) -> Any:
+    """TensorBoard events of the run's folder; those beyond a resumed step are dropped.
+
+    Raises:
+        ConfigError: tensorboard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ConfigError(
+            "--events needs tensorboard: pip install 'metalens-toolchain[events]'"
+        ) from None
+    return SummaryWriter(str(folder), purge_step=step + 1 if step else None)  # type: ignore[no-untyped-call]
+
+
+def _events(writer: Any, going: Run, record: Record) -> None:
+    for name, value in asdict(record).items():
+        if name != "step":
+            writer.add_scalar(name, float(value), record.step)
     if record.step % going.settings.checkpoint_every == 0:
         for name, picture in pictures.all_of(going).items():
-            journal.picture(record.step, name, picture)
+            image = plt_image.imread(io.BytesIO(picture))
+            writer.add_image(name, image, record.step, dataformats="HWC")
+    writer.flush()
 
 
 def _start(folder: Path, settings: RunConfig) -> Run:
@@ -243,7 +260,7 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
     about = store.Provenance(config=config.dumps(settings), seed=settings.inner.seed)
     phase = runs.coefficients(going)
     lens.save(folder / "lens.h5", trained_lens(settings.optics, phase, about))
-    _weights(folder, going, ends)
+    _weights(folder, going, ends, about)
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
     found = {
@@ -254,7 +271,6 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
     }
     found |= {"bound": pictures.bound(going)}
     found |= {
-        "network": settings.network,
         "frozen": list(settings.run.frozen),
         "image": said,
     }
@@ -262,7 +278,8 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
     found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
     said_by = {
-        f"network_{i}": _named(row["budget_mmacs"]) for i, row in enumerate(rows)
+        f"network_{i}": f"budget {row['budget_mmacs']:g} million MACs"
+        for i, row in enumerate(rows)
     }
     store.save(
         folder / ANSWERS, "answers", pictures.answered(ends, SHOWN), attributes=said_by
@@ -271,23 +288,23 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
         store.write_bytes(folder / "pareto.png", _plot(going))
 
 
-def _weights(folder: Path, going: Run, ends: list[End]) -> None:
-    """Every network, cut to its own architecture."""
-    for end, state in zip(ends, [*going.searches, None], strict=False):
-        net, budget = end.model.net, end.row["budget_mmacs"]
-        kept = (
-            net
-            if isinstance(net, Baseline) or state is None
-            else Subnet(net, best(state.history).architecture)
-        )
-        name = going.settings.network if budget is None else f"subnet_{budget:g}"
-        checkpoint.save_network(folder / f"{name}.safetensors", kept)
-
-
-def _named(budget_mmacs: float | None) -> str:
-    return (
-        "network" if budget_mmacs is None else f"budget {budget_mmacs:g} million MACs"
-    )
+def _weights(
+    folder: Path, going: Run, ends: list[End], about: store.Provenance
+) -> None:
+    """Every network, cut to its own architecture, with the lens of its own."""
+    for end, state in zip(ends, going.searches, strict=True):
+        model, budget = end.trainer.model, end.row["budget_mmacs"]
+        kept = Subnet(model.net, best(state.history).architecture)
+        optics = {
+            "optics.coefficients_rad": model.coefficients_rad,
+            "optics.log_pitch": model.log_pitch,
+        }
+        checkpoint.save_network(weights_file(folder, budget), kept, beside=optics)
+        if going.settings.search.inner_steps:
+            own = trained_lens(
+                going.settings.optics, model.coefficients_rad.detach(), about
+            )
+            lens.save(lens_file(folder, going.settings, budget), own)
 
 
 SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
@@ -311,7 +328,7 @@ def trained_lens(
     def over(half_um: float) -> lens.Lens:
         waves = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
         waves_um = tuple((waves + middle_um).tolist())
-        made = library.sweep(library.DEFAULT_CELL, wavelengths_um=waves_um)
+        made = library.sweep(settings.cell, wavelengths_um=waves_um)
         result, _ = design.make(
             trained.phase_of(settings, coefficients_rad.numpy()),
             settings.focus,
@@ -351,7 +368,7 @@ def _plot(going: Run) -> bytes:
     )
     axes.set(
         xlabel="MMACs",
-        ylabel="slippage error on validation / mm",
+        ylabel="gaze error on validation / deg",
         title="Accuracy against compute",
     )
     axes.legend()
@@ -359,17 +376,32 @@ def _plot(going: Run) -> bytes:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    head = "budget  MMACs  pixels seen / um  axial / mm  90 % interval (covers)  lateral / mm   IoU  mm per mm of depth"
+    head = (
+        "budget  MMACs  pixels seen / um  gaze / deg  axial / mm  finer image (ratio)  "
+        "90 % interval (covers)  lateral / mm   IoU  mm per mm of depth"
+    )
     lines = []
     for r in rows:
-        budget = "     -" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:6g}"
+        budget = f"{r['budget_mmacs']:6g}"
         iou = "    -" if r["iou"] is None else f"{r['iou']:.3f}"
-        told = "                     -"
+        interval, fine = "                     -", "                  -"
         if "axial_coverage_90" in r:
-            told = f"+-{r['axial_interval_mm']:5.2f} mm ({100 * r['axial_coverage_90']:7.0f} %)"
-        errors = f"{r['axial_slip_mm']:10.3f}  {told}  {r['lateral_slip_mm']:12.3f}"
+            covered = 100 * r["axial_coverage_90"]
+            interval = f"+-{r['axial_interval_mm']:5.2f} mm ({covered:7.0f} %)"
+        if "finer_ratio" in r:
+            fine = f"{r['finer_axial_slip_mm']:12.3f} ({r['finer_ratio']:4.2f})"
+        errors = (
+            f"{r['gaze_deg']:10.2f}  {r['axial_slip_mm']:10.3f}  {fine}  {interval}"
+        )
         costs = f"{r['mmacs']:5.2f}  {r['effective_pitch_um']:16.1f}"
         lines.append(
-            f"{budget}  {costs}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}"
+            f"{budget}  {costs}  {errors}  {r['lateral_slip_mm']:12.3f}  {iou}  "
+            f"{r['depth_response_mm_per_mm']:6.2f}"
+        )
+    worst = max((r.get("finer_ratio", 1.0) for r in rows), default=1.0)
+    if worst > assess.SAME:
+        lines.append(
+            f"results depend on the image: on one formed at a quarter of "
+            f"optics.image_tolerance errors are {worst:.2f} times as large; lower it"
         )
     return "\n".join([head, *lines])

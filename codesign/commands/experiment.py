@@ -4,6 +4,7 @@ run's lens and network (Sec. 5).
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
             row[quantity] = float(values.mean()) if known else None
             if known and len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap(values))
-        rows.append(row)
+        rows.append(row | _finer(result, row))
     ratios = []
     for other, means in zip(results[1:], per[1:], strict=True):
         for quantity in (
@@ -156,9 +157,24 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
                 "goal": GOALS.get(quantity, ""),
             })  # fmt: skip
-    about = {"subjects": config.subjects, "frames": config.frames, "seed": config.seed, "share": config.share,
-             "points": config.points, "people": config.people, "fixation_deg": config.fixation_deg}  # fmt: skip
+    about = {**asdict(config), "frames": config.frames}
     return {"first": results[0].name, "settings": about, "runs": rows, "ratios": ratios}
+
+
+FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
+
+
+def _finer(result: Result, row: dict[str, Any]) -> dict[str, Any]:
+    """Errors of the same frames on a finer image, and its ratio of the gaze error."""
+    if result.finer is None:
+        return {f"finer_{name}": None for name in (*FINER, "ratio")}
+    means = _per_subject(result.finer)
+    found = {}
+    for name in FINER:
+        value = float(means[name].mean())
+        found[f"finer_{name}"] = value if np.isfinite(value) else None
+    ratio = found["finer_gaze_axial_deg"] / row["gaze_axial_deg"]
+    return found | {"finer_ratio": ratio}
 
 
 def _beyond(result: Result) -> dict[str, Any]:
@@ -227,15 +243,24 @@ def ratio(
     return float(one.mean() / other.mean()), float(low), float(high)
 
 
+def _finer_words(row: dict[str, Any]) -> str:
+    if row["finer_ratio"] is None:
+        return f"{'-':>32}"
+    return f"{row['finer_gaze_axial_deg']:24.2f} ({row['finer_ratio']:5.2f})"
+
+
 def table(values: dict[str, Any]) -> str:
     """The numbers as text."""
-    head = f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}{'axial/mm':>10}{'IoU':>7}"
+    head = (
+        f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}"
+        f"{'axial/mm':>10}{'IoU':>7}{'finer image: axial/deg (ratio)':>32}"
+    )
     lines = [head]
     for r in values["runs"]:
         iou = "      -" if r["iou"] is None else f"{r['iou']:7.3f}"
         lines.append(
             f"{r['name']:<16}{r['mmacs']:7.2f}{r['gaze_axial_deg']:12.2f}{r['gaze_lateral_deg']:12.2f}"
-            f"{r['slip_mm']:8.3f}{r['slip_axial_mm']:10.3f}{iou}"
+            f"{r['slip_mm']:8.3f}{r['slip_axial_mm']:10.3f}{iou}{_finer_words(r)}"
         )
     for r in values["ratios"]:
         low, high = r["interval"]
@@ -264,9 +289,12 @@ COLUMNS = {
     "name": "run",
     "mmacs": "million MACs a frame",
     "gaze_axial_deg": "gaze error under axial slip / deg",
+    "finer_gaze_axial_deg": "the same on a finer image / deg",
+    "finer_ratio": "ratio",
     "gaze_lateral_deg": "under lateral slip / deg",
     "gaze_told_slip_deg": "axial, slip told / deg",
     "slip_mm": "slip error / mm",
+    "finer_slip_mm": "slip error on a finer image / mm",
     "slip_axial_mm": "its axial part / mm",
     "slip_lateral_mm": "its lateral part / mm",
     "slip_visible_mm": "slip error of the visible displacement read exactly / mm",
@@ -330,5 +358,22 @@ def _told(about: dict[str, Any]) -> str:
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
         "error under axial slip is that of pupil, sphere and regressor alone. A camera sees the head's displacement "
         "before it, its own turn on the mount included: who reads that exactly errs by what the table says, for all "
-        "runs alike. Intervals are over subjects."
+        f"runs alike. Intervals are over subjects. {_of_light(about)}"
+    )
+
+
+def _of_light(about: dict[str, Any]) -> str:
+    """Which light and which image the frames were taken in."""
+    image = {"true": "the true image", "trained": "the image of training"}
+    light = (
+        "in good light"
+        if about["snr_db"] is None
+        else f"in dim light under a bright background, {about['snr_db']:g} dB in a "
+        "pixel of the first run behind a lens that images all light; exposure and "
+        "background are the same for every run"
+    )
+    return (
+        f"Frames are {image[about['image']]} {light}. The finer image is formed at a "
+        "quarter of the run's tolerance; a ratio near 1 says that results do not "
+        "depend on it."
     )

@@ -153,19 +153,14 @@ def _measure(options: Options, folder: Path) -> None:
 
 
 def _measure_gaze(options: Options, path: Path) -> None:
-    """Gaze of the proposed run and of the other networks; runs that are in the file are
-    not measured again.
-    """
+    """Gaze of the proposed run; not measured again where it is in the file."""
     told = json.loads(path.read_text("utf-8")) if path.is_file() else {}
-    for folder in (options.runs[0], *options.others):
-        kind = paper_runs.kind_of(folder)
-        if str(folder) in told or (
-            folder != options.runs[0] and kind.network == "supernet"
-        ):
-            continue
-        options.console.say(f"measuring: gaze of {folder}")
-        told[str(folder)] = {"network": kind.network, "rows": paper_runs.gaze(folder)}
-        store.write_text(path, json.dumps(told, indent=1) + "\n")
+    folder = options.runs[0]
+    if str(folder) in told:
+        return
+    options.console.say(f"measuring: gaze of {folder}")
+    told[str(folder)] = {"rows": paper_runs.gaze(folder)}
+    store.write_text(path, json.dumps(told, indent=1) + "\n")
 
 
 def _named(folder: Path, name: str, run_dir: Path) -> Path:

@@ -13,6 +13,7 @@ from codesign.adapt import Lenses, Source, correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained import RECIPE, RESULT, Recipe, given
+from codesign.adapt.source import lens_file
 from codesign.adapt.sure import MAP, judge
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
@@ -38,12 +39,11 @@ def run(options: Options) -> int:
     source = retraining.load(
         options.run_dir, budget_mmacs=options.settings.budget_mmacs
     )
-    retraining.network(
-        source.run.trainer
-    )  # refused now, not after the lenses were imaged
     place(source.run.trainer, device_of(options.device))
     result = asbuilt.load(options.asbuilt)
-    design = lens.load_plain(options.run_dir / "lens.h5")
+    design = lens.load_plain(
+        lens_file(options.run_dir, source.settings, source.row["budget_mmacs"])
+    )
     retraining.check_lens(design, result, insist=options.insist)
     truth = config.load(options.truth, Truth) if options.truth else None
     old = correction.present_bias(options.process)
@@ -91,7 +91,12 @@ def _story(
     states = correction.next_lenses(made, plan, result.parameters(), true)
     for state in console.track(states, total=len(states), label="next lens"):
         error = retraining.judge(
-            trained["nominal"], source, options.settings, (state.stack,), frames=frames
+            trained["nominal"],
+            source,
+            options.settings,
+            (state.stack,),
+            frames=frames,
+            finer=False,
         )
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
     printed = correction.printed_um(design)
@@ -104,6 +109,8 @@ def _story(
         ),
     )
     even = judge(result, correction.uneven_nm, part=MAP)
+    refused = sure.words or correction.worse(states[0], states[1])
+    uneven = even.words or correction.worse(states[1], states[2])
     apart = (
         psf_error(found.best, found.nominal),
         psf_error(found.judges[0], found.nominal),
@@ -116,14 +123,14 @@ def _story(
         plan,
         proposals,
         _cautions(result, found),
-        sure.words,
-        even.words,
+        refused,
+        uneven,
     )
-    if sure.usable:
-        correction.write(folder, plan, evened=even.usable)
+    if not refused:
+        correction.write(folder, plan, evened=not uneven)
     _keep(folder, options, (source, trained["retrained"]), story)
     if options.export:
-        net = retraining.network(trained["retrained"])
+        net = trained["retrained"].model.net
         onnx_file.write(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
@@ -237,7 +244,7 @@ def _keep(
 ) -> None:
     source, going = trained
     retraining.settle(going, source)
-    cut = Subnet(retraining.network(going), source.architecture)
+    cut = Subnet(going.model.net, source.architecture)
     checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
     retrain_report.write(folder / "report.html", story)
     store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
@@ -278,13 +285,22 @@ def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
     }
 
 
+def _finer(row: dict[str, float]) -> str:
+    if "finer_ratio" not in row:
+        return ""
+    return f" {row['finer_slip_mm']:.3f} ({row['finer_ratio']:.2f})"
+
+
 def _text(story: retrain_report.Story, folder: Path) -> str:
     o = story.outcome
-    lines = [f"{'case':<38}slippage error / mm        axial   IoU"]
+    lines = [
+        f"{'case':<38}slippage error / mm        axial   IoU   finer image (ratio)"
+    ]
     for name, v in o.rows().items():
         span = f"[{v['slip_low_mm']:.3f}, {v['slip_high_mm']:.3f}]"
         lines.append(
-            f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} {v['axial_mm']:.3f}   {v['iou']:.3f}"
+            f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} "
+            f"{v['axial_mm']:.3f}   {v['iou']:.3f}{_finer(v)}"
         )
     won = (
         "nothing to win back beyond chance"

@@ -11,7 +11,6 @@ from codesign.batches import varied, worn
 from codesign.commands.options.scene import Options
 from codesign.evaluate import imaged
 from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks
-from codesign.referee import pathtraced
 from metalens import lens as lenses
 from metalens.ground import config, reading, store, transaction
 from metalens.ground.errors import ConfigError
@@ -110,14 +109,12 @@ def run(options: Options) -> int:
         raise ConfigError(
             f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is"
         )
-    if options.referee:
-        pathtraced.start()
     lens = None if options.lens is None else lenses.load(options.lens)
     folder, failures = options.output, list[str]()
     with options.claim_folder(
         folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
     ) as draft:
-        count = _make(settings, draft.path, referee=options.referee)
+        count = _make(settings, draft.path)
         values: dict[str, object] = {
             "frames": settings.frames,
             "layers": count,
@@ -143,7 +140,7 @@ def run(options: Options) -> int:
     return options.console.judged(values, words, failures)
 
 
-def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
+def _make(settings: Scene, folder: Path) -> int:
     """Render and write; the number of layers of the first frame."""
     camera = Camera(settings.pixels, settings.pitch_um)
     states = dataset.states_at(
@@ -155,11 +152,6 @@ def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
     count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)
     store.write_text(folder / "labels.csv", _table(made))
     contact_sheet(made, folder / "sheet.png")
-    if referee:
-        view = Camera(96, settings.pixels * settings.pitch_um / 96)
-        judged = pathtraced.compare(states, rig=settings.rig, camera=view)
-        pathtraced.picture(judged, folder / "referee.png")
-        store.write_text(folder / "referee.txt", "\n".join(judged.lines()) + "\n")
     return count
 
 

@@ -141,7 +141,7 @@ def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
             [e["mmacs"] for e in births],
             [e["error"] for e in births],
             "million MACs",
-            "slippage error / mm",
+            "gaze error / deg",
             [f"budget {e['budget_mmacs']:g} million MACs" for e in births],
             front,
             notes=notes,

@@ -13,12 +13,13 @@ from codesign.evaluate.gaze_experiment import (
     AXIAL,
     LATERAL,
     Result,
+    lighting,
     ready,
+    render_subject,
     states_of,
     through,
 )
 from codesign.evaluate.shown import ExperimentConfig
-from codesign.eye import render
 from metalens.ground import report
 
 COLOURS = ("#e9812b", "#1f6feb", "#2a9d8f", "#6d597a")
@@ -30,7 +31,8 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
     (green) and as it is read (red).
     """
     scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
-    prepared, slips = ready(source), config.slips_mm
+    prepared, slips = ready(source, image=config.image), config.slips_mm
+    sensor = lighting([source], config)[0]
     points = len(config.stimuli_deg)
     count = min(subjects, config.subjects)
     figure, axes = report.canvas(
@@ -40,8 +42,8 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
     for subject in range(count):
         rows = torch.arange(len(slips)) * points + (points // 2 + 5 * subject) % points
         states, _ = states_of(config, subject, scenes)
-        made = render(states[rows], rig=scenes.rig, camera=scenes.camera)
-        seen = through(source, made, prepared, seed=subject)
+        made = render_subject(states[rows], config, subject, scenes)
+        seen = through(source, made, prepared, seed=subject, sensor=sensor)
         logits = net(seen.frames, source.architecture).mask_logits
         for column, slip in enumerate(slips):
             ax = axes[subject, column]

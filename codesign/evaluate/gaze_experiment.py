@@ -26,7 +26,14 @@ from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.evaluate.shown import Result as Result
 from codesign.evaluate.shown import Trial as Trial
-from codesign.eye import POPULATION, Rendered, Rig, States, render
+from codesign.eye import (
+    POPULATION,
+    Rendered,
+    Rig,
+    States,
+    drawn_of_people,
+    render_dressed,
+)
 from codesign.eye import population as eye
 from codesign.gaze import (
     Calibrator,
@@ -41,10 +48,11 @@ from codesign.network import losses, recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, frame_wide, read_out
 from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
-from metalens.image import Imager, UniformImager, low_snr
+from metalens.ground.errors import ConfigError, PropagationError, SceneError
+from metalens.image import Imager, Sensor, UniformImager, low_snr
 
-LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
+# streams of the random generator
+LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
 TURNS = (
     4  # corrections of where an eye looks, each twenty times as fine as the one before
 )
@@ -102,6 +110,19 @@ def states_of(
     return turned_to(states, looks, scenes.rig), trial
 
 
+def render_subject(
+    states: States, config: ExperimentConfig, subject: int, scenes: EyeScenes
+) -> Rendered:
+    """Frames of one subject with the variety of training, worn by a person: spectacles
+    and make-up stay on from frame to frame, before the stage's own camera.
+    """
+    seed = (config.seed, subject, WORN)
+    worn = drawn_of_people(
+        np.zeros(len(states), np.int64), scenes.settings.variety, seed
+    )
+    return render_dressed(states, worn, rig=scenes.rig, camera=scenes.camera)
+
+
 def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
     """States whose visual axes point along angles (n, 2) across and down, in the frame
     of the face: to 1e-5 degrees.
@@ -132,25 +153,28 @@ def through(
     prepared: UniformImager | Imager,
     *,
     seed: int,
-    snr_db: float | None = None,
+    sensor: Sensor | None = None,
     quiet: bool = False,
 ) -> Seen:
     """Rendered frames through a run's lens and sensor, with noise of a seed or
-    ``quiet``; dimmed with ``snr_db``.
+    ``quiet``.
+
+    Args:
+        sensor: of :func:`lighting`; the run's own without it.
     """
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
     light = irradiance(batch.frames, prepared, margin=margin)
     noise = torch.Generator().manual_seed(seed)
-    sensor, pitch = trainer.sensor, trainer.model.pitch_um
-    if snr_db is not None:
-        at = replace(sensor, pitch_um=float(pitch))
-        sensor = replace(
-            low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um
-        )
+    pitch = trainer.model.pitch_um
     pixels = read_out(
-        light, trainer.optics.sample_um, pitch, sensor, generator=noise, quiet=quiet
+        light,
+        trainer.optics.sample_um,
+        pitch,
+        sensor or trainer.sensor,
+        generator=noise,
+        quiet=quiet,
     )
     wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
     return Seen(
@@ -160,6 +184,36 @@ def through(
         trainer.inner.batch,
         wide=wide,
     )
+
+
+def lighting(sources: Sequence[Source], config: ExperimentConfig) -> list[Sensor]:
+    """Every run's sensor in the light of the experiment.
+
+    Dim light is one exposure and one background for all runs: those at which a pixel of
+    the first run has ``config.snr_db`` behind a lens of its aperture that images all
+    light. What a lens loses, and a smaller aperture, costs it signal.
+    """
+    sensors = [source.run.trainer.sensor for source in sources]
+    if config.snr_db is None:
+        return sensors
+    scenes = sources[0].run.scenes(EXPERIMENT)
+    states, _ = states_of(config, 0, scenes)
+    at_origin = states[slice(len(config.stimuli_deg))]
+    frames = render_subject(at_origin, config, 0, scenes)
+    pitch_um = float(sources[0].run.trainer.model.pitch_um.detach())
+    dim = low_snr(
+        replace(sensors[0], pitch_um=pitch_um),
+        float(frames.pinhole().mean()),
+        snr_db=config.snr_db,
+    )
+    areas = [source.settings.optics.aperture_mm**2 for source in sources]
+    found = []
+    for sensor, area in zip(sensors, areas, strict=True):
+        base = (sensor.base_pitch_um / dim.base_pitch_um) ** 2  # counts of a base pixel
+        scale = base * area / areas[0]
+        light = {"exposure_e": dim.exposure_e, "ambient_e": dim.ambient_e}
+        found.append(replace(sensor, **{k: v * scale for k, v in light.items()}))
+    return found
 
 
 @torch.no_grad()
@@ -185,20 +239,27 @@ def experiment(
     trials: list[Trial] = []
     visible: list[Array] = []
     answers: list[list[Answers]] = [[] for _ in sources]
+    on_fine: list[list[Answers]] = [[] for _ in sources]
     prepared = [ready(source, image=config.image) for source in sources]
+    fine = [finer_imager(source) for source in sources]
+    sensors = lighting(sources, config)
     how = [
-        calibrator(source, imager, config)
-        for source, imager in zip(sources, prepared, strict=True)
+        calibrator(source, imager, config, sensor)
+        for source, imager, sensor in zip(sources, prepared, sensors, strict=True)
     ]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
-        made = render(states, rig=scenes.rig, camera=scenes.camera)
+        made = render_subject(states, config, subject, scenes)
         trials.append(trial)
         visible.append((made.labels.shift_um * 1e-3).numpy())
-        for kept, source, imager in zip(answers, sources, prepared, strict=True):
-            seen = through(
-                source, made, imager, seed=NOISE + subject, snr_db=config.snr_db
-            )
+        each = [
+            *zip(answers, sources, prepared, sensors, strict=True),
+            *zip(on_fine, sources, fine, sensors, strict=True),
+        ]
+        for kept, source, imager, sensor in each:
+            if imager is None:
+                continue
+            seen = through(source, made, imager, seed=NOISE + subject, sensor=sensor)
             kept.append(_answers(source, seen))
         if subject + 1 < config.subjects:
             yield subject + 1, []
@@ -208,19 +269,16 @@ def experiment(
         formed.above(source.run.trainer.optics, one)
         for source, one in zip(sources, prepared, strict=True)
     ]
-    yield (
-        config.subjects,
-        [
-            replace(
-                _result(label, source, kept, whole, config, one),
-                visible_mm=np.concatenate(visible),
-                above=told,
-            )
-            for label, source, kept, one, told in zip(
-                labels, sources, answers, how, above, strict=True
-            )
-        ],
-    )
+    seen_mm, results = np.concatenate(visible), []
+    for i, (label, source, one) in enumerate(zip(labels, sources, how, strict=True)):
+        found = _result(label, source, answers[i], whole, config, one)
+        exact = (
+            _result(label, source, on_fine[i], whole, config, one)
+            if on_fine[i]
+            else None
+        )
+        results.append(replace(found, visible_mm=seen_mm, above=above[i], finer=exact))
+    yield config.subjects, results
 
 
 def _answers(source: Source, seen: Seen) -> Answers:
@@ -272,10 +330,8 @@ def ready(
     """
     trainer = source.run.trainer
     if source.made is None:
-        measured = assess.frames(
-            trainer, trainer.scenes, min(8, source.settings.test_batches)
-        )
-        recalibrate(trainer.model.net, source.architecture, assess.parts(measured))
+        measured = assess.training_frames(trainer)
+        recalibrate(trainer.model.net, source.architecture, measured)
     else:
         retraining.settle(trainer, source)
     settings, scenes = trainer.optics, source.settings.scenes
@@ -290,6 +346,27 @@ def ready(
     )
 
 
+def finer_imager(source: Source) -> Imager | None:
+    """The true image of a run's lens at a quarter of the run's tolerance; None where it
+    cannot be formed so precisely, or the run was trained on a uniform image.
+    """
+    settings = assess.finer(source.run.trainer.optics)
+    if settings is None:
+        return None
+    scenes = source.settings.scenes
+    try:
+        made = formed.imager(
+            settings,
+            source.run.trainer.model.coefficients_rad,
+            scenes.pixels + 2 * scenes.margin,
+            margin=scenes.margin,
+            made=source.made,
+        )
+    except (SceneError, PropagationError):
+        return None
+    return made if isinstance(made, Imager) else None
+
+
 def sphere(source: Source, config: ExperimentConfig) -> Sphere:
     """Calibrates before a run's camera by pupil and slippage alone."""
     return Sphere(source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed)
@@ -297,7 +374,10 @@ def sphere(source: Source, config: ExperimentConfig) -> Sphere:
 
 @torch.no_grad()
 def calibrator(
-    source: Source, imager: UniformImager | Imager, config: ExperimentConfig
+    source: Source,
+    imager: UniformImager | Imager,
+    config: ExperimentConfig,
+    sensor: Sensor,
 ) -> Calibrator:
     """How people are calibrated whom a run's network reads: by what people have in
     common, if it tells the axis.
@@ -319,12 +399,9 @@ def calibrator(
         theirs = replace(config, axial_mm=tuple(axial), lateral_mm=tuple(lateral))
         states, trial = states_of(theirs, BEFORE + person, scenes)
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
-        made = render(
-            states[torch.from_numpy(rows)], rig=scenes.rig, camera=scenes.camera
-        )
-        seen = through(
-            source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db
-        )
+        some = states[torch.from_numpy(rows)]
+        made = render_subject(some, theirs, BEFORE + person, scenes)
+        seen = through(source, made, imager, seed=2 * NOISE + person, sensor=sensor)
         found.append(_answers(source, seen))
         looked.append(trial.stimulus_deg[rows])
         if found[0].axis is None:

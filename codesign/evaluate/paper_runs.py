@@ -1,5 +1,5 @@
-"""What finished runs say to Table 2 and Fig. 8b of the paper: gaze of other networks,
-cost of what is frozen.
+"""What finished runs say to Table 2 and Fig. 8b of the paper: gaze, cost of what is
+frozen.
 """
 
 import functools
@@ -13,7 +13,8 @@ from typing import Any
 import torch
 
 from codesign.adapt import train as retraining
-from codesign.batches import TEST, VALIDATION
+from codesign.adapt.source import restore_weights
+from codesign.batches import CALIBRATION, TEST
 from codesign.evaluate.paper import Measured
 from codesign.gaze import Readings
 from codesign.gaze import bench as gaze_test
@@ -22,11 +23,6 @@ from codesign.train import Run, Seen, assess
 from codesign.train import run as runs
 from metalens.ground.errors import TrainingError
 
-TABLE_2 = {
-    "nvgaze": "nvgaze",
-    "popovic": "popovic_et_al",
-    "de2gaze": "de2gaze",
-}  # our network: the claim's key
 PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
 # other people of as many frames, whose gaze tells what an axis that is read means
 BEFORE = 32
@@ -35,9 +31,8 @@ WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What a finished run was: its network, and which parts did not move."""
+    """What a finished run was: which parts did not move."""
 
-    network: str
     frozen: tuple[str, ...]
 
 
@@ -49,7 +44,7 @@ def kind_of(folder: Path) -> Kind:
     """
     retraining.rows_of(folder)  # refuses what is missing, cut short or empty
     told = json.loads((folder / "result.json").read_text("utf-8"))
-    return Kind(str(told.get("network", "supernet")), tuple(told.get("frozen", ())))
+    return Kind(tuple(told.get("frozen", ())))
 
 
 def image_tolerance(folders: Sequence[Path]) -> float:
@@ -74,15 +69,12 @@ def gaze(
     settings = runs.load(folder / "run.toml")
     going = runs.resume(folder / "checkpoint.safetensors", settings)
     shown = _shown(going, TEST, people, each, seed)
-    before = functools.cache(lambda: _shown(going, VALIDATION, BEFORE, each, seed + 1))
-    known = assess.parts(
-        assess.frames(
-            going.trainer, going.trainer.scenes, min(8, settings.test_batches)
-        )
-    )
+    before = functools.cache(lambda: _shown(going, CALIBRATION, BEFORE, each, seed + 1))
+    known = assess.training_frames(going.trainer)
     out = []
     for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
         architecture = retraining.architecture_of(row["architecture"], going, folder)
+        restore_weights(going, row, folder)
         recalibrate(going.trainer.model.net, architecture, known)
         read, how = _read(going, architecture, shown), None
         if read.axis_deg is not None:
@@ -122,20 +114,17 @@ def _read(
 
 
 def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
-    """Table 2 from gaze.json: {folder: {network, rows of :func:`gaze`}}; the first
-    supernet is the proposed one.
+    """Table 2 from gaze.json, {folder: {rows of :func:`gaze`}}: the first run is the
+    proposed one. Networks of others are not rebuilt here.
     """
-    found: dict[str, Measured] = {}
     for entry in told.values():
         rows = entry["rows"]
-        if entry["network"] in TABLE_2:
-            found[f"table2/{TABLE_2[entry['network']]}"] = _measured(rows[0])
-        elif "table2/proposed_efficient" not in found:
-            found["table2/proposed_efficient"] = _measured(rows[0])
-            found["table2/proposed_accurate"] = _measured(
-                min(rows, key=lambda r: float(r["personal_deg"]))
-            )
-    return found
+        accurate = min(rows, key=lambda r: float(r["personal_deg"]))
+        return {
+            "table2/proposed_efficient": _measured(rows[0]),
+            "table2/proposed_accurate": _measured(accurate),
+        }
+    return {}
 
 
 def _measured(row: Mapping[str, Any]) -> Measured:
@@ -169,8 +158,7 @@ def of_ablations(
 
 
 def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """(part, rows) of every run of the elastic network in which exactly one part was
-    frozen.
+    """(part, rows) of every run in which exactly one part was frozen.
 
     Raises:
         TrainingError: two runs with the same part frozen.
@@ -178,7 +166,7 @@ def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, A
     seen: dict[str, Path] = {}
     for folder in folders:
         kind = kind_of(folder)
-        if kind.network != "supernet" or len(kind.frozen) != 1:
+        if len(kind.frozen) != 1:
             continue
         part = kind.frozen[0]
         if part in seen:

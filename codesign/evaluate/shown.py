@@ -54,8 +54,9 @@ class ExperimentConfig:
     the image that the run knows.
     pupil_sd: relative change of the pupil's radius from frame to frame. seed: of
     subjects, fixation and calibration.
-    snr_db: dim light under a strong ambient one, so that a pixel has this
-    signal-to-noise ratio; None for good light.
+    snr_db: dim light under a strong ambient one, so that a pixel of the first run has
+    this signal-to-noise ratio behind a lens that images all light; the exposure and the
+    background are the same for every run. None for good light.
     """
 
     subjects: int = 20
@@ -135,7 +136,9 @@ class Result:
     visible_mm: (n, 3) displacement
     of the head as the camera sees it, its own turn on the mount included: all that can
     be read. above: why the error
-    of the images is above what the run asks for; empty where it is not.
+    of the images is above what the run asks for; empty where it is not. finer: the same
+    frames on images formed at a quarter of the run's tolerance, calibrated on those;
+    None where they are not known.
     """
 
     name: str
@@ -151,6 +154,7 @@ class Result:
     how: "Calibrator | None" = None
     visible_mm: Array | None = None
     above: str = ""
+    finer: "Result | None" = None
 
     @property
     def within(self) -> Array:

@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from codesign.eye.view import face_axes as face_axes
     from codesign.eye.worn import CAUSES as CAUSES
     from codesign.eye.worn import drawn as drawn
+    from codesign.eye.worn import drawn_of_people as drawn_of_people
     from codesign.eye.worn import dressed as dressed
     from codesign.eye.worn import pigmented as pigmented
+    from codesign.eye.worn import render_dressed as render_dressed
     from codesign.eye.worn import viewed as viewed
 
 __getattr__, __dir__, __all__ = attach(
@@ -53,11 +55,13 @@ __getattr__, __dir__, __all__ = attach(
         "model": "",
         "dressed": "worn",
         "drawn": "worn",
+        "drawn_of_people": "worn",
         "face_axes": "view",
         "mean_eye_um": "population",
         "parameters": "population",
         "population": "",
         "render": "renderer",
+        "render_dressed": "worn",
         "renderer": "",
         "states_at": "dataset",
         "textures": "",

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from codesign.eye.hair import lashes, patches
-from codesign.eye.population import POPULATION, States
-from codesign.eye.renderer import Labels, Rendered
+from codesign.eye.population import POPULATION, Rig, States
+from codesign.eye.renderer import Camera, Labels, Rendered, render
 from codesign.eye.view import View
 from metalens.ground.arrays import Array
 from metalens.image import Frames
@@ -173,23 +173,64 @@ TAPS = 15  # of the kernel of a movement, at most its length
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Worn:
-    """What each of n frames has: ``size`` by cause, 0 where it is off; ``draws`` (n,
-    12) in [0, 1) place it.
+    """What each of n frames has: ``size`` by cause, 0 where it is off.
+
+    draws: by cause, (n, 12) independent draws in [0, 1) that place it.
     """
 
     size: Mapping[str, Array]
-    draws: Array
+    draws: Mapping[str, Array]
+
+    def __getitem__(self, rows: Array | slice) -> "Worn":
+        """Those of some frames."""
+        parts = (
+            {name: held[rows] for name, held in of.items()}
+            for of in (self.size, self.draws)
+        )
+        return Worn(*parts)
+
+    def from_one_view(self) -> "Worn":
+        """The same before the stage's own camera: no cause of :data:`VIEWS`."""
+        still = {n: 0 * v if n in VIEWS else v for n, v in self.size.items()}
+        return Worn(still, self.draws)
+
+
+def drawn_of_people(who: Array, variety: float, seed: tuple[int, ...]) -> Worn:
+    """What frames of some people have before the camera of one stage.
+
+    One draw a person, but movement, which is drawn for every frame.
+
+    Args:
+        who: (n,) number of the person in each frame, from 0.
+    """
+    people = drawn(
+        int(who.max()) + 1, variety, np.random.default_rng((*seed, 0))
+    ).from_one_view()
+    each = drawn(len(who), variety, np.random.default_rng((*seed, 1)))
+    worn = people[who]
+    size, draws = dict(worn.size), dict(worn.draws)
+    size["movement"], draws["movement"] = each.size["movement"], each.draws["movement"]
+    return Worn(size, draws)
 
 
 def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
     """Causes of ``count`` frames; off everywhere up to variety 1. The same generator
     draws the same at any variety.
     """
-    size = {}
+    size, draws = {}, {}
     for name, cause in CAUSES.items():
         on = generator.random(count) < min(cause.share * max(variety - 1.0, 0.0), 1.0)
         size[name] = np.where(on, generator.uniform(cause.low, cause.high, count), 0.0)
-    return Worn(size, generator.random((count, 12)))
+        draws[name] = generator.random((count, 12))
+    return Worn(size, draws)
+
+
+def render_dressed(states: States, worn: Worn, *, rig: Rig, camera: Camera) -> Rendered:
+    """Frames of states with all that they have; bare ones where nothing is on."""
+    if not any(size.any() for size in worn.size.values()):
+        return render(states, rig=rig, camera=camera)
+    plain = render(pigmented(states, worn), rig=rig, camera=camera, view=viewed(worn))
+    return dressed(plain, worn)
 
 
 def viewed(worn: Worn) -> View:
@@ -246,8 +287,8 @@ def _grid(pixels: int) -> tuple[Tensor, Tensor]:
 
 def _on(worn: Worn, name: str) -> list[tuple[int, float, Array]]:
     """(frame, size, draws) of every frame that has a cause."""
-    size = worn.size[name]
-    return [(int(i), float(size[i]), worn.draws[i]) for i in np.flatnonzero(size)]
+    size, draws = worn.size[name], worn.draws[name]
+    return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
 
 
 def _made_up(

@@ -15,14 +15,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches import EyeScenes, as_batch
-from codesign.eye import Labels, States, render
+from codesign.batches import Batch, EyeScenes, as_batch
+from codesign.eye import (
+    Labels,
+    States,
+    drawn_of_people,
+    render,
+    render_dressed,
+)
 from codesign.eye import population as eye
+from codesign.eye.worn import Worn
 from codesign.gaze import shared
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
 from codesign.gaze.personal import Sphere, angle_deg
 from codesign.gaze.readings import Calibrator, Readings, face_angles
-from codesign.train import Batch
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
@@ -31,10 +37,13 @@ from metalens.ground.errors import TrainingError
 class People:
     """Frames of ``people`` people, ``each`` one after the other; see
     :class:`codesign.train.inner.Scenes`.
+
+    worn: what each frame has, with the variety of training.
     """
 
     scenes: EyeScenes
     states: States
+    worn: Worn
     labels: Labels
     people: int
 
@@ -55,10 +64,14 @@ class People:
 
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step."""
-        part = self.states[slice(step * size, (step + 1) * size)]
-        return as_batch(
-            render(part, rig=self.scenes.rig, camera=self.scenes.camera), self.margin
+        rows = slice(step * size, (step + 1) * size)
+        made = render_dressed(
+            self.states[rows],
+            self.worn[rows],
+            rig=self.scenes.rig,
+            camera=self.scenes.camera,
         )
+        return as_batch(made, self.margin)
 
 
 def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
@@ -77,9 +90,9 @@ def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
         pixels=32,
         pitch_um=scenes.camera.pitch_um * scenes.camera.pixels / 32,
     )
-    return People(
-        scenes, states, render(states, rig=scenes.rig, camera=camera).labels, count
-    )
+    worn = drawn_of_people(rows.numpy(), scenes.settings.variety, (seed, 23))
+    labels = render(states, rig=scenes.rig, camera=camera).labels
+    return People(scenes, states, worn, labels, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +147,27 @@ def learnt(before: People, read: Readings) -> shared.People:
         TrainingError: too few people or frames, or readings without an axis.
     """
     return shared.learn(read, looked_deg(before), np.arange(len(read)) // before.each)
+
+
+def calibrated_error_deg(
+    test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2
+) -> float:
+    """Mean angle between read and true visual axes, deg, over the frames that no
+    calibration used.
+
+    Args:
+        how: people are calibrated; without it by the spherical-eye solver and residual
+            regressor (paper Sec. 3.3).
+        share: part of each person's frames that calibrates.
+    """
+    how, known = how or Sphere(test.scenes.rig), max(3, round(share * test.each))
+    looked, errors = looked_deg(test), []
+    for first in range(0, test.people * test.each, test.each):
+        mine = np.arange(first, first + known)
+        others = np.arange(first + known, first + test.each)
+        found = how.person(read[mine], looked[mine])(read[others])
+        errors.append(angle_deg(found, looked[others]))
+    return float(np.concatenate(errors).mean())
 
 
 def gaze_errors(

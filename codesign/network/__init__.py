@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from codesign.network import exported as exported
     from codesign.network import losses as losses
     from codesign.network import running as running
-    from codesign.network import soap as soap
+    from codesign.network import subnet as subnet
     from codesign.network import windows as windows
     from codesign.network.architecture import Architecture as Architecture
     from codesign.network.architecture import Space as Space
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from codesign.network.architecture import mutate as mutate
     from codesign.network.architecture import sample as sample
     from codesign.network.architecture import smallest as smallest
-    from codesign.network.baselines import Baseline as Baseline
-    from codesign.network.baselines import Name as Name
-    from codesign.network.baselines import make as make
     from codesign.network.subnet import Subnet as Subnet
     from codesign.network.supernet import Prediction as Prediction
     from codesign.network.supernet import Supernet as Supernet
@@ -32,8 +29,6 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Architecture": "architecture",
-        "Baseline": "baselines",
-        "Name": "baselines",
         "Prediction": "supernet",
         "Space": "architecture",
         "Subnet": "subnet",
@@ -45,13 +40,12 @@ __getattr__, __dir__, __all__ = attach(
         "exported": "",
         "largest": "architecture",
         "losses": "",
-        "make": "baselines",
         "mutate": "architecture",
         "recalibrate": "supernet",
         "running": "",
         "sample": "architecture",
         "smallest": "architecture",
-        "soap": "",
+        "subnet": "",
         "windows": "",
     },
 )

@@ -81,6 +81,23 @@ class Space:
     widths: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0)
     resolution: tuple[float, float] = (0.3, 1.0)
 
+    def __post_init__(self) -> None:
+        for name in ("stages", "kernels", "expansions", "depths", "widths"):
+            if not getattr(self, name):
+                raise ConfigError(f"space.{name} is empty: need one choice or more")
+        low, high = self.resolution
+        if not 0 < low <= high <= 1 or min(self.widths) <= 0 or min(self.depths) < 1:
+            raise ConfigError(
+                f"space: resolution = {self.resolution}, widths = {self.widths}, "
+                f"depths = {self.depths}: need 0 < least <= largest <= 1, widths "
+                "above 0 and depths of 1 or more"
+            )
+        if any(k < 1 or k % 2 == 0 for k in self.kernels) or min(self.expansions) < 1:
+            raise ConfigError(
+                f"space: kernels = {self.kernels}, expansions = {self.expansions}: "
+                "need odd kernels and expansions of 1 or more"
+            )
+
     @property
     def slots(self) -> int:
         """Blocks of the deepest architecture."""
@@ -210,29 +227,55 @@ def mutate(
     *,
     rate: float = 0.15,
 ) -> Architecture:
-    """A neighbour: every entry is drawn anew with probability ``rate``, and at least
-    one entry differs.
+    """A neighbour: every entry is drawn anew with probability ``rate``.
+
+    Where no active entry changed, one that can change is drawn from its other values.
+    The only member of a space is its own neighbour.
     """
-    while True:
-        other = sample(space, generator)
-        child = replace(
-            architecture,
-            depths=_mix(architecture.depths, other.depths, generator, rate),
-            kernels=_mix(architecture.kernels, other.kernels, generator, rate),
-            expansions=_mix(architecture.expansions, other.expansions, generator, rate),
-            width=other.width if generator.random() < rate else architecture.width,
-            resolution=other.resolution
-            if generator.random() < rate
-            else architecture.resolution,
-        )
-        if active(space, child) != active(space, architecture):
-            return child
+    other = sample(space, generator)
+    child = replace(
+        architecture,
+        depths=_mix(architecture.depths, other.depths, generator, rate),
+        kernels=_mix(architecture.kernels, other.kernels, generator, rate),
+        expansions=_mix(architecture.expansions, other.expansions, generator, rate),
+        width=other.width if generator.random() < rate else architecture.width,
+        resolution=other.resolution
+        if generator.random() < rate
+        else architecture.resolution,
+    )
+    if active(space, child) != active(space, architecture):
+        return child
+    neighbours = _neighbours(space, architecture)
+    if not neighbours:
+        return architecture
+    return neighbours[int(generator.integers(len(neighbours)))]
+
+
+def _neighbours(space: Space, architecture: Architecture) -> list[Architecture]:
+    """Every other network that differs from this one in a single entry."""
+    found = []
+    choices: dict[str, tuple[Any, ...]] = {
+        "depths": space.depths,
+        "kernels": space.kernels,
+        "expansions": space.expansions,
+    }
+    for name, values in choices.items():
+        row = getattr(architecture, name)
+        for i in range(len(row)):
+            for value in values:
+                changed: Any = {name: (*row[:i], value, *row[i + 1 :])}
+                found.append(replace(architecture, **changed))
+    found += [replace(architecture, width=width) for width in space.widths]
+    found += [replace(architecture, resolution=r) for r in resolutions(space)]
+    here = active(space, architecture)
+    return [one for one in found if active(space, one) != here]
 
 
 def resolutions(space: Space) -> tuple[float, ...]:
     """The input scales that the search tries, 0.1 apart."""
     low, high = space.resolution
-    return tuple(round(low + 0.1 * i, 3) for i in range(round((high - low) / 0.1) + 1))
+    count = int((high - low) / 0.1 + 1e-9) + 1
+    return tuple(round(low + 0.1 * i, 3) for i in range(count))
 
 
 def active(space: Space, architecture: Architecture) -> Architecture:

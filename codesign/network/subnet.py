@@ -2,6 +2,8 @@
 uses.
 """
 
+from collections.abc import Mapping
+from operator import gt
 from typing import Any
 
 from torch import Tensor, nn
@@ -9,6 +11,7 @@ from torch import Tensor, nn
 from codesign.network.architecture import Architecture, Block, blocks, stem_channels
 from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, lateral_strides
 from codesign.network.supernet import ElasticBlock, Supernet, modules_of
+from metalens.ground.errors import TrainingError
 
 
 class Subnet(nn.Module):
@@ -30,6 +33,36 @@ class Subnet(nn.Module):
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         found = self.net(frames, self.architecture)
         return found.mask_logits, found.centre, found.slip
+
+
+def restore(net: Supernet, state: Mapping[str, Tensor]) -> None:
+    """Put the weights of a kept :class:`Subnet` back into the supernet it was cut from.
+
+    Channels are the leading ones and kernels the central ones, as they were cut; what
+    the architecture does not use stays as it is.
+
+    Args:
+        state: weights by name as :meth:`Subnet.state_dict` has them.
+
+    Raises:
+        TrainingError: a weight that the supernet lacks, or one larger than its own.
+    """
+    whole = net.state_dict()
+    for name, part in state.items():
+        own = name.removeprefix("net.")
+        place = whole.get(own)
+        fits = place is not None and place.dim() == part.dim()
+        if place is None or not fits or any(map(gt, part.shape, place.shape)):
+            raise TrainingError(
+                f"weight {own!r} is no part of this run's network: its space differs"
+            )
+        leading = [slice(0, n) for n in part.shape[:2]]
+        central = [
+            slice((most - n) // 2, (most - n) // 2 + n)
+            for most, n in zip(place.shape[2:], part.shape[2:], strict=True)
+        ]
+        place[(*leading, *central)] = part
+    net.load_state_dict(whole)
 
 
 def _trim(net: Supernet, architecture: Architecture) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from codesign.batches import parallel
-from codesign.network import blur, normed
+from codesign.network import blur
 from codesign.network.architecture import (
     Activation,
     Architecture,
@@ -37,7 +37,6 @@ from codesign.network.cost import (
     lateral_strides,
     network,
 )
-from codesign.network.normed import activated
 from codesign.network.running import RunningNorm
 from codesign.network.windows import resampled
 from metalens.ground.arrays import Array
@@ -76,6 +75,11 @@ class Prediction:
     axis: Tensor | None = None
 
 
+def activated(x: Tensor, kind: Activation | None) -> Tensor:
+    """The activation alone."""
+    return x if kind is None else F.relu(x) if kind == "relu" else F.hardswish(x)
+
+
 class SlicedNorm(nn.Module):
     """Batch normalisation whose first channels serve narrower networks."""
 
@@ -100,10 +104,12 @@ class SlicedNorm(nn.Module):
             self._measure(x)
         if self.training and not self.measuring and parallel.ranks() > 1:
             return activated(parallel.batch_norm(x, weight, bias), act)
-        if self.training or self.measuring:
-            return normed.batch_norm(x, weight, bias, act)
+        own = self.training or self.measuring  # statistics of this batch
+        mean, variance = (None, None) if own else (self.mean, self.variance)
+        if mean is not None and variance is not None:
+            mean, variance = mean[:count], variance[:count]
         return activated(
-            F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias), act
+            F.batch_norm(x, mean, variance, weight, bias, training=own), act
         )
 
     @torch.no_grad()

@@ -19,13 +19,9 @@ steepest steps first.
 import functools
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-
-from codesign.network import stepped
-from metalens.ground.arrays import Array
 
 GRID = 7  # windows along a side; neighbours overlap by half
 WAVES = 8  # periods a window of the finest wave
@@ -193,18 +189,7 @@ def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
 def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """(batch, kinds, y, x) of which windows have the means: log(1 + square), its
     square, and the fourth power's.
-
-    Compiled, as means over blocks already, where no derivative is asked, and nobody
-    follows what is done.
     """
-    first = samples[0]
-    if (
-        first.device.type == "cpu"
-        and first.dtype == torch.float32
-        and not first.requires_grad
-        and not followed()
-    ):
-        return stepped.moments(samples, REACHES, _kernels(), GRID + 1, STEP_FLOOR)
     square = (
         torch.cat(
             [_steps(of, reach) for of, reach in zip(samples, REACHES, strict=True)], 1
@@ -217,23 +202,6 @@ def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         told**2,
         (square**2) ** 2,
     )  # squares twice: a power of four is a function call a number
-
-
-def followed() -> bool:
-    """Whether a graph is being made of the network."""
-    traced: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-    return traced or torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
-
-
-@functools.lru_cache(maxsize=1)
-def _kernels() -> Array:
-    """(kinds, 3, 3) weights of STEPS by place (y, x), of variance 1 on white samples."""
-    out = np.zeros((len(STEPS), 3, 3))
-    for kind, taps in zip(out, STEPS, strict=True):
-        for x, y, weight in taps:
-            kind[1 + y, 1 + x] = weight
-        kind /= np.linalg.norm(kind)
-    return out
 
 
 def _steps(samples: Tensor, reach: int) -> Tensor:

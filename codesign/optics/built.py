@@ -8,7 +8,7 @@ over a few micrometres.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numba
 import numpy as np
@@ -30,9 +30,15 @@ from metalens.fabrication import (
 )
 from metalens.field import Optics, cell_um
 from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
-from metalens.ground.paths import path_difference
-from metalens.image import Pupil, amplitude, aperture_light, coordinates
+from metalens.ground.paths import path_difference, sensor_path, source_path
+from metalens.image import (
+    Field,
+    Pupil,
+    amplitude,
+    aperture_light,
+    coordinates,
+    view,
+)
 from metalens.lens import Lens
 
 OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")
@@ -84,16 +90,13 @@ class MadeLens:
         *,
         response: Sensitivity | None = None,
     ) -> None:
-        if settings.angle_deg:
-            raise TrainingError(
-                f"the run sees its lens at {settings.angle_deg:g} deg: a made lens is known on axis"
-            )
         self.design, self.settings, self.response = (
             design,
             settings,
             response or sensitivity(design),
         )
         d = design.diameters
+        self._field = Field(math.radians(settings.angle_deg))
         self.focus = Focus(
             design.wavelength_um, design.sensor_distance_um, design.source_distance_um
         )
@@ -112,21 +115,32 @@ class MadeLens:
             )
 
     def stack(self, x: Array | None = None) -> Stack:
-        """PSFs on axis of the lens with these parameters; of the design without them.
+        """PSFs at the run's field angle of the lens with these parameters; of the
+        design without them.
 
         Args:
             x: all parameters; of the bench's own (stage, light, camera) none enters.
         """
         known = of_lens(vector() if x is None else x)
         distance = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
-        pupil = self._pupil(distance)
-        nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
+        pupil, tangents = self._pupil(distance), self._field.tangents
+        seen = view(pupil, self._field, self.design.source_distance_um)
+        x_um, y_um = seen.x_um.numpy(), seen.y_um.numpy()
         cells = self._gathered(state(known))
-        field = self._on_nodes(cells, nodes_x, nodes_y)
-        phase = profiles.hyperbolic(nodes_x, nodes_y, self.focus) + self._aberration(
-            state(known), nodes_x, nodes_y
+        field = torch.from_numpy(self._on_nodes(cells, x_um, y_um))
+        phase = profiles.hyperbolic(x_um, y_um, self.focus)
+        phase = phase + self._aberration(state(known), x_um, y_um)
+        centre = tangents[0] * distance, tangents[1] * distance
+        k = 2 * math.pi / pupil.wavelength_um
+        inward = torch.from_numpy(phase) + k * sensor_path(
+            seen.x_um, seen.y_um, centre, distance
         )
-        light = self._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil)
+        paths = [
+            source_path(seen.x_um, seen.y_um, tangents, 1 / z)
+            for z in self.settings.depths_um.tolist()
+        ]
+        angles = (torch.remainder(inward + k * p, 2 * math.pi) for p in paths)
+        light = self._psfs(seen.weight * field, angles, pupil)
         return Stack(
             light,
             self.settings.depths_um,
@@ -252,30 +266,21 @@ class MadeLens:
         )
         return np.asarray(real + 1j * imaginary)
 
-    def _psfs(self, field: Tensor, phase: Tensor, pupil: Pupil) -> Tensor:
+    def _psfs(self, field: Tensor, angles: Iterable[Tensor], pupil: Pupil) -> Tensor:
         """(depths, samples, samples) share of the light through the aperture on each
         sample, low-passed to the grid.
+
+        field: (nodes, nodes) complex wave. angles: its phase for every depth, rad.
         """
-        k = 2 * math.pi / pupil.wavelength_um
-        r2 = sum(c**2 for c in coordinates(pupil))
-        inward = phase + k * path_difference(r2, pupil.sensor_distance_um)
         harmonics, columns = self._samples(pupil)
         size = pupil.nodes + harmonics
-        weight = amplitude(pupil)
         s = self.settings
         given = aperture_light(pupil, s.window_samples * s.sample_um)
         scale = (s.sample_um / pupil.period_um) ** 2 / (given * size**2)
         out = []
-        for depth in self.settings.depths_um.tolist():
-            angle = torch.remainder(
-                inward + k * path_difference(r2, depth), 2 * math.pi
-            )
-            light = torch.fft.fft2(
-                (weight * field * torch.polar(torch.ones_like(angle), angle)).to(
-                    torch.complex64
-                ),
-                s=(size, size),
-            )
+        for angle in angles:
+            wave = field * torch.polar(torch.ones_like(angle), angle)
+            light = torch.fft.fft2(wave.to(torch.complex64), s=(size, size))
             transfer = torch.fft.fft2(light.real**2 + light.imag**2)
             keep = torch.arange(-harmonics + 1, harmonics) % size
             out.append((columns @ transfer[keep][:, keep] @ columns.mT).real * scale)

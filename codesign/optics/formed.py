@@ -167,7 +167,9 @@ def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
     """See :func:`codesign.optics.stack.hazy`; the shadow's light falls on all samples
     alike.
     """
-    light = lens.hazy(settings, whole.stack, variance_rad2(error.state()))
+    light = lens.hazy(
+        settings, whole.stack, variance_rad2(error.state(), settings.phase_rates)
+    )
     total = light.sum((-2, -1))
     return with_psfs(whole, light / total[..., None, None], whole.energy * total)
 

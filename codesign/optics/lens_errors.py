@@ -1,11 +1,9 @@
 """Lenses as they will be made, drawn while training: what the assembly and every cause
 of the table do to the light.
 
-Training knows the phase of its lens but not its pillars. Their answers are taken as
-those of the default cell, whose
-phases fill a turn evenly wherever one looks: what all of them answer alike is a phase
-of the wave front, what they
-answer differently takes light out of the image.
+Training knows the phase of its lens and the unit cell, but not the pillars one by one.
+Phases fill a turn evenly over the lens. What all pillars answer in common is a phase of
+the wave front; what they answer differently takes light out of the image.
 """
 
 import dataclasses
@@ -19,10 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens import library
+from metalens.cell import Cell
 from metalens.fabrication import DRAWN, Draw, ResponseError, State, guide, of_kind
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
-from metalens.pillars import DEFAULT_CELL, Proxy
+from metalens.pillars import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
 _FIRST = (
@@ -30,16 +30,6 @@ _FIRST = (
     "height_nm",
 )  # of the process: the order that correlations are written in
 ENTRIES = (*ASSEMBLY, *_FIRST, *(name for name in DRAWN if name not in _FIRST))
-WAVELENGTH_UM = 0.85
-# phase of the default cell over its domain, as `metalens library` finds it (1e-3 rad);
-# a test holds it to the solver
-TURN = Proxy(
-    np.array(
-        [[2.23327426, 3.46714529, 0.160908115, -0.19169534, -0.0139012285, 0.0567230276, 0.00584519421, -0.0124124034,
-          -0.00450211399, 0.00380727079, 0.00164159463, -0.000646972864]]
-    ),
-    np.array([[0.95]]), (0.06, 0.20321608040201006), (WAVELENGTH_UM, WAVELENGTH_UM), 1e-3, 0.05, power=3,
-)  # fmt: skip
 _Entries: Any = dataclasses.make_dataclass(
     "_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True
 )
@@ -155,18 +145,30 @@ class LensError:
         return tuple(self.amounts.get(name, 0.0) for name in ASSEMBLY)
 
 
-def wave_front_rad(state: State, u: Tensor, v: Tensor) -> Tensor:
+@dataclass(frozen=True, eq=False, slots=True)
+class PhaseRates:
+    """How the phases of a cell's pillars change with the process, over a turn of phase.
+
+    mean: (1 + causes,) of d phase / d(diameter, answering causes), base units.
+    covariance: (1 + causes, 1 + causes) of the same.
+    """
+
+    mean: Array
+    covariance: Array
+
+
+def wave_front_rad(state: State, u: Tensor, v: Tensor, rates: PhaseRates) -> Tensor:
     """Phase at lens places over the radius that all pillars share: their mean answer,
     and the causes that bend.
     """
     x, y = u.cpu().numpy(), v.cpu().numpy()
-    shared = _answers()[0][0] * (
+    shared = rates.mean[0] * (
         state.bias_um(x, y) - state.bias_um(np.zeros(1), np.zeros(1))
     )
     return torch.from_numpy(shared + state.phase_rad(x, y)).to(u.device)
 
 
-def variance_rad2(state: State, *, rings: int = 12) -> float:
+def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
     """Variance of the pillars' phases about what they share, mean over the aperture
     (Gauss nodes: exact).
     """
@@ -180,7 +182,7 @@ def variance_rad2(state: State, *, rings: int = 12) -> float:
         state.answers(),
     )
     mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
-    c = _answers()[1]
+    c = rates.covariance
     return float(
         c[0, 0] * square
         + 2 * mean * (c[0, 1:] @ answers)
@@ -188,22 +190,30 @@ def variance_rad2(state: State, *, rings: int = 12) -> float:
     )
 
 
-@functools.cache
-def _answers() -> tuple[Array, Array]:
-    """Mean and covariance over a turn of d phase / d(diameter, answering causes), base
-    units, of the default cell.
+@functools.lru_cache(maxsize=8)
+def pillar_proxy(cell: Cell, wavelength_um: float) -> Proxy:
+    """Phase and transmission of a cell's pillars as functions of their diameter, from
+    a solved library (paper Eq. 2).
+    """
+    return library.proxy_of(library.sweep(cell, wavelengths_um=(wavelength_um,)))
+
+
+@functools.lru_cache(maxsize=8)
+def phase_rates(cell: Cell, wavelength_um: float) -> PhaseRates:
+    """Rates of a cell at a wavelength, over pillars whose phases fill a turn evenly.
 
     Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 %
     of the covariance with height.
     """
-    start = TURN.phase_rad(np.array([TURN.domain_um[0]]), WAVELENGTH_UM)[0]
+    proxy = pillar_proxy(cell, wavelength_um)
+    start = proxy.phase_rad(np.array([proxy.domain_um[0]]), wavelength_um)[0]
     even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
-    diameter = np.asarray(TURN.diameter_um(even, WAVELENGTH_UM))
-    seen = guide(DEFAULT_CELL, TURN, WAVELENGTH_UM, diameter)
+    diameter = np.asarray(proxy.diameter_um(even, wavelength_um))
+    seen = guide(cell, proxy, wavelength_um, diameter)
     quick = [
         row.acts.quick(seen).imag
         for _, row in of_kind(ResponseError)
         if isinstance(row.acts, ResponseError)
     ]
-    rates = np.stack([TURN.dphase_ddiameter(diameter, WAVELENGTH_UM), *quick])
-    return rates.mean(1), np.cov(rates)
+    rates = np.stack([proxy.dphase_ddiameter(diameter, wavelength_um), *quick])
+    return PhaseRates(rates.mean(1), np.cov(rates))

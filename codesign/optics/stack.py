@@ -16,14 +16,19 @@ import scipy.fft
 import torch
 from torch import Tensor
 
+from codesign.batches import parallel
 from codesign.optics import families
 from codesign.optics.families import Family, Start
 from codesign.optics.lens_errors import (
     LensError,
     LensErrors,
+    PhaseRates,
+    phase_rates,
+    pillar_proxy,
     variance_rad2,
     wave_front_rad,
 )
+from metalens.cell import Cell
 from metalens.design import Focus, PhaseOf, profiles
 from metalens.field import Layers, Optics
 from metalens.ground.arrays import Array
@@ -42,6 +47,7 @@ from metalens.image import (
     uniform_imager,
     view,
 )
+from metalens.pillars import DEFAULT_CELL, Proxy
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +84,8 @@ class OpticsConfig:
     image_tolerance: of the true image, relative L2 of a texture.
     layers: films around the lens and an aperture stop, as in DESIGN.toml, for the true
     image alone.
+    cell: unit cell that the lens is made of, as in CELL.toml: its pillars are those of
+    the lens file, and what a process does to them is what training draws.
     """
 
     aperture_mm: float = 1.0
@@ -102,6 +110,7 @@ class OpticsConfig:
     apart_um: float = 0.0
     foci_mm: tuple[float, ...] = ()
     layers: Layers | None = None
+    cell: Cell = DEFAULT_CELL
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -214,6 +223,16 @@ class OpticsConfig:
         )
 
     @property
+    def proxy(self) -> Proxy:
+        """Phase and transmission of the cell's pillars over their diameter."""
+        return pillar_proxy(self.cell, self.focus.wavelength_um)
+
+    @property
+    def phase_rates(self) -> PhaseRates:
+        """What a process does to the phases of this cell's pillars."""
+        return phase_rates(self.cell, self.focus.wavelength_um)
+
+    @property
     def focus(self) -> Focus:
         """What the hyperbolic part images onto the sensor."""
         distances = self.sensor_distance_mm * 1e3, self.focus_mm * 1e3
@@ -240,7 +259,11 @@ class Stack:
 
 
 def stack(
-    settings: OpticsConfig, coefficients_rad: Tensor, *, error: LensError | None = None
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    *,
+    error: LensError | None = None,
+    shared: bool = False,
 ) -> Stack:
     """PSFs of the lens whose polynomial coefficients are these, on samples of the
     image; differentiable.
@@ -256,6 +279,8 @@ def stack(
         coefficients_rad: (polynomials,) in rad of root-mean-square phase over the
             aperture.
         error: one draw of ``settings.spread``.
+        shared: every process of a training computes its part of the depths, and all
+            get the whole stack; all of them must call.
 
     Raises:
         TrainingError: a coefficient is not finite.
@@ -268,18 +293,26 @@ def stack(
     if error is not None:
         phase = phase + _error_phase(settings, error)
     carriers, shape = _carriers(settings)
+    count = len(carriers)
+    rows = parallel.shared_rows(count) if shared else torch.arange(count)
+    if len(rows) < count:
+        carriers = carriers[rows]
     turn = torch.polar(
         torch.ones_like(phase, dtype=torch.float32),
         torch.remainder(phase, 2 * math.pi).float(),
     )
     field = torch.fft.fft2(carriers * turn, s=shape)
     transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
-    rows, columns = _sample_rows(settings)
-    low = len(columns)
+    to_rows, to_columns = _sample_rows(settings)
+    low = len(to_columns)
     kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
-    light = (rows @ (kept @ columns)).real
+    light = (to_rows @ (kept @ to_columns)).real
+    if shared:
+        light = parallel.gathered(light, rows, count)
     if error is not None:
-        light = hazy(settings, light, variance_rad2(error.state()))
+        light = hazy(
+            settings, light, variance_rad2(error.state(), settings.phase_rates)
+        )
     return Stack(light, settings.depths_um)
 
 
@@ -497,7 +530,7 @@ def _wave_front(
         -k * focus_um * (pupil.radius_um / pupil.sensor_distance_um) ** 2 / 2 * rho2
     )
     assembled = defocus + 2 * math.pi * (tilt * rho2 * x + astigmatism * (x**2 - y**2))
-    return assembled + wave_front_rad(error.state(), x, y)
+    return assembled + wave_front_rad(error.state(), x, y, settings.phase_rates)
 
 
 def hazy(settings: OpticsConfig, light: Tensor, variance: float) -> Tensor:

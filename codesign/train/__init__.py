@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from codesign.train import checkpoint as checkpoint
     from codesign.train import pictures as pictures
     from codesign.train import run as run
+    from codesign.train import search as search
     from codesign.train.assess import Answers as Answers
     from codesign.train.assess import Seen as Seen
     from codesign.train.evolution import Candidate as Candidate
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from codesign.train.inner import Schedule as Schedule
     from codesign.train.inner import Trainer as Trainer
     from codesign.train.inner import model as model
-    from codesign.train.journal import Journal as Journal
     from codesign.train.placement import device_of as device_of
     from codesign.train.placement import place as place
     from codesign.train.run import Run as Run
@@ -41,7 +41,6 @@ __getattr__, __dir__, __all__ = attach(
         "Candidate": "evolution",
         "End": "finish",
         "InnerConfig": "inner",
-        "Journal": "journal",
         "Part": "words",
         "Place": "words",
         "Record": "inner",
@@ -63,5 +62,6 @@ __getattr__, __dir__, __all__ = attach(
         "frame_wide": "formation",
         "read_out": "formation",
         "run": "",
+        "search": "",
     },
 )

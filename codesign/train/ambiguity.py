@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from codesign.batches import Batch, EyeScenes, as_batch, decoupled
-from codesign.eye import Labels, States, ambiguity_pairs, render
+from codesign.eye import States, ambiguity_pairs, drawn, render_dressed
+from codesign.eye.worn import Worn
 from metalens.ground.errors import TrainingError
 
 
@@ -22,11 +23,13 @@ class AmbiguityScenes:
     """The two states of every pair, one after the other; see
     :class:`codesign.train.inner.Scenes`.
 
-    scenes: rig, camera, ranges and margin. states: (2 pairs), with their scales.
+    scenes: rig, camera, ranges and margin. states: (2 pairs), with their scales. worn:
+    what each frame has, as in training, before the one camera that pairs need.
     """
 
     scenes: EyeScenes
     states: States
+    worn: Worn
 
     @property
     def margin(self) -> int:
@@ -55,20 +58,14 @@ class AmbiguityScenes:
 
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step."""
-        made = render(
-            self.states[self.rows(step, size)],
+        rows = self.rows(step, size)
+        made = render_dressed(
+            self.states[rows],
+            self.worn[rows],
             rig=self.scenes.rig,
             camera=self.scenes.camera,
         )
         return as_batch(made, self.margin)
-
-    def labels(self, step: int, size: int) -> Labels:
-        """All that is true of the frames of a step."""
-        return render(
-            self.states[self.rows(step, size)],
-            rig=self.scenes.rig,
-            camera=self.scenes.camera,
-        ).labels
 
 
 def ambiguous(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
@@ -92,4 +89,6 @@ def ambiguous(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
     scale = decoupled(
         depth, scenes.depths_um, scenes.settings.scale, np.random.default_rng((seed, 8))
     )
-    return AmbiguityScenes(scenes, replace(joined, scale=scale))
+    generator = np.random.default_rng((seed, scenes.stream, 10))
+    worn = drawn(len(joined), scenes.settings.variety, generator).from_one_view()
+    return AmbiguityScenes(scenes, replace(joined, scale=scale), worn)

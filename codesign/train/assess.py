@@ -1,15 +1,17 @@
 """How well a network reads frames that it never saw: slippage and pupil mask."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from codesign.batches import depth_um, irradiance, samples
-from codesign.network import Architecture, Baseline, Supernet, blur, losses, recalibrate
-from codesign.optics import Stack, formed
+from codesign.network import Architecture, Supernet, blur, losses, recalibrate
+from codesign.optics import OpticsConfig, Stack, formed
 from codesign.train.formation import frame_wide, read_out
 from codesign.train.inner import InnerConfig, Scenes, Trainer
+from metalens.ground.errors import PropagationError, SceneError
 from metalens.image import Imager, UniformImager
 
 
@@ -52,13 +54,50 @@ class Assessment:
         return (self.axial_mm + 2 * self.lateral_mm) / 3
 
 
+SAME = 1.05  # ratio of errors up to which a result does not depend on the tolerance
+FINER = 4  # by which the image that checks a result is formed more precisely
+
+
+def finer(settings: OpticsConfig) -> OpticsConfig | None:
+    """The image that checks whether a result depends on the image's tolerance: a
+    quarter of the tolerance of training; None of the uniform image, which has none.
+    """
+    if settings.image == "uniform":
+        return None
+    return replace(settings, image_tolerance=settings.image_tolerance / FINER)
+
+
+def finer_frames(
+    trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None
+) -> Seen | None:
+    """:func:`frames` of the same scenes and noise on the :func:`finer` image; None
+    where there is none, or this lens cannot be imaged so precisely.
+    """
+    optics = finer(trainer.optics)
+    if optics is None:
+        return None
+    try:
+        return frames(trainer, scenes, batches, stack=stack, optics=optics)
+    except (SceneError, PropagationError):
+        return None
+
+
 @torch.no_grad()
 def frames(
-    trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None
+    trainer: Trainer,
+    scenes: Scenes,
+    batches: int,
+    *,
+    stack: Stack | None = None,
+    optics: OpticsConfig | None = None,
 ) -> Seen:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
     with fixed noise.
+
+    Args:
+        optics: how the image is formed; as in training without it.
     """
+    optics = optics or trainer.optics
     prepared: UniformImager | Imager | None = None
     pitch, wide, above = trainer.model.pitch_um, 1.0, ""
     pixels, masks, slips, depths = [], [], [], []
@@ -66,14 +105,14 @@ def frames(
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
             given = (
-                trainer.optics,
+                optics,
                 trainer.model.coefficients_rad,
                 samples(batch.frames),
             )
             prepared = formed.imager(
                 *given, margin=scenes.margin, made=stack, device=trainer.light.device
             )
-            above = formed.above(trainer.optics, prepared)
+            above = formed.above(optics, prepared)
         light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
         noise = torch.Generator().manual_seed(
             1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number
@@ -121,7 +160,7 @@ class Answers:
 
 @torch.no_grad()
 def predict(
-    net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig
+    net: Supernet, architecture: Architecture, seen: Seen, inner: InnerConfig
 ) -> Answers:
     """Answers with the batch statistics that the network holds (see
     :func:`codesign.network.supernet.recalibrate`).
@@ -158,15 +197,29 @@ def parts(seen: Seen) -> list[Tensor]:
     ]
 
 
+def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
+    """Training frames through the lens as it is: batch statistics are measured on them,
+    never on frames that are scored.
+    """
+    return parts(frames(trainer, trainer.scenes, batches))
+
+
 @torch.no_grad()
 def assess(
-    net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig
+    net: Supernet,
+    architecture: Architecture,
+    seen: Seen,
+    inner: InnerConfig,
+    *,
+    measured: Sequence[Tensor],
 ) -> Assessment:
-    """Errors of one architecture, with its own batch statistics measured on the first
-    half of the frames.
+    """Errors of one architecture.
+
+    Args:
+        measured: (batch, 1, y, x) frames each, on which its batch statistics are
+            measured; see :func:`training_frames`.
     """
-    batches = parts(seen)
-    recalibrate(net, architecture, batches[: max(1, len(batches) // 2)])
+    recalibrate(net, architecture, measured)
     answers = predict(net, architecture, seen, inner)
     error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     net.train()

@@ -3,6 +3,7 @@ written whole or not at all.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -44,18 +45,41 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
     _write(Path(path), tensors, ABOUT, json.dumps(about))
 
 
-def save_network(path: str | Path, net: nn.Module) -> None:
-    """Write the weights of a network alone; the same weights give the same bytes.
+def save_network(
+    path: str | Path, net: nn.Module, *, beside: Mapping[str, Tensor] | None = None
+) -> None:
+    """Write the weights of a network, and tensors ``beside`` them; the same weights
+    give the same bytes.
 
     Raises:
         OSError: the target cannot be written, the disk is full (the old file stays).
     """
     _write(
         Path(path),
-        {name: weight.contiguous() for name, weight in net.state_dict().items()},
+        {
+            name: tensor.detach().contiguous()
+            for name, tensor in {**net.state_dict(), **(beside or {})}.items()
+        },
         "kind",
         "subnet",
     )
+
+
+def load_network(path: str | Path) -> dict[str, Tensor]:
+    """Weights by name of :func:`save_network`.
+
+    Raises:
+        TrainingError: no such file, or not a network.
+    """
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            if (file.metadata() or {}).get("kind") != "subnet":
+                raise TrainingError(f"{path}: not the weights of a run's network")
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError) as error:
+        raise TrainingError(
+            f"{path}: missing, truncated or no network ({error}); finish the run again"
+        ) from error
 
 
 def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from codesign.batches import Batch, Flat
-from codesign.network import Architecture, Baseline, Supernet
+from codesign.network import Architecture, Supernet
 from codesign.train import assess
 from codesign.train.inner import Scenes, Trainer
 from metalens.image import Frames
@@ -67,7 +67,7 @@ class DepthResponse:
 def depth_response(
     trainer: Trainer,
     scenes: Scenes,
-    net: Supernet | Baseline,
+    net: Supernet,
     architecture: Architecture,
     *,
     batches: int,
@@ -92,7 +92,7 @@ def depth_response(
 def _axial(
     trainer: Trainer,
     scenes: Scenes,
-    net: Supernet | Baseline,
+    net: Supernet,
     architecture: Architecture,
     batches: int,
 ) -> Tensor:

@@ -40,6 +40,9 @@ class Plan:
     population: members alive; the oldest dies with every birth.
     tournament: members that compete to be the parent.
     rounds: evaluations in all, the first population included.
+    inner_steps: of the inner optimisation of Eq. 10: optics, pitch and weights of every
+    candidate, from those of the supernet, before it is judged. 0 judges candidates with
+    the supernet's weights behind one lens and pitch.
     mutation: chance that one entry changes.
     together: candidates that are born before any of them is judged, so that the
     processes of ``torchrun`` can share
@@ -51,8 +54,13 @@ class Plan:
     rounds: int = 64
     mutation: float = 0.15
     together: int = 1
+    inner_steps: int = 0
 
     def __post_init__(self) -> None:
+        if self.inner_steps < 0:
+            raise TrainingError(
+                f"inner_steps = {self.inner_steps}: need 0 or more steps"
+            )
         if self.together < 1:
             raise TrainingError(
                 f"together = {self.together}: need 1 or more candidates at once"

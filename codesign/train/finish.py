@@ -2,7 +2,6 @@
 blur tells depth, and why.
 """
 
-import copy
 import json
 import math
 from dataclasses import dataclass, replace
@@ -10,20 +9,20 @@ from typing import Any
 
 from torch import Tensor
 
-from codesign.batches import TEST, VALIDATION
-from codesign.network import Architecture, Baseline, blur, recalibrate, smallest
-from codesign.train import ambiguity, assess, evolution
+from codesign.batches import CALIBRATION, TEST, Scenes
+from codesign.gaze.bench import People
+from codesign.network import blur, recalibrate
+from codesign.train import ambiguity, assess, evolution, specialise
 from codesign.train.assess import Answers, Seen
 from codesign.train.depth_test import depth_response
 from codesign.train.evolution import Candidate, Search
-from codesign.train.inner import Model, Schedule, Trainer
+from codesign.train.inner import Trainer
 from codesign.train.run import Run
 from metalens.ground.errors import TrainingError
 
 
 def finish(run: Run) -> list[dict[str, Any]]:
-    """The best of every budget on the test frames: one row a budget; one row for a
-    baseline network.
+    """The best of every budget on the test frames: one row a budget.
 
     Raises:
         TrainingError: a search has not ended.
@@ -35,15 +34,15 @@ def finish(run: Run) -> list[dict[str, Any]]:
 class End:
     """What a budget ended in.
 
-    row: of the result. model: that reached it, fine-tuned where that is asked for.
-    seen, answers: test frames, and
+    row: of the result. trainer: with the model that reached it, lens, pitch and weights
+    of its own where that is asked for. seen, answers: test frames, and
     what the model said of them. interval_mm: (n,) half width of its 90 % intervals of
     the axial slippage; None of a
     network that gives none.
     """
 
     row: dict[str, Any]
-    model: Model
+    trainer: Trainer
     seen: Seen
     answers: Answers
     interval_mm: Tensor | None
@@ -52,6 +51,8 @@ class End:
 def finished(run: Run) -> list[End]:
     """The ends of :func:`finish`, a budget each.
 
+    ``gaze_deg``: mean gaze error on people whom training never saw, by spherical-eye
+    solver and residual regressor. ``pitch_um``: of its own lens and sensor.
     ``mmacs``: that run for a frame. A search holds its budget to the smooth count,
     beside which it may lie where the
     pitch does not divide the image, or a network's resolution the pixels.
@@ -60,73 +61,103 @@ def finished(run: Run) -> list[End]:
     ``axial_coverage_90``: share of test frames within the network's calibrated 90 %
     interval, whose mean half width is
     ``axial_interval_mm``. ``window_depth_mm``: mean error of the depth of the windows.
+    ``finer_axial_slip_mm``, ``finer_lateral_slip_mm``, ``finer_iou``: the same frames on
+    an image formed at a quarter of the training tolerance, and ``finer_ratio`` of the
+    axial errors: near 1 where the result does not depend on the tolerance.
     Batch statistics are measured on training frames through the final lens, never on
     those that are judged.
     """
     settings = run.settings
-    chosen = _chosen(run)
-    tests = {"": assess.frames(run.trainer, run.scenes(TEST), settings.test_batches)}
-    pairs = None
+    people = specialise.people_of(run, TEST, settings.test_batches)
+    shared: _Frames | None = None
+    out = []
+    for budget, best in _chosen(run):
+        trainer = specialise.specialise(run, best.architecture, budget)
+        if shared is None or settings.search.inner_steps:
+            shared = _frames(replace(run, trainer=trainer), people)
+        out.append(_end(replace(run, trainer=trainer), budget, best, people, shared))
+    return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Frames:
+    """Frames through one lens: tests by prefix of their columns, on the finer image, of
+    people, to measure batch statistics on, to calibrate intervals with.
+    """
+
+    tests: dict[str, Seen]
+    fine: Seen | None
+    people: Seen
+    measured: list[Tensor]
+    apart: Seen
+    response: Scenes
+
+
+def _frames(run: Run, people: People) -> _Frames:
+    settings, trainer = run.settings, run.trainer
+    tests = {"": assess.frames(trainer, run.scenes(TEST), settings.test_batches)}
+    response: Scenes = run.scenes(TEST)
     if settings.ambiguity_pairs:
         pairs = ambiguity.ambiguous(
             run.scenes(TEST), settings.ambiguity_pairs, settings.inner.seed
         )
-        tests["ambiguous_"] = assess.frames(
-            run.trainer, pairs, max(1, len(pairs) // settings.inner.batch)
-        )
-    measured = assess.frames(
-        run.trainer, run.trainer.scenes, min(8, settings.test_batches)
+        batches = max(1, len(pairs) // settings.inner.batch)
+        tests["ambiguous_"] = assess.frames(trainer, pairs, batches)
+        response = pairs
+    return _Frames(
+        tests,
+        assess.finer_frames(trainer, run.scenes(TEST), settings.test_batches),
+        specialise.frames_of(trainer, people),
+        assess.training_frames(trainer),
+        assess.frames(trainer, run.scenes(CALIBRATION), settings.validation_batches),
+        response,
     )
-    apart = assess.frames(
-        run.trainer, run.scenes(VALIDATION), settings.validation_batches
-    )
-    out = []
-    for i, (budget, best) in enumerate(chosen):
-        trainer = _tuned(run, best.architecture, i)
-        net, architecture = trainer.model.net, best.architecture
-        recalibrate(net, architecture, assess.parts(measured))
-        row: dict[str, Any] = {
-            "budget_mmacs": budget,
-            "mmacs": run.macs(architecture) / 1e6,
-        }
-        row["effective_pitch_um"] = (
-            float(run.trainer.model.pitch_um.detach()) / architecture.resolution
-        )
-        reach = widths(assess.predict(net, architecture, apart, settings.inner), apart)
-        plain = assess.predict(net, architecture, tests[""], settings.inner)
-        for name, seen in tests.items():
-            answers = (
-                assess.predict(net, architecture, seen, settings.inner)
-                if name
-                else plain
-            )
-            row |= _errors(name, answers, seen) | told(name, answers, seen, reach)
-        response = depth_response(
-            trainer,
-            pairs or run.scenes(TEST),
-            net,
-            architecture,
-            batches=max(1, settings.test_batches // 4),
-        )
-        row["depth_response_mm_per_mm"] = response.mean
-        row["depth_response_error"] = response.standard_error
-        row["architecture"] = (
-            json.loads(evolution.dumps(Search((best,))))["history"][0]
-            if budget
-            else None
-        )
-        out.append(End(row, trainer.model, tests[""], plain, _wide(plain, reach)))
-    return out
 
 
-def _chosen(run: Run) -> list[tuple[float | None, Candidate]]:
-    settings, net = run.settings, run.trainer.model.net
-    if isinstance(net, Baseline):
-        only = smallest(net.space)
-        return [(None, Candidate(only, 0.0, run.macs(only)))]
+def _end(
+    run: Run, budget: float, best: Candidate, people: People, shown: _Frames
+) -> End:
+    """The row of one budget; ``run`` holds the trainer that reached it."""
+    settings, trainer, architecture = run.settings, run.trainer, best.architecture
+    net, inner = trainer.model.net, settings.inner
+    recalibrate(net, architecture, shown.measured)
+    row: dict[str, Any] = {
+        "budget_mmacs": budget,
+        "mmacs": run.macs(architecture) / 1e6,
+    }
+    pitch = float(trainer.model.pitch_um.detach())
+    row["pitch_um"], row["effective_pitch_um"] = pitch, pitch / architecture.resolution
+    row["gaze_deg"] = specialise.gaze_error_deg(
+        trainer, architecture, people, shown.people
+    )
+    reach = widths(assess.predict(net, architecture, shown.apart, inner), shown.apart)
+    plain = assess.predict(net, architecture, shown.tests[""], inner)
+    for name, seen in shown.tests.items():
+        answers = assess.predict(net, architecture, seen, inner) if name else plain
+        row |= _errors(name, answers, seen) | told(name, answers, seen, reach)
+    if shown.fine is not None:
+        on_fine = assess.predict(net, architecture, shown.fine, inner)
+        row |= _errors("finer_", on_fine, shown.fine)
+        row["finer_ratio"] = row["finer_axial_slip_mm"] / row["axial_slip_mm"]
+    response = depth_response(
+        trainer,
+        shown.response,
+        net,
+        architecture,
+        batches=max(1, settings.test_batches // 4),
+    )
+    row["depth_response_mm_per_mm"] = response.mean
+    row["depth_response_error"] = response.standard_error
+    row["architecture"] = json.loads(evolution.dumps(Search((best,))))["history"][0]
+    return End(row, trainer, shown.tests[""], plain, _wide(plain, reach))
+
+
+def _chosen(run: Run) -> list[tuple[float, Candidate]]:
+    settings = run.settings
     if len(run.searches) < len(settings.run.budgets_mmacs):
         raise TrainingError(
-            f"{len(run.searches)} of {len(settings.run.budgets_mmacs)} searches are done; resume the run"
+            f"{len(run.searches)} of {len(settings.run.budgets_mmacs)} searches are "
+            "done; resume the run"
         )
     return [
         (b, evolution.best(s.history))
@@ -150,8 +181,8 @@ def widths(answers: Answers, seen: Seen, *, share: float = 0.9) -> float | None:
     """Half width, in its own standard deviations, of the interval that holds this share
     of the axial slippages.
 
-    From frames that neither training nor test sees: with them the network's uncertainty
-    is calibrated.
+    From frames that training, search and test never use: with them the network's
+    uncertainty is calibrated (split conformal prediction).
     """
     if answers.slip_sd_mm is None:
         return None
@@ -187,34 +218,3 @@ def told(
         miss = blur.depth_mm(answers.depth[:, 0]) - blur.depth_mm(seen.vergence)
         row[f"{name}window_depth_mm"] = float(miss.abs().mean())
     return row
-
-
-def _tuned(run: Run, architecture: Architecture, number: int) -> Trainer:
-    """A copy of the trainer whose weights were trained on for one architecture, lens
-    and pitch as they are.
-    """
-    steps = run.settings.run.finetune_steps
-    source = run.trainer
-    made = copy.deepcopy(source.model)
-    rate = source.inner.weights.rate / 4
-    inner = replace(
-        source.inner,
-        steps=max(steps, 1),
-        seed=source.inner.seed + 1000 * (number + 1),
-        weights=replace(source.inner.weights, rate=rate),
-        optics=Schedule(0.0),
-        pitch=Schedule(0.0),
-    )
-    going = Trainer(
-        inner,
-        source.optics,
-        source.sensor,
-        source.scenes,
-        made,
-        architecture=architecture,
-        stacks=source.light.stacks,
-    )
-    going.light.device = source.light.device  # where the copied network lies already
-    for _ in going.run() if steps else ():
-        pass
-    return going

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign.batches import parallel
-from codesign.network import Architecture, Baseline, Supernet, cost
+from codesign.network import Architecture, Supernet, cost
 from codesign.optics import OpticsConfig, Stack
 from metalens.image import Sensor, encircled_energy, texture_information
 from metalens.image import sensor as camera
@@ -111,7 +111,7 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
 
 
 def network_macs(
-    net: Supernet | Baseline,
+    net: Supernet,
     architecture: Architecture,
     window_um: float,
     pitch_um: Tensor,

@@ -7,20 +7,24 @@ that is stopped anywhere goes on bit for bit. Optics, pitch and weights have the
 rates, clips and schedules: the
 gradients of phase coefficients are a hundred times smaller than those of weights, and
 one shared clip never acts.
-The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`),
-on the schedule of the weights.
+The dense layers that read blur are trained by SOAP (Vyas et al. 2024, arXiv:2409.11321)
+on the schedule of the weights: log powers of a window vary together, and Adam along the
+eigenvectors of their gradients learns what lies across that direction at once.
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
+from pytorch_optimizer import SOAP
 from torch import Tensor, nn
 
 from codesign.batches import (
     Batch,
+    EyeScenes,
     Flat,
     Pose,
     Scenes,
@@ -31,14 +35,11 @@ from codesign.batches import (
 )
 from codesign.network import (
     Architecture,
-    Baseline,
     Prediction,
     blur,
     cost,
     losses,
     running,
-    smallest,
-    soap,
 )
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
@@ -48,9 +49,20 @@ from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
 from codesign.train.light import Light
 from codesign.train.moving import Model, Schedule, model
+from codesign.train.separability import (
+    SeparabilityConfig,
+    render_triplets,
+    separability,
+)
 from metalens.ground import threads
 from metalens.ground.errors import ConfigError, TrainingError
-from metalens.image import Frames, Imager, Sensor, UniformImager
+from metalens.image import (
+    Frames,
+    Imager,
+    Sensor,
+    UniformImager,
+    encircled_energy,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +76,9 @@ class InnerConfig:
     than the samples of the image or
         than the run's budgets allow, nor so coarse that least resolution leaves a
         network less than 16 pixels.
-    slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of
+    slip_weight, optics_weight, budget_weight: of Eq. 10. separability: Eq. 6, the
+    optics loss; while it is off, a bound on the depth in blurred texture stands for it.
+    depth_weight: of the depths of
     windows.
     axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read
     from; 0 where slippage alone
@@ -99,6 +113,7 @@ class InnerConfig:
     refresh: int = 50
     draws: int = 4
     patience: int = 20
+    separability: SeparabilityConfig = field(default_factory=SeparabilityConfig)
 
     def __post_init__(self) -> None:
         if (
@@ -109,6 +124,51 @@ class InnerConfig:
                 f"steps {self.steps}, batch {self.batch}, patience {self.patience}, refresh {self.refresh}, draws "
                 f"{self.draws}: need 1 or more; slip_scale_mm {self.slip_scale_mm}: need all above 0"
             )
+
+
+def _reading_layers(net: nn.Module) -> list[nn.Parameter]:
+    """Weights of the dense layers that read blur and slippage, which every member of an
+    elastic network uses whole, in the order of its parameters.
+    """
+    rooms = [
+        getattr(net, name) for name in ("blur", "calibration") if hasattr(net, name)
+    ]
+    layers = [
+        m
+        for room in rooms
+        for m in room.modules()
+        if isinstance(m, nn.Linear | nn.Conv2d)
+    ]
+    return [
+        m.weight
+        for m in layers
+        if m.weight[0].numel() == m.weight.shape[1] and min(m.weight.shape[:2]) >= 8
+    ]
+
+
+class _Soap(SOAP):
+    """SOAP whose axes lie in memory as a checkpoint gives them back: products of
+    other layouts round otherwise, and a resumed run would part from the whole one.
+    """
+
+    @staticmethod
+    def get_orthogonal_matrix(mat: Any) -> list[Any]:
+        return _contiguous(SOAP.get_orthogonal_matrix(mat))
+
+    def get_orthogonal_matrix_qr(self, *given: Any, **named: Any) -> list[Any]:
+        return _contiguous(super().get_orthogonal_matrix_qr(*given, **named))
+
+
+def _contiguous(axes: list[Any]) -> list[Any]:
+    return [one.contiguous() if isinstance(one, Tensor) else one for one in axes]
+
+
+def _soap(weights: list[nn.Parameter]) -> torch.optim.Optimizer:
+    """SOAP; sides above 600 keep their own axes, whose moments would cost too much."""
+    made: torch.optim.Optimizer = _Soap(
+        weights, betas=(0.9, 0.98), weight_decay=0.01, max_precondition_dim=600
+    )
+    return made
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -162,14 +222,18 @@ class Trainer:
         stacks: Sequence[Stack] = (),
         budgets_mmacs: Sequence[float] = (),
         largest_only: bool = False,
+        triplets: EyeScenes | None = None,
     ) -> None:
-        """``stacks``: PSFs of a lens that is already made; every step draws one of
-        them, and no optics move.
+        """One training.
 
-        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none.
-        ``largest_only``: of a step's members.
+        Args:
+            stacks: PSFs of a lens that is already made; every step draws one of them,
+                and no optics move.
+            budgets_mmacs: one a step, in turn, where ``inner`` names none.
+            largest_only: of a step's members.
+            triplets: scenes that the triplets of Eq. 6 are drawn from.
         """
-        self.largest_only = largest_only
+        self.largest_only, self.triplets = largest_only, triplets
         self.budgets_mmacs = (
             (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
         )
@@ -189,7 +253,7 @@ class Trainer:
             seed=inner.seed,
             draw=self._lens_error,
         )
-        reading = soap.layers(made.net)
+        reading = _reading_layers(made.net)
         others = [p for p in made.net.parameters() if all(p is not q for q in reading)]
         self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, others),
@@ -201,7 +265,7 @@ class Trainer:
             "pitch": (inner.pitch, [made.log_pitch]),
         }
         self.optimisers: dict[str, torch.optim.Optimizer] = {
-            name: soap.Soap(parameters, weight_decay=0.01)
+            name: _soap(parameters)
             if name == "reading"
             else torch.optim.AdamW(
                 parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True
@@ -394,8 +458,25 @@ class Trainer:
         )
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
+        config, every = self.inner.separability, self.inner.separability.every
+        if every and (self.triplets is None or step % every):
+            return optics, torch.zeros(())
         made = lens.stack(self.optics, coefficients, error=self._lens_error(step))
-        return optics, depth_loss(made, self.optics, energy=self.inner.energy)
+        if not every or self.triplets is None:
+            return optics, depth_loss(made, self.optics, energy=self.inner.energy)
+        found = separability(
+            render_triplets(self.triplets, config, step),
+            lambda one: irradiance(one, optics, margin=self.scenes.margin),
+            encircled_energy(
+                made.intensity,
+                self.optics.sample_um,
+                radius_um=2 * self.optics.sample_um,
+            ),
+            config,
+            sensor=replace(self.sensor, pitch_um=float(self.model.pitch_um.detach())),
+            sample_um=self.optics.sample_um,
+        )
+        return optics, every * found.loss.value  # of weight optics_weight on average
 
     def _lens_error(self, step: int | None = None) -> LensError | None:
         return self.optics.spread.draw(self._generator(2, step))
@@ -404,8 +485,6 @@ class Trainer:
         if self.architecture is not None:
             return [self.architecture]
         space = self.model.net.space
-        if isinstance(self.model.net, Baseline):
-            return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
         members = sandwich(
             space, count, self._budget, generator, subnets=self.inner.subnets

@@ -111,7 +111,7 @@ class Light:
         error = self.draw(step)
         if not live and error is None and self._ready is not None:
             return self._ready
-        made = lens.stack(self.optics, coefficients_rad, error=error)
+        made = lens.stack(self.optics, coefficients_rad, error=error, shared=True)
         prepared = lens.prepared(self.optics, made, frame, margin=margin).to(
             self.device
         )

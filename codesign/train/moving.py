@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from codesign.network import Baseline, Name, Space, Supernet, make
+from codesign.network import Space, Supernet
 from codesign.optics import OpticsConfig
 from metalens.ground.errors import ConfigError
 
@@ -56,7 +56,7 @@ class Model:
     which no network of the run keeps its budget; 0 for none.
     """
 
-    net: Supernet | Baseline
+    net: Supernet
     coefficients_rad: nn.Parameter
     log_pitch: nn.Parameter
     finest_um: float = 0.0
@@ -88,11 +88,10 @@ def model(
     pitch_um: float,
     seed: int,
     space: Space | None = None,
-    network: Name = "supernet",
 ) -> Model:
     """A fresh model: network weights from the seed, a lens without added phase."""
     torch.manual_seed(seed)
-    net = Supernet(space) if network == "supernet" else make(network)
+    net = Supernet(space)
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
     return Model(
         net,
@@ -121,6 +120,8 @@ def laid_out(optimiser: torch.optim.Optimizer) -> None:
     for parameter, kept in optimiser.state.items():
         for name, value in kept.items():
             if (
-                name != "step" and value.shape == parameter.shape
-            ):  # the count of a scalar is no moment of it
+                isinstance(value, Tensor)
+                and name != "step"  # the count of a scalar is no moment of it
+                and value.shape == parameter.shape
+            ):
                 kept[name] = torch.empty_like(parameter).copy_(value)

@@ -2,12 +2,14 @@
 answers of its networks.
 """
 
+import copy
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.batches import VALIDATION
-from codesign.network import blur, losses, smallest
+from codesign.network import blur, losses, recalibrate, smallest
 from codesign.optics import stack as lens
 from codesign.train import assess
 from codesign.train.finish import End
@@ -19,7 +21,11 @@ from metalens.ground.arrays import Array
 
 @torch.no_grad()
 def all_of(run: Run) -> dict[str, bytes]:
-    """PNG pictures by name: psf, frames, masks."""
+    """PNG pictures by name: psf, frames, masks.
+
+    The run stays as it is: masks come from a copy of the network, whose batch
+    statistics are measured in evaluation mode on the frames that are shown.
+    """
     trainer = run.trainer
     made = lens.stack(trainer.optics, trainer.model.coefficients_rad)
     chosen = torch.linspace(0, len(made.depths_um) - 1, 6).long().tolist()
@@ -30,13 +36,9 @@ def all_of(run: Run) -> dict[str, bytes]:
     seen = assess.frames(trainer, run.scenes(VALIDATION), 1)
     shown = min(6, len(seen.frames))
     pictures["frames"] = _row(list(seen.frames[:shown, 0]), [""] * shown)
-    net = trainer.model.net
-    was, _ = (
-        net.training,
-        net.train(),
-    )  # batch statistics of these frames: the supernet keeps none
-    found = net(seen.frames, smallest(net.space)).mask_logits
-    net.train(was)
+    net = copy.deepcopy(trainer.model.net)  # the run's own statistics must not move
+    recalibrate(net, smallest(net.space), [seen.frames])
+    found = net(seen.frames, smallest(net.space)).mask_logits.cpu()
     if found.numel():
         pictures["masks"] = _row(list(torch.sigmoid(found[:shown])), [""] * shown)
     return pictures

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from codesign.batches import (
-    VALIDATION,
     EyeScenes,
     Pool,
     PoolScenes,
@@ -23,10 +22,10 @@ from codesign.batches import (
     fill,
     parallel,
 )
-from codesign.network import Architecture, Name, Space, cost, smallest
+from codesign.network import Architecture, Space, cost, smallest
 from codesign.optics import OpticsConfig
-from codesign.train import assess, checkpoint, evolution
-from codesign.train.evolution import Candidate, Plan, Search
+from codesign.train import checkpoint, evolution
+from codesign.train.evolution import Plan, Search
 from codesign.train.formation import network_macs
 from codesign.train.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
 from codesign.train.words import Part
@@ -35,7 +34,7 @@ from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Sensor
 from metalens.image.sensor import pixel_count
 
-Preset = Literal["smoke", "laptop", "paper"]
+Preset = Literal["none", "smoke", "laptop", "paper"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +81,10 @@ class RunConfig:
 
     checkpoint_every: steps. validation_batches: judge architectures. test_batches:
     judge the result.
-    network: the elastic network, or a baseline in its place (no search; one row without
-    a budget).
     ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that
     test out.
-    preset: of what is not given: smoke (2 minutes), laptop (half an hour), paper
-    (GPUs).
+    preset: of what RUN.toml does not give: smoke (a minute), laptop (half an hour;
+    without the key), paper (GPUs); none: the defaults of this record.
     scenes: what is looked at. optics: the lens and how its images are formed. sensor:
     noise and exposure.
     space: networks trained together. inner: training of weights and lens. search: of
@@ -95,11 +92,10 @@ class RunConfig:
     run: budgets, steps and seed.
     """
 
-    preset: Preset = "laptop"
+    preset: Preset = "none"
     checkpoint_every: int = 50
     validation_batches: int = 8
     test_batches: int = 32
-    network: Name = "supernet"
     ambiguity_pairs: int = 0
     scenes: SceneConfig = field(default_factory=SceneConfig)
     optics: OpticsConfig = field(default_factory=OpticsConfig)
@@ -145,15 +141,15 @@ def load(path: str | Path) -> RunConfig:
 
 
 def preset_table(name: str) -> dict[str, Any]:
-    """The settings of a preset; of laptop for a name that is none, which :func:`load`
-    then refuses.
+    """The settings of a preset; empty for "none" and for a name that is no preset,
+    which :func:`load` then refuses.
     """
-    known = name if name in get_args(Preset) else "laptop"
-    return tomllib.loads(
-        resources.files("codesign")
-        .joinpath("data", f"{known}.toml")
-        .read_text(encoding="utf-8")
+    if name == "none" or name not in get_args(Preset):
+        return {}
+    text = (
+        resources.files("codesign").joinpath("data", f"{name}.toml").read_text("utf-8")
     )
+    return {"preset": name, **tomllib.loads(text)}
 
 
 @dataclass(eq=False)
@@ -217,7 +213,6 @@ def start(settings: RunConfig) -> Run:
         pitch_um=settings.run.pitch_um,
         seed=seed,
         space=settings.space,
-        network=settings.network,
     )
     fresh = EyeScenes(
         settings.scenes,
@@ -231,23 +226,18 @@ def start(settings: RunConfig) -> Run:
             _pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed
         )
         scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
-    if parallel.ranks() > 1 and settings.network != "supernet":
-        raise ConfigError(
-            f"network {settings.network!r} trains in one process: its batch statistics are not shared"
-        )
-    budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
     trainer = Trainer(
         inner,
         settings.optics,
         settings.sensor,
         scenes,
         made,
-        budgets_mmacs=budgets,
+        budgets_mmacs=settings.run.budgets_mmacs,
         largest_only="architecture" in frozen,
+        triplets=fresh,
     )
     run = Run(settings, trainer, [])
-    if settings.network == "supernet":
-        made.finest_um = _affordable(run, moves=inner.pitch.rate > 0)
+    made.finest_um = _affordable(run, moves=inner.pitch.rate > 0)
     return run
 
 
@@ -286,7 +276,7 @@ def _affordable(run: Run, *, moves: bool) -> float:
         cost.coarsest_um(run.window_um, settings.space.resolution[0]),
     )
     if count(begins) > budget:
-        coarser = _finest(count, budget, begins, coarsest)
+        coarser = finest_within(count, budget, begins, coarsest)
         way = (
             ""
             if coarser is None
@@ -300,11 +290,11 @@ def _affordable(run: Run, *, moves: bool) -> float:
     return (
         0.0
         if not moves or count(finest) <= budget
-        else _finest(count, budget, finest, begins) or begins
+        else finest_within(count, budget, finest, begins) or begins
     )
 
 
-def _finest(
+def finest_within(
     count: Callable[[float], float], budget: float, low_um: float, high_um: float
 ) -> float | None:
     """The finest pitch within the budget, where the low one is beyond it; None where
@@ -355,47 +345,6 @@ def train(run: Run, path: Path) -> Iterator[Record]:
             record.step % run.settings.checkpoint_every == 0
             or record.step == run.settings.inner.steps
         ):
-            save(path, run)
-
-
-def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
-    """Advance the searches to their end, budget by budget, with a checkpoint after
-    every round of births.
-
-    Yields:
-        (budget in MMACs, the candidate that was born).
-    """
-    settings = run.settings
-    if settings.network != "supernet":
-        return
-    frames = assess.frames(
-        run.trainer, run.scenes(VALIDATION), settings.validation_batches
-    )
-    plan = settings.search
-    if "architecture" in settings.run.frozen:
-        plan = Plan(population=1, tournament=1, rounds=1)
-
-    def error(architecture: Architecture) -> float:
-        return assess.assess(
-            run.trainer.model.net, architecture, frames, settings.inner
-        ).slip_mm
-
-    for i, budget in enumerate(settings.run.budgets_mmacs):
-        before = run.searches[i] if i < len(run.searches) else None
-        states = evolution.evolve(
-            settings.space,
-            plan,
-            error,
-            run.macs,
-            budget=budget * 1e6,
-            seed=settings.inner.seed + i,
-            start=before,
-        )
-        told = len(before.history) if before else 0
-        for state in states:
-            yield from ((budget, born) for born in state.history[told:])
-            told = len(state.history)
-            run.searches[i:] = [state]
             save(path, run)
 
 

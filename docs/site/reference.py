@@ -41,7 +41,6 @@ SETTINGS = {
         "Settings",
         "evaluate optics --config",
     ),
-    "PLAN.toml": ("codesign.budget.plan", "PlanConfig", "plan"),
     "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
 }
 

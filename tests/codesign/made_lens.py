@@ -116,25 +116,6 @@ def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
     )
 
 
-def finished_baseline(folder, network="nvgaze"):
-    """The files of a run of somebody else's network, untrained: one row, no budget, no
-    architecture.
-    """
-    folder.mkdir(parents=True)
-    (folder / "run.toml").write_text(
-        TINY.replace('preset = "smoke"', f'preset = "smoke"\nnetwork = "{network}"')
-    )
-    run.save(
-        folder / "checkpoint.safetensors", run.start(run.load(folder / "run.toml"))
-    )
-    row = {"budget_mmacs": None, "mmacs": 1.5, "architecture": None}
-    (folder / "result.json").write_text(
-        json.dumps({"rows": [row], "network": network, "frozen": []})
-    )
-    lens.save(folder / "lens.h5", small())
-    return folder
-
-
 def finished_run(folder, text=TINY):
     """The files of a run whose search ended, its network untrained."""
     folder.mkdir(parents=True)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from characterize.bench.bench import Truth
 from characterize.commands.fit import Metrology
 from characterize.pupil.record import PupilSpec
-from codesign.budget.plan import PlanConfig
 from codesign.train import run as runs
 from layout.process import process as processes
 from metalens import materials
@@ -28,7 +27,6 @@ TEXTS = {
     "truth": ('depths_um = [18000.0, 22000.0]\npeak_e = 8000.0\n[[parameter]]\nname = "bias_nm"\nvalue = 3.0\n', Truth),
     "metrology": ('scan_um = 150.0\n[[known]]\nname = "height_nm"\nvalue = -3.0\nsigma = 3.0\n', Metrology),
     "pupil": ("numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\nstep_um = 0.5\n", PupilSpec),
-    "plan": ("aperture_mm = 0.3\nstacks = 10\nframes = 100\nled_fwhm_nm = 30.0\n", PlanConfig),
     "chain": ('cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\n', ChainFiles),
     "run": ('preset = "smoke"\n[inner]\nsteps = 3\n[run]\npitch_um = 18.0\n', None),
 }  # fmt: skip

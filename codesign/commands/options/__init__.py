@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from codesign.commands.options import experiment as experiment
     from codesign.commands.options import optics as optics
     from codesign.commands.options import paper as paper
-    from codesign.commands.options import plan as plan
     from codesign.commands.options import retrain as retrain
     from codesign.commands.options import scene as scene
 
@@ -24,7 +23,6 @@ __getattr__, __dir__, __all__ = attach(
         "experiment": "",
         "optics": "",
         "paper": "",
-        "plan": "",
         "retrain": "",
         "scene": "",
     },

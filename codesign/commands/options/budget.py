@@ -1,8 +1,5 @@
 """lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each
 with how it was found.
-
-Links that are done are kept beside the output (NAME.resume): after an interruption the
-same command goes on.
 """
 
 from dataclasses import dataclass, field

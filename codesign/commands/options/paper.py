@@ -21,8 +21,7 @@ class Options(Common):
             best focus, double helix, as
             far as there are; without any, the claims are listed with the commands that
             measure them.
-        others: further finished runs: other networks (Table 2), runs with one part
-            frozen (Fig. 8b); each run's
+        others: further finished runs with one part frozen (Fig. 8b); each run's
             result.json tells which it is.
         output: folder for paper.json, report.html, and the measurements in optics,
             experiment and dim beside them.

@@ -23,14 +23,9 @@ class Options(Common):
             their difference, and the PSFs over field and depth. Ends 1 where the
             image's error is above 0.03.
         fwhm_nm: width of that light, 0 for one wavelength.
-        referee: path trace the first frame with Mitsuba 3 as well (an extra:
-            metalens-toolchain[referee]) and write
-            referee.png and referee.txt: the radiance error of the renderer by region.
-            About a minute.
     """
 
     config: tyro.conf.Positional[Path | None] = None
     output: Output = Path("scene")
     lens: Path | None = None
     fwhm_nm: float = 0.0
-    referee: bool = False

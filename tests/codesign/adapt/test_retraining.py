@@ -297,19 +297,6 @@ def test_a_retraining_is_no_run_and_said_to_be_none(folder, tmp_path, take_up):
         take_up(tmp_path)
 
 
-def test_a_run_of_another_network_is_read_and_not_retrained(tmp_path):
-    source = retraining.load(m.finished_baseline(tmp_path / "run"))
-    assert source.architecture.resolution == 1.0
-    with pytest.raises(
-        TrainingError, match="trained a NVGaze; only elastic networks are retrained"
-    ):
-        retraining.network(source.run.trainer)
-    with pytest.raises(
-        TrainingError, match="no network of 7 MMACs; its budgets are none"
-    ):
-        retraining.load(tmp_path / "run", budget_mmacs=7.0)
-
-
 def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
     d = m.small().diameters
     other = np.where(d.diameter_um > 0, np.clip(d.diameter_um + 0.003, 0, 0.33), 0)

@@ -215,30 +215,3 @@ def test_a_mean_gaze_error_is_of_angles_over_eyes():
     draws = torch.stack([shift, 2 * shift, 5 * shift])
     assert task.gaze_mean(draws) == pytest.approx(8 / 3 * (0.5 + 1.2) / 2)
     assert task.gaze_rms(draws) == pytest.approx(math.sqrt(30 / 3 * (0.25 + 1.44) / 2))
-
-
-def test_an_estimate_at_rest_balances_the_image_and_what_was_known_before():
-    """Where D' W (I / (1 + b) - I(x)) = P x: an eye moved by 0.3 mrad and 3 um, of 1.01
-    times the light.
-
-    Three steps leave an eighth of what the prior pulls: images bend a little with the
-    eye.
-    """
-    bench = small.bare()
-    setting, states, optics = bench.setting, bench.setting.states, bench.device.whole
-    moved = task.shifted(task.shifted(states, 1, 3e-4), 2, 3.0)
-    image = 1.01 * task.electrons(
-        task.views(setting, moved, exposed=states).anchor, optics, setting
-    )
-    found = task.settle(image, optics, states, setting, seen=bench.eyes, steps=3)
-    there = states
-    for unknown in range(len(task.NAMES) - 1):
-        there = task.shifted(there, unknown, found[:, unknown])
-    about = task.linear(task.views(setting, there, exposed=states), optics, setting)
-    left = about.shift(image / (1 + found[:, -1:])).numpy()
-    prior = np.einsum(
-        "skl,sl->sk", about.covariance.numpy(), found.numpy() / np.square(task.priors())
-    )
-    size = np.sqrt(np.einsum("skk->sk", about.covariance.numpy()))
-    assert np.abs((left - prior) / size).max() < 0.2 * np.abs(prior / size).max()
-    assert np.abs(prior / size).max() < 0.1 * np.abs(found.numpy() / size).max()

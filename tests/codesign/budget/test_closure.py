@@ -17,7 +17,6 @@ from codesign.budget.reading import Reading
 from codesign.budget.task import TaskSetting
 from codesign.evaluate import AXIAL, ExperimentConfig, experiment
 from codesign.optics import Numerics, formed, image_difference
-from metalens.cli import main
 from metalens.ground.errors import LensError
 from tests.codesign import made_lens as m
 
@@ -114,28 +113,6 @@ def test_the_reader_of_another_lens_is_refused(source):
             bench(m.small(), Given(run=source, frames=FRAMES))
     finally:
         source.run.settings = kept
-
-
-def test_the_reader_of_another_lens_takes_no_part_in_a_plan(tmp_path, capsys):
-    m.finished_run(tmp_path / "run")
-    words = [
-        "plan",
-        "--gaze-error",
-        "1deg",
-        "--run",
-        str(tmp_path / "run"),
-        "--config",
-        str(tmp_path / "plan.toml"),
-    ]
-    (tmp_path / "plan.toml").write_text(
-        "aperture_mm = 0.12\nsensor_distance_mm = 0.4\n"
-    )
-    assert main([*words, "-o", str(tmp_path / "plan")]) == 2
-    assert (
-        "0.3 mm, 850 nm, 0.12 mm there and 0.4 mm, 850 nm, 0.12 mm in the plan"
-        in capsys.readouterr().err
-    )
-    assert not (tmp_path / "plan").exists()
 
 
 def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(

@@ -4,7 +4,7 @@ what the device itself says.
 
 import functools
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +12,6 @@ import torch
 
 from characterize.model import NAMES
 from codesign.budget import links, task
-from codesign.budget.entry import NONE, TOTAL, Entry
-from codesign.budget.journal import Journal
 from codesign.budget.links import Made
 from codesign.optics import Aperture, Window, image_difference, kernels, psf_difference
 from metalens.cell import Light
@@ -494,40 +492,3 @@ def test_films_are_taken_away_on_both_faces_and_a_lens_without_them_errs_by_none
 
 def test_nothing_is_measured_without_a_run():
     assert not list(links.measured(small.bare()))
-
-
-def test_links_of_a_budget_are_computed_once_and_end_with_their_sum(tmp_path):
-    """A journal holds all parts but the mask: that one is computed, kept, and not asked
-    again when the mask is gone.
-    """
-    bench, path = small.bare(), tmp_path / "out.resume"
-    names = (
-        "answer",
-        "device",
-        "pillars",
-        "neighbours",
-        "mask",
-        "process",
-        "calibration",
-        "numerics",
-    )
-    journal = Journal(path, "0.1")
-    for name in (*names[:4], *names[5:]):
-        journal.part(
-            name,
-            lambda name=name: [astuple(Entry(name, NONE, 0.25, 1e-3 / 7, "by hand"))],
-        )
-    found = list(links.entries(bench, Journal(path, "0.1")))
-    (mask,) = links.mask(bench)
-    assert [entry.link for entry in found] == [
-        *names[:4],
-        "mask grid",
-        *names[5:],
-        TOTAL,
-    ]
-    assert found[4] == mask
-    assert found[-1].gaze_rad == pytest.approx(
-        math.sqrt(7e-6 / 49 + mask.gaze_rad**2), rel=1e-12
-    )
-    again = list(links.entries(given(bench, mask=None), Journal(path, "0.1")))
-    assert [str(entry) for entry in again] == [str(entry) for entry in found]

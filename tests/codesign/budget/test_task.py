@@ -58,8 +58,7 @@ def test_a_moved_eye_is_read_as_moved(eyes, reader, unknown, amount):
         assert reader.shift(image)[:, unknown].tolist() == pytest.approx(
             [amount] * 2, rel=0.35
         )
-    settled = task.settle(image, _optics(0.8), states, SETTING, seen=eyes, steps=3)
-    assert (settled[:, unknown] * amount > 0).all()
+    assert (reader.shift(image)[:, unknown] * amount > 0).all()
 
 
 def test_every_unknown_has_a_step_a_prior_and_an_answer(eyes, reader):

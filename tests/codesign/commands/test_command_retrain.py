@@ -157,25 +157,6 @@ def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the
     assert [path.name for path in Path().iterdir()] == ["out"]
 
 
-def test_a_baseline_is_refused_before_the_work(folder, capsys):
-    m.finished_baseline(folder / "base")
-    words = [
-        "retrain",
-        str(folder / "base"),
-        "--asbuilt",
-        str(folder / "asbuilt.h5"),
-        "-o",
-        str(folder / "none"),
-        *SHORT,
-    ]
-    assert main(words) == 2
-    assert (
-        "trained a NVGaze; only elastic networks are retrained"
-        in capsys.readouterr().err
-    )
-    assert not list(folder.glob("none*"))
-
-
 def test_refusals_leave_nothing_behind(folder, capsys):
     assert _retrain(folder, record="refused.h5", out="bad") == 2
     assert "refused by its own checks" in capsys.readouterr().err

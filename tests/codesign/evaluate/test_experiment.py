@@ -12,7 +12,6 @@ import torch
 from codesign.adapt import train as retraining
 from codesign.batches import EyeScenes, SceneConfig
 from codesign.commands import experiment as command
-from codesign.evaluate import experiment_plots
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
 from codesign.evaluate.shown import ExperimentConfig
@@ -201,26 +200,6 @@ def test_eyes_that_slip_to_where_images_hold_no_depth_are_refused(folder, axial,
         next(experiment.experiment([source], replace(SMALL, axial_mm=axial)))
 
 
-def test_a_network_of_others_reads_the_experiment_by_sphere_and_has_no_overlap(
-    tmp_path,
-):
-    source = retraining.load(m.finished_baseline(tmp_path / "run"))
-    config = replace(SMALL, subjects=2, hidden=0, axial_mm=(2.5,), lateral_mm=())
-    *_, (_, (found,)) = experiment.experiment([source], config)
-    assert isinstance(
-        experiment.calibrator(source, experiment.ready(source), config), personal.Sphere
-    )
-    told = command.summary([found], config)
-    (row,) = told["runs"]
-    assert row["iou"] is None
-    assert "iou_interval" not in row
-    assert row["slip_mm"] == pytest.approx(
-        np.abs(found.slip_mm - found.trial.slip_mm).mean(), rel=1e-9
-    )
-    assert command.table(told).splitlines()[1].split()[-1] == "-"
-    assert experiment_plots.samples(source, config, subjects=1).startswith(b"\x89PNG")
-
-
 def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     run, out = str(folder / "run"), folder / "out"
     words = [
@@ -402,7 +381,8 @@ def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder
     source = retraining.load(folder / "run")
     config, imager = replace(SMALL, people=2), experiment.ready(source)
     found, again, dim = (
-        experiment.calibrator(source, imager, c) for c in (config, config, replace(config, snr_db=3.0))
+        experiment.calibrator(source, imager, c, experiment.lighting([source], c)[0])
+        for c in (config, config, replace(config, snr_db=3.0))
     )  # fmt: skip
     assert found.model.mean.shape == (36, 2)
     assert np.isfinite(found.model.mean).all()

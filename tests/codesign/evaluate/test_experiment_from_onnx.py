@@ -45,7 +45,7 @@ def test_gaze_from_the_graph_is_that_of_the_experiment(tmp_path, pitch_um):
     onnx_file.write(
         tmp_path / "n.onnx",
         source.run,
-        retraining.network(source.run.trainer),
+        source.run.trainer.model.net,
         source.architecture,
     )
     session = onnxruntime.InferenceSession(tmp_path / "n.onnx")

@@ -2,18 +2,14 @@
 answer, gaze of two networks.
 """
 
-import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from codesign.commands import paper as command_paper
-from codesign.commands.paper import GAZE
 from codesign.evaluate import paper, paper_runs
 from codesign.train import run as runs
-from metalens.cli import main
 from metalens.ground.errors import TrainingError
 from tests.codesign import made_lens as m
 
@@ -70,66 +66,14 @@ def test_lenses_are_compared_at_the_largest_tolerance_of_their_runs(monkeypatch)
 
 
 def test_runs_are_told_apart_by_what_they_wrote(tmp_path):
-    one = _result(tmp_path / "a", network="supernet", frozen=["optics"])
-    two = _result(tmp_path / "b", network="supernet", frozen=["pitch", "optics"])
-    three = _result(tmp_path / "c", network="nvgaze", frozen=["pitch"])
+    one = _result(tmp_path / "a", frozen=["optics"])
+    two = _result(tmp_path / "b", frozen=["pitch", "optics"])
+    three = _result(tmp_path / "c", frozen=[])
     assert [part for part, _ in paper_runs.frozen_rows((one, two, three))] == ["optics"]
-    again = _result(tmp_path / "d", network="supernet", frozen=["optics"])
+    again = _result(tmp_path / "d", frozen=["optics"])
     with pytest.raises(
         TrainingError, match="both have optics frozen; give one of them"
     ):
         list(paper_runs.frozen_rows((one, again)))
     with pytest.raises(TrainingError, match="no finished run"):
         paper_runs.kind_of(tmp_path)
-
-
-def test_networks_of_the_table_have_their_claims():
-    row = {"mmacs": 3.0, "personal_deg": 1.5, "people": 4, "seed": 5}
-    told = {"x": {"network": "supernet", "rows": [row, {**row, "personal_deg": 1.0}]}}
-    told |= {name: {"network": name, "rows": [row]} for name in paper_runs.TABLE_2}
-    found = paper_runs.of_gaze(told)
-    assert set(found) == {
-        claim.key for claim in paper.claims() if claim.place == "Table 2"
-    }
-    assert found["table2/proposed_efficient"].value == 1.5
-    assert found["table2/proposed_accurate"].value == 1.0
-
-
-def test_gaze_of_both_kinds_of_network_stands_in_the_table(
-    folder, tmp_path, monkeypatch
-):
-    other, page = m.finished_baseline(tmp_path / "nvgaze"), tmp_path / "page"
-    monkeypatch.setattr(
-        paper_runs, "gaze", functools.partial(paper_runs.gaze, people=3, each=20)
-    )
-    monkeypatch.setattr(
-        command_paper,
-        "_measure",
-        lambda options, at: command_paper._measure_gaze(options, at / GAZE),
-    )
-    arguments = [
-        "evaluate",
-        "paper",
-        str(folder),
-        "--others",
-        str(other),
-        "-o",
-        str(page),
-        "--quiet",
-    ]
-    assert main(arguments) == 0
-    for entry in json.loads((page / GAZE).read_text()).values():
-        (row,) = entry["rows"]
-        assert all(0 < row[key] <= 180 for key in KEYS)
-        assert (
-            row["personal_floor_deg"] < row["personal_deg"]
-        )  # an untrained network knows less than the truth
-    told = json.loads((page / "paper.json").read_text())
-    measured = {
-        line["key"] for line in told if line["place"] == "Table 2" and line["ours"]
-    }
-    assert measured == {
-        "table2/nvgaze",
-        "table2/proposed_efficient",
-        "table2/proposed_accurate",
-    }

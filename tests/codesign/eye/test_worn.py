@@ -57,12 +57,8 @@ def put_on(made, draws=None, **size):
     all_of = {name: np.zeros(1) for name in wear.CAUSES} | {
         name: np.array([v]) for name, v in size.items()
     }
-    return wear.dressed(
-        made,
-        wear.Worn(
-            all_of, np.full((1, 12), 0.3) if draws is None else np.array([draws])
-        ),
-    )
+    placed = np.full((1, 12), 0.3) if draws is None else np.array([draws])
+    return wear.dressed(made, wear.Worn(all_of, dict.fromkeys(wear.CAUSES, placed)))
 
 
 def test_light_that_falls_off_is_a_plane_through_1_in_the_middle():

@@ -2,6 +2,7 @@
 takes.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,8 +11,8 @@ import torch
 
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import TURN, WAVELENGTH_UM, LensError, LensErrors
-from metalens.cell import Light
+from codesign.optics.lens_errors import LensError, LensErrors
+from metalens.cell import Index, Light
 from metalens.pillars import DEFAULT_CELL, engines
 
 SETTINGS = optics.OpticsConfig()
@@ -76,13 +77,13 @@ def test_variance_of_a_bowed_bias_by_plain_quadrature():
     radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None]
     turn = 2 * np.pi * np.arange(64) / 64
     bias = state.bias_um(radius * np.cos(turn), radius * np.sin(turn))
-    c, answers = lens_errors._answers()[1], state.answers()
+    c, answers = SETTINGS.phase_rates.covariance, state.answers()
     want = (
         c[0, 0] * (bias**2).mean()
         + 2 * bias.mean() * c[0, 1:] @ answers
         + answers @ c[1:, 1:] @ answers
     )
-    assert lens_errors.variance_rad2(state) == pytest.approx(
+    assert lens_errors.variance_rad2(state, SETTINGS.phase_rates) == pytest.approx(
         want, rel=1e-4
     )  # rings: 1 / 400² of the curvature
 
@@ -133,38 +134,59 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
         torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64),
         torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64),
     )
-    turn, lens = TURN.phase_rad, np.linspace(*TURN.domain_um, 40_001)
-    phase = np.asarray(turn(lens, WAVELENGTH_UM))
+    turn, lens = (
+        SETTINGS.proxy.phase_rad,
+        np.linspace(*SETTINGS.proxy.domain_um, 40_001),
+    )
+    phase = np.asarray(turn(lens, 0.85))
     inside = phase - phase[0] <= 2 * math.pi
     rate = np.gradient(phase, lens)[inside]
     mean = np.trapezoid(rate, phase[inside]) / (
         2 * math.pi
     )  # phases fill the turn evenly
     bias = state.bias_um(u.numpy(), v.numpy())
-    got = lens_errors.wave_front_rad(state, u, v).numpy()
+    got = lens_errors.wave_front_rad(state, u, v, SETTINGS.phase_rates).numpy()
     assert got[0] == pytest.approx(0, abs=1e-12)
     assert got == pytest.approx(
         mean * (bias - bias[0]), rel=0.01, abs=1e-12
     )  # 400 phases of the turn
 
 
-def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have():
+@pytest.mark.parametrize(
+    ("height_um", "pitch_um", "wavelength_nm"),
+    [(None, None, 850.0), (1.1, 0.4, 940.0)],
+)
+def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have(
+    height_um, pitch_um, wavelength_nm
+):
     """phase = k n_eff h: a height off by d turns each by d / h of its phase. Phases
     fill a turn evenly, so about what
-    they share they scatter by 2π / √12 of d / h (400 phases of the turn: 0.3 %)."""
+    they share they scatter by 2π / √12 of d / h (400 phases of the turn: 0.3 %). Of the
+    lens's own cell: a lower one turns more."""
+    settings = SETTINGS
+    if height_um is not None:
+        cell = dataclasses.replace(
+            DEFAULT_CELL,
+            pitch_um=pitch_um,
+            height_um=height_um,
+            pillar=Index(3.7),
+            substrate=Index(1.45),
+        )
+        settings = dataclasses.replace(SETTINGS, cell=cell, wavelength_nm=wavelength_nm)
     state = LensError({"height_nm": 8.0}).state()
-    want = (2 * math.pi / math.sqrt(12) * 8e-3 / DEFAULT_CELL.height_um) ** 2
-    assert lens_errors.variance_rad2(state) == pytest.approx(want, rel=0.01)
+    want = (2 * math.pi / math.sqrt(12) * 8e-3 / settings.cell.height_um) ** 2
+    got = lens_errors.variance_rad2(state, settings.phase_rates)
+    assert got == pytest.approx(want, rel=0.01)
 
 
 def test_the_phases_that_training_takes_are_those_of_the_solver():
     """The fit's 1e-3 rad and the solver's 1e-4 over the diameters that training looks
     at, both ends among them.
     """
-    low, high = TURN.domain_um
+    low, high = SETTINGS.proxy.domain_um
     solve = engines.smooth(
-        DEFAULT_CELL, Light(WAVELENGTH_UM), (low, high), tolerance=1e-3, engine="modal"
+        DEFAULT_CELL, Light(0.85), (low, high), tolerance=1e-3, engine="modal"
     )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
-    told = np.exp(1j * np.asarray(TURN.phase_rad(diameter, WAVELENGTH_UM)))
+    told = np.exp(1j * np.asarray(SETTINGS.proxy.phase_rad(diameter, 0.85)))
     assert np.abs(np.angle([solve(float(d)).t for d in diameter] / told)).max() < 1.1e-3

@@ -41,7 +41,7 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     seen = Seen(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
     net = Typed((truth + off) / scale, logits)
     inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
-    got = assess.assess(net, None, seen, inner)
+    got = assess.assess(net, None, seen, inner, measured=[])
     assert got.axial_mm == pytest.approx((0.7 + 0.4 + 0.1) / 3)
     assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.8) / 6)
     assert got.iou == pytest.approx((1 / 3 + 1 + 1) / 3)  # two empty masks agree
@@ -105,26 +105,3 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
     ]
     assert torch.allclose(told[0], torch.tensor([[3.0, -4.0, 12.0]]).expand(3, 3) / 13)
     assert told[1] is None
-
-
-@pytest.mark.parametrize(
-    ("frames", "used"), [(1, [1]), (2, [2]), (5, [2]), (8, [2, 2]), (10, [2, 2])]
-)
-def test_batch_statistics_come_from_the_first_half_of_the_batches(
-    monkeypatch, frames, used
-):
-    told = []
-    monkeypatch.setattr(
-        assess,
-        "recalibrate",
-        lambda net, architecture, batches: told.extend(map(len, batches)),
-    )
-    seen = Seen(
-        torch.zeros(frames, 1, 5, 5),
-        torch.zeros(frames, 5, 5),
-        torch.zeros(frames, 3),
-        batch=2,
-    )
-    net = Typed(torch.zeros(frames, 3), -torch.ones(frames, 5, 5))
-    assess.assess(net, None, seen, SimpleNamespace(slip_scale_mm=(1.0, 1.0, 1.0)))
-    assert told == used

@@ -31,10 +31,10 @@ from codesign.eye import (
     renderer,
     textures,
 )
-from codesign.referee.traced_shapes import LAMP_RADIUS_MM, build
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
+from tests.referees.traced_shapes import LAMP_RADIUS_MM, build
 
 REGIONS = ("pupil", "iris", "sclera", "skin", "edges", "mirrors")
 LEAST_LLVM = 17  # older ones end the process over an instruction that they do not know

@@ -9,7 +9,7 @@ import pytest
 
 from codesign.eye import model, population
 from codesign.eye.renderer import Camera
-from codesign.referee import pathtraced
+from tests.referees import pathtraced
 
 
 def test_light_is_multiplied_by_the_gain(monkeypatch):

@@ -12,9 +12,9 @@ from codesign.eye import model, renderer
 from codesign.eye import population as eye
 from codesign.eye.population import Rig
 from codesign.eye.renderer import Camera
-from codesign.referee import pathtraced, traced_shapes
-from codesign.referee.pathtraced import Comparison
 from metalens.ground.errors import SceneError
+from tests.referees import pathtraced, traced_shapes
+from tests.referees.pathtraced import Comparison
 
 CAMERA = Camera(pixels=32, pitch_um=45.0)
 STATES = eye.draw(2, 5)

@@ -1,0 +1,152 @@
+"""Eqs. 4 to 6 in training: how separably the sensor shows gaze and slippage.
+
+    J_i  = (I(state + step of motion i) - I(state)) / step                     on the sensor's pixels
+    F_ij = sum over pixels of J_i J_j                                          (Eq. 4)
+    L    = -sum log F_ii + w sum over i != j of F_ij² / (F_ii F_jj) + v (1 - E)        (Eq. 6)
+
+The triplets {anchor, gaze, slip} are rendered in two layers with occlusion, share one
+exposure, and go through the step's own optics and pixels. Images are in units of the
+anchor's mean, so that no lens wins by its light alone. The off-diagonal entries are
+relative to the diagonal: the plain ones of the paper change with units and brightness.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from codesign.batches import EyeScenes
+from codesign.eye import States, render
+from metalens.ground.errors import ConfigError
+from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
+from metalens.image import sensor as camera
+from metalens.image.information import information, span_angle
+
+Motions = Literal["axial", "all"]
+STREAM = 4  # of the scenes: no other frames are drawn from it
+
+
+@dataclass(frozen=True, slots=True)
+class SeparabilityConfig:
+    """Eq. 6 in training.
+
+    every: steps from one evaluation to the next; 0 leaves the loss out.
+    triplets: anchors of an evaluation.
+    motions: "axial", gaze across and slippage along the axis (2 x 2); "all", gaze
+    across and slippage in all directions (4 x 4).
+    gaze_step_deg, slip_step_um: of the differences, in the linear regime of the image.
+    orthogonality, compactness: weights of the second and third term of Eq. 6.
+    """
+
+    every: int = 0
+    triplets: int = 4
+    motions: Motions = "axial"
+    gaze_step_deg: float = 0.1
+    slip_step_um: float = 50.0
+    orthogonality: float = 1.0
+    compactness: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.every < 0 or self.triplets < 1:
+            raise ConfigError(
+                f"separability: every = {self.every}, triplets = {self.triplets}: "
+                "need 0 or more steps and 1 triplet or more"
+            )
+        if not (self.gaze_step_deg > 0 and self.slip_step_um > 0):
+            raise ConfigError(
+                f"separability: gaze_step_deg = {self.gaze_step_deg}, slip_step_um = "
+                f"{self.slip_step_um}: need steps above 0"
+            )
+        if min(self.orthogonality, self.compactness) < 0:
+            raise ConfigError("separability: need weights of 0 or more")
+
+    @property
+    def directions(self) -> tuple[tuple[str, int, float], ...]:
+        """(field of the state, axis, step in rad or um) of every motion, gaze first."""
+        gaze = ("gaze_rad", 0, math.radians(self.gaze_step_deg))
+        slips = (2,) if self.motions == "axial" else (0, 1, 2)
+        return (gaze, *(("slip_um", axis, self.slip_step_um) for axis in slips))
+
+    @property
+    def units(self) -> tuple[float, ...]:
+        """Step of every motion in degrees or mm: the units of the Fisher matrix."""
+        _, *slips = self.directions
+        return (self.gaze_step_deg, *(1e-3 * step for _, _, step in slips))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Separability:
+    """Fisher matrix of gaze and slippage at the sensor, and the loss of Eq. 6.
+
+    fisher: (motions, motions), mean over the anchors, per degree and mm.
+    """
+
+    fisher: Tensor
+    loss: OpticsLoss
+
+    @property
+    def angle_rad(self) -> Tensor:
+        """Span angle of Eq. 5 between gaze and axial slippage."""
+        ends = torch.tensor([0, -1])
+        return span_angle(self.fisher[ends][:, ends])
+
+
+def moved_states(states: States, config: SeparabilityConfig) -> list[States]:
+    """The anchors, then the same moved along every motion."""
+    out = [states]
+    for name, axis, step in config.directions:
+        values = getattr(states, name).clone()
+        values[:, axis] += step
+        out.append(replace(states, **{name: values}))
+    return out
+
+
+def render_triplets(
+    scenes: EyeScenes, config: SeparabilityConfig, step: int
+) -> list[Frames]:
+    """Frames of the anchors of a training step and of every motion, at the anchors'
+    exposure.
+    """
+    anchors = replace(scenes, stream=STREAM).states(step, config.triplets)
+    return [
+        render(one, rig=scenes.rig, camera=scenes.camera, exposed=anchors).frames
+        for one in moved_states(anchors, config)
+    ]
+
+
+def separability(
+    frames: list[Frames],
+    image: Callable[[Frames], Tensor],
+    encircled: Tensor,
+    config: SeparabilityConfig,
+    *,
+    sensor: Sensor,
+    sample_um: float,
+) -> Separability:
+    """Eqs. 4 to 6 of triplets through a lens and its sensor; differentiable in both.
+
+    Args:
+        frames: of :func:`render_triplets`. image: gives the irradiance (n, y, x) of
+            frames on samples ``sample_um`` apart.
+        encircled: share of the light that the lens keeps together, any shape.
+        sensor: its pixels; their expected electrons are compared, without noise.
+    """
+    anchor, *moved = (
+        camera.mean_electrons(image(one), sample_um, sensor=sensor) for one in frames
+    )
+    level = anchor.mean((-2, -1), keepdim=True)
+    fields = [
+        (one - anchor) / (level * unit)
+        for one, unit in zip(moved, config.units, strict=True)
+    ]
+    fisher = information(torch.stack(fields)) / len(anchor)
+    loss = optics_loss(
+        fisher,
+        encircled.to(fisher),
+        orthogonality=config.orthogonality,
+        compactness=config.compactness,
+    )
+    return Separability(fisher, loss)
