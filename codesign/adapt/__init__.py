@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from codesign.adapt.reading import bootstrap as bootstrap
     from codesign.adapt.settings import RetrainConfig as RetrainConfig
     from codesign.adapt.source import Source as Source
+    from codesign.adapt.source import lens_file as lens_file
+    from codesign.adapt.source import restore_weights as restore_weights
+    from codesign.adapt.source import weights_file as weights_file
     from codesign.adapt.train import Lenses as Lenses
 
 __getattr__, __dir__, __all__ = attach(
@@ -23,9 +26,12 @@ __getattr__, __dir__, __all__ = attach(
         "Source": "source",
         "bootstrap": "reading",
         "correction": "",
+        "lens_file": "source",
         "report": "",
+        "restore_weights": "source",
         "retrained": "",
         "sure": "",
         "train": "",
+        "weights_file": "source",
     },
 )

@@ -15,7 +15,7 @@ import torch
 from matplotlib import image as plt_image
 from torch import Tensor
 
-from codesign.adapt.source import lens_file, weights_file
+from codesign.adapt import lens_file, weights_file
 from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options

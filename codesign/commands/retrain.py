@@ -9,11 +9,10 @@ from typing import Any
 
 from characterize.bench import Truth
 from characterize.inference import asbuilt
-from codesign.adapt import Lenses, Source, correction
+from codesign.adapt import Lenses, Source, correction, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained import RECIPE, RESULT, Recipe, given
-from codesign.adapt.source import lens_file
 from codesign.adapt.sure import MAP, judge
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options

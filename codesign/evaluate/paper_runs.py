@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
+from codesign.adapt import restore_weights
 from codesign.adapt import train as retraining
-from codesign.adapt.source import restore_weights
 from codesign.batches import CALIBRATION, TEST
 from codesign.evaluate.paper import Measured
 from codesign.gaze import Readings

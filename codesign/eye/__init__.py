@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from codesign.eye.view import View as View
     from codesign.eye.view import face_axes as face_axes
     from codesign.eye.worn import CAUSES as CAUSES
+    from codesign.eye.worn import Worn as Worn
     from codesign.eye.worn import drawn as drawn
     from codesign.eye.worn import drawn_of_people as drawn_of_people
     from codesign.eye.worn import dressed as dressed
@@ -67,6 +68,7 @@ __getattr__, __dir__, __all__ = attach(
         "textures": "",
         "triplets": "dataset",
         "View": "view",
+        "Worn": "worn",
         "pigmented": "worn",
         "viewed": "worn",
     },

@@ -19,12 +19,12 @@ from codesign.batches import Batch, EyeScenes, as_batch
 from codesign.eye import (
     Labels,
     States,
+    Worn,
     drawn_of_people,
     render,
     render_dressed,
 )
 from codesign.eye import population as eye
-from codesign.eye.worn import Worn
 from codesign.gaze import shared
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
 from codesign.gaze.personal import Sphere, angle_deg

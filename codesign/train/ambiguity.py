@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from codesign.batches import Batch, EyeScenes, as_batch, decoupled
-from codesign.eye import States, ambiguity_pairs, drawn, render_dressed
-from codesign.eye.worn import Worn
+from codesign.eye import States, Worn, ambiguity_pairs, drawn, render_dressed
 from metalens.ground.errors import TrainingError
 
 

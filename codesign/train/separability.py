@@ -20,10 +20,10 @@ from torch import Tensor
 
 from codesign.batches import EyeScenes
 from codesign.eye import States, render
+from metalens.fisher import information, span_angle
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
 from metalens.image import sensor as camera
-from metalens.image.information import information, span_angle
 
 Motions = Literal["axial", "all"]
 STREAM = 4  # of the scenes: no other frames are drawn from it
