@@ -20,7 +20,6 @@ from torch import Tensor
 
 from codesign.batches import EyeScenes
 from codesign.eye import States, render
-from metalens.fisher import information, span_angle
 from metalens.ground.errors import ConfigError
 from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
 from metalens.image import sensor as camera
@@ -89,9 +88,11 @@ class Separability:
 
     @property
     def angle_rad(self) -> Tensor:
-        """Span angle of Eq. 5 between gaze and axial slippage."""
-        ends = torch.tensor([0, -1])
-        return span_angle(self.fisher[ends][:, ends])
+        """Span angle of Eq. 5 between gaze and axial slippage, in [0, pi]; from atan2,
+        so that it is exact near 0 and pi.
+        """
+        gaze, slip, both = (self.fisher[i, j] for i, j in ((0, 0), (-1, -1), (0, -1)))
+        return torch.atan2((gaze * slip - both**2).clamp_min(0).sqrt(), both)
 
 
 def moved_states(states: States, config: SeparabilityConfig) -> list[States]:
@@ -142,7 +143,8 @@ def separability(
         (one - anchor) / (level * unit)
         for one, unit in zip(moved, config.units, strict=True)
     ]
-    fisher = information(torch.stack(fields)) / len(anchor)
+    along = torch.stack(fields).flatten(1)
+    fisher = along @ along.mT / len(anchor)
     loss = optics_loss(
         fisher,
         encircled.to(fisher),
