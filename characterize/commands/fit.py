@@ -135,28 +135,23 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
         f"{target}: fitted to {len(result.measured)} frames, chi² / dof {result.chi2_per_dof:.3f}; {result.reason}"
     ]
     lines += [f"  {words}" for words in result.verdicts]
+    lines.append(
+        f"  {'parameter':<24} {'value':>10}   {'total 95 %':<24} statistical 95 %"
+    )
     for name, v in zip(result.names, result.value, strict=True):
-        low, high = result.interval(name)
-        lines.append(
-            f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_within(result, name)}"
+        total, statistical = (
+            f"{low:.4g} to {high:.4g}"
+            for low, high in (result.interval(name), result.within_model(name))
         )
+        widened = ", ".join(result.most(name))
+        row = f"  {name:<24} {v:10.4g}   {total:<24} {statistical:<24}"
+        lines.append((f"{row} widened by {widened}" if widened else row).rstrip())
     for label, words in (
         ("cannot tell", result.degeneracies),
         ("note", result.cautions),
     ):
         lines += [f"  {label}: {text}" for text in words]
     return "\n".join(lines)
-
-
-def _within(result: AsBuilt, name: str) -> str:
-    """The interval that would hold without what the captures cannot tell; nothing where
-    that adds little.
-    """
-    causes = result.most(name)
-    low, high = result.within_model(name)
-    return (
-        f"; {low:.4g} to {high:.4g} only without {', '.join(causes)}" if causes else ""
-    )
 
 
 def _values(found: PupilFit) -> dict[str, object]:

@@ -242,7 +242,7 @@ def _parameters(result: AsBuilt) -> report.Table:
                 PARAMETERS[PLACE[name]].meaning,
             )
         )
-    heads = "95 %", "if nothing unstated is there", "widened mostly by"
+    heads = "total 95 %", "statistical 95 %", "widened mostly by"
     return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
 
 
