@@ -22,10 +22,8 @@ from scipy.signal import resample
 
 from layout import solids
 from layout.drc import check_plan
-from layout.files import verify
+from layout.formats import compare, oasis_read, oasis_write
 from layout.mask import build, fields
-from layout.oasis import read as oasis_read
-from layout.oasis import write as oasis_write
 from layout.pec import correct as dose
 from layout.process import process
 from layout.study import sensitivity, stitching, tolerance
@@ -80,8 +78,8 @@ made = build.prepare(lens, rules, with_doses=False)
 report = check_plan(made.plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())
-oasis_write.write(made.plan, folder / "mask.oas", form="small")
-same = verify.compare(made.plan, oasis_read.read(folder / "mask.oas"))
+oasis_write.write(made.plan, folder / "mask.oas")
+same = compare.compare(made.plan, oasis_read.read(folder / "mask.oas"))
 print(
     f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as planned: {same.ok}"
 )

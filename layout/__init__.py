@@ -11,13 +11,13 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.drc.lattice import check_plan as check_plan
-    from layout.files.dxf import write as write_dxf
-    from layout.files.verify import compare as compare
-    from layout.gdsii.read import read as read_gdsii
-    from layout.gdsii.write import write as write_gdsii
+    from layout.formats.compare import compare as compare
+    from layout.formats.dxf import write as write_dxf
+    from layout.formats.gdsii_read import read as read_gdsii
+    from layout.formats.gdsii_write import write as write_gdsii
+    from layout.formats.oasis_read import read as read_oasis
+    from layout.formats.oasis_write import write as write_oasis
     from layout.mask.build import plan as plan
-    from layout.oasis.read import read as read_oasis
-    from layout.oasis.write import write as write_oasis
     from layout.process.process import Process as Process
     from layout.process.process import load as load_process
 
@@ -26,13 +26,13 @@ __getattr__, __dir__, __all__ = attach(
     {
         "Process": "layout.process.process",
         "check_plan": "layout.drc.lattice",
-        "compare": "layout.files.verify",
+        "compare": "layout.formats.compare",
         "load_process": "layout.process.process:load",
         "plan": "layout.mask.build",
-        "read_gdsii": "layout.gdsii.read:read",
-        "read_oasis": "layout.oasis.read:read",
-        "write_dxf": "layout.files.dxf:write",
-        "write_gdsii": "layout.gdsii.write:write",
-        "write_oasis": "layout.oasis.write:write",
+        "read_gdsii": "layout.formats.gdsii_read:read",
+        "read_oasis": "layout.formats.oasis_read:read",
+        "write_dxf": "layout.formats.dxf:write",
+        "write_gdsii": "layout.formats.gdsii_write:write",
+        "write_oasis": "layout.formats.oasis_write:write",
     },
 )

@@ -86,7 +86,7 @@ def cut_tile(
     side_um: float | None = None,
     centre_um: tuple[float, float] = (0.0, 0.0),
 ) -> Tile:
-    """The pillars of a square of a lens as fabricated: bias, corner rounding, sidewalls.
+    """The pillars of a square of a lens as fabricated: bias, rounding, sidewalls.
 
     Args:
         lens: pillars that stand, of any shape.
@@ -300,7 +300,7 @@ def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
             placed = facets[pillars.kind[block]]
             placed["corners"][..., :2] += places[block, None, None]
             file.write(placed.data)
-    return total
+    return int(total)
 
 
 def _facets(mesh: Mesh) -> Array:
@@ -402,11 +402,12 @@ def _loft(
 ) -> Any:
     from build123d import Face, Solid
 
-    is_round = isinstance(foot, Conic) and foot.half_x_um == foot.half_y_um
-    if is_round and is_upright:
-        return Solid.make_cylinder(foot.half_x_um, height_um)
-    if is_round:
-        return Solid.make_cone(foot.half_x_um, top.half_x_um, height_um)
+    if isinstance(foot, Conic) and isinstance(top, Conic):
+        radii = foot.half_x_um, top.half_x_um
+        if foot.half_x_um == foot.half_y_um and is_upright:
+            return Solid.make_cylinder(radii[0], height_um)
+        if foot.half_x_um == foot.half_y_um:
+            return Solid.make_cone(*radii, height_um)
     if is_upright:
         return Solid.extrude(Face(_wire(foot, 0.0)), (0, 0, height_um))
     return Solid.make_loft([_wire(foot, 0.0), _wire(top, height_um)], ruled=True)

@@ -62,7 +62,7 @@ QUICK = (
     "tests/codesign/optics",
 )
 # Small tests of compiled loops, 80 s of one processor. Sums modulo 2⁶⁴
-# (layout/files/digest) stay with machine code.
+# (layout/formats/digest) stay with machine code.
 INTERPRETED = (
     "tests/characterize/model/test_gather.py",
     "tests/codesign/batches/test_flat.py",
@@ -77,8 +77,8 @@ INTERPRETED = (
         f"tests/layout/pec/test_{name}.py"
         for name in ("exposure_core", "nodes", "fracture", "rects")
     ),
-    "tests/layout/files/test_gdsii_numbers.py",
-    "tests/layout/oasis",
+    "tests/layout/formats/test_gdsii_numbers.py",
+    "tests/layout/formats",
     *(
         f"tests/layout/drc/test_{name}.py"
         for name in ("check_file", "drc", "separation")

@@ -11,7 +11,7 @@ import tifffile
 
 import layout
 from characterize.captures import capture as captures
-from layout.gdsii import read as gdsii_read
+from layout.formats import gdsii_read
 from layout.process import Process
 from metalens import cli, lens
 from metalens.cell.record import Cell, Index

@@ -21,10 +21,8 @@ import numpy as np
 import layout
 from benchmarks import Row, fastest
 from layout.drc import check_plan
-from layout.files import verify
-from layout.gdsii import write as gdsii_write
+from layout.formats import compare, gdsii_write, oasis_write
 from layout.mask.plan import Lattice, MaskPlan, pillar_classes
-from layout.oasis import write as oasis_write
 from layout.process.process import Rules
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -153,45 +151,31 @@ def rows() -> Iterator[Row]:
 def _file_rows(target: Path) -> list[Row]:
     free, symmetric = plan(), plan(freeform=False)
     cases = [
-        ("free-form", "GDSII", free, "m.gds", {}, "write <= 1.3x a raw write"),
+        ("free-form", "GDSII", free, "m.gds", "write <= 1.3x a raw write"),
         (
             "free-form",
-            "OASIS small",
+            "OASIS",
             free,
             "s.oas",
-            {"form": "small"},
             "<= 3.0 MB (2.0), <= 1 s",
         ),
         (
-            "free-form",
-            "OASIS fast",
-            free,
-            "f.oas",
-            {"form": "fast"},
-            "10x gdstk level 6, <= 0.75 of its size",
-        ),
-        ("free-form", "OASIS reader", free, "r.oas", {"form": "reader"}, "<= 6.5 MB"),
-        ("free-form", "OASIS circles", free, "c.oas", {"circles": True}, ""),
-        (
             "symmetric",
-            "OASIS small",
+            "OASIS",
             symmetric,
             "y.oas",
-            {"form": "small"},
             "<= 0.36 MB, <= 0.15 s",
         ),
     ]
     made = []
-    for case, method, mask, name, options, goal in cases:
+    for case, method, mask, name, goal in cases:
         path = target / name
         write = layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis
         read = layout.read_gdsii if path.suffix == ".gds" else layout.read_oasis
-        seconds, peak = measured(
-            lambda w=write, m=mask, p=path, o=options: w(m, p, **o)
-        )
+        seconds, peak = measured(lambda w=write, m=mask, p=path: w(m, p))
         size = path.stat().st_size
         start = time.perf_counter()
-        outcome = verify.compare(mask, read(path))
+        outcome = compare.compare(mask, read(path))
         back = time.perf_counter() - start
         threads = 1 if path.suffix == ".gds" else 2
         wrong = float(
@@ -259,12 +243,7 @@ def _streaming_rows(target: Path) -> list[Row]:
     for diameter_mm, goal in ((4.0, "<= 8 s, <= 64 MB"), (10.0, "<= 60 s, <= 64 MB")):
         mask = large(diameter_mm)
         for method, write, name in (
-            (
-                "OASIS fast",
-                lambda p, m=mask: oasis_write.write(m, p, form="fast"),
-                "l.oas",
-            ),
-            ("OASIS small", lambda p, m=mask: oasis_write.write(m, p), "l.oas"),
+            ("OASIS", lambda p, m=mask: oasis_write.write(m, p), "l.oas"),
         ):
             with peak_mb() as grown:
                 start = time.perf_counter()
@@ -317,7 +296,7 @@ def _command_rows(target: Path) -> list[Row]:
 
 def _certificate_rows(target: Path) -> list[Row]:
     """8.7 million pillars with corrected doses, written, read back and exposed again."""
-    from layout.files import doses
+    from layout.formats import doses
     from layout.mask import build
     from layout.process.process import Exposure, Process
     from layout.verify import verify_exposure
@@ -395,7 +374,7 @@ _COMMAND = (
     _PEAK
     + """
 start = time.perf_counter()
-code = cli.main(["layout", *sys.argv[1:], "--oasis", "--form", "fast", "--quiet", "--force"])
+code = cli.main(["layout", *sys.argv[1:], "--oasis", "--quiet", "--force"])
 print(code, time.perf_counter() - start, peak_mb())
 """
 )

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from layout.arrange import job_file as job_file
     from layout.arrange import joined as joined
     from layout.arrange import parts as parts
-    from layout.arrange import readback as readback
     from layout.arrange import seen as seen
     from layout.arrange import wafer as wafer
     from layout.arrange.record import Arrangement as Arrangement
@@ -32,7 +31,6 @@ __getattr__, __dir__, __all__ = attach(
         "job_file": "",
         "joined": "",
         "parts": "",
-        "readback": "",
         "seen": "",
         "wafer": "",
     },

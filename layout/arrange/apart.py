@@ -11,7 +11,7 @@ import numpy as np
 from layout.arrange.joined import PER_UM, Placing
 from layout.arrange.parts import APERTURE, Part
 from layout.drc import Violation
-from layout.files import Copies, Turn
+from layout.formats import Copies, Turn
 from layout.pec import psf
 from layout.process import Process
 from metalens.ground.arrays import Array

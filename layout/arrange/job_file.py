@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from layout.arrange.joined import PER_UM, Placing
-from layout.files import Assembly, CellContent, handover
+from layout.formats import Assembly, CellContent, handover
 from layout.mask import FieldPlan, Lattice
 from layout.process import LayerNumber
 from layout.shapes import polygon

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from layout.arrange.parts import UNIT_NM, Part, compact, relayered
 from layout.arrange.record import At
-from layout.files import Assembly, CellContent, Copies, Sites, Turn
+from layout.formats import Assembly, CellContent, Copies, Sites, Turn
 from layout.process import LayerNumber
 from metalens.ground.errors import ProcessError
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import (
+from layout.formats import (
     NOTHING,
     CellContent,
     Copies,
@@ -17,7 +17,7 @@ from layout.files import (
     Sites,
     arrays,
     doses,
-    flat,
+    flatten,
 )
 from layout.mask import UNDRAWN, Lattice, MaskPlan
 from layout.process import LayerNumber, Process
@@ -151,6 +151,12 @@ def of_file(
         len(shapes) - len(cells[key].polygons.get(layer, ()))
         for key in cells
         for layer, shapes in whole.cells[key].polygons.items()
+    )
+    empty += sum(  # those that the reader left out
+        count
+        for cell in cells.values()
+        for kind, count in cell.skipped.items()
+        if kind.endswith("without area")
     )
     layers = process.layers
     undrawn = {layers.outline, layers.fields}
@@ -350,7 +356,7 @@ def _file_boxes(
     }
     found: dict[str, list[Array]] = {}
     counts: dict[LayerNumber, int] = {}
-    for stack in flat.stacks(content, top):
+    for stack in flatten.stacks(content, top):
         number = len(stack.outlines) * len(stack.x)
         counts[stack.layer] = counts.get(stack.layer, 0) + number
         pieces = np.concatenate(

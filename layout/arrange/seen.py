@@ -9,7 +9,7 @@ import numpy as np
 
 from layout.arrange.joined import Placing
 from layout.arrange.parts import APERTURE, PILLARS, Part
-from layout.files import MaskContent, Sites, flat
+from layout.formats import MaskContent, Sites, flatten
 from layout.process import Process
 from layout.shapes import polygon
 from metalens.ground.arrays import Array
@@ -104,7 +104,7 @@ def _of_part(part: Part, process: Process, side: float) -> dict[str, Spots]:
     }
     ours[layers.aperture[0]] = APERTURE
     found: dict[str, list[Spots]] = {}
-    for shape in flat.shapes(content, part.top):
+    for shape in flatten.shapes(content, part.top):
         if shape.layer[0] not in undrawn:
             x, y, area = _sampled(np.asarray(shape.outline, float), side / _FINER)
             every = (

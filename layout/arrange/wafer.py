@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.arrange.record import MOST_DIES, Wafer
-from layout.files import Copies
+from layout.formats import Copies
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 

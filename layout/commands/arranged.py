@@ -18,7 +18,6 @@ from layout.arrange import (
     job_file,
     joined,
     parts,
-    readback,
     wafer,
 )
 from layout.commands import arranged_page, make
@@ -28,10 +27,8 @@ from layout.commands.job import Options
 from layout.commands.placed import Work
 from layout.commands.stages import Stages
 from layout.drc import write_lyp
-from layout.files import Assembly, doses, handover
-from layout.gdsii import assemble as gdsii_assemble
+from layout.formats import Assembly, compare, doses, gdsii_write, handover, oasis_write
 from layout.mask import build
-from layout.oasis import assemble as oasis_assemble
 from layout.process import LayerNumber, noticed
 from layout.process import process as processes
 from metalens.ground import config, store
@@ -175,9 +172,9 @@ def _write(work: Work, made: Assembly) -> None:
     options = work.options
     neither = not (options.oasis or options.gds)
     if options.oasis or neither:
-        _one(work, made, "mask.oas", oasis_assemble.write)
+        _one(work, made, "mask.oas", oasis_write.write)
     if options.gds or neither:
-        _one(work, made, "mask.gds", gdsii_assemble.write)
+        _one(work, made, "mask.gds", gdsii_write.write)
 
 
 def _one(
@@ -187,7 +184,8 @@ def _one(
     with work.stages(f"write {name}"):
         write(made, path)
     with work.stages(f"read back {name}"):
-        found = readback.differences(made, read(path, make.MOST_READ, keep=make.KEPT))
+        content = read(path, make.MOST_READ, keep=make.KEPT)
+        found = compare.differences(made, content)
     work.failures += [f"{name} does not read back as planned: {text}" for text in found]
     work.unlike |= {name} if found else set()
     work.written[name] = path.stat().st_size

@@ -9,7 +9,7 @@ import numpy as np
 from layout.arrange import apart, joined, seen
 from layout.commands.placed import Work
 from layout.drc import format_size
-from layout.files import Assembly, handover
+from layout.formats import Assembly, handover
 from layout.shapes import rectilinear
 from metalens.ground import report
 from metalens.ground.arrays import Array

@@ -18,10 +18,15 @@ from layout.drc import (
     format_size,
     write_lyrdb,
 )
-from layout.files import MaskContent, hierarchy, mapped, placement_limit
-from layout.gdsii import read as gdsii_read
-from layout.oasis import bytes as oasis_bytes
-from layout.oasis import read as oasis_read
+from layout.formats import (
+    MaskContent,
+    gdsii_read,
+    hierarchy,
+    mapped,
+    oasis_read,
+    placement_limit,
+)
+from layout.formats import oasis_records as oasis_bytes
 from layout.process import process as processes
 from metalens.commands import Common, MaybeOutput
 from metalens.ground import reading

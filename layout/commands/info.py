@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from layout.commands.check import format_counts, read
-from layout.files import hierarchy
+from layout.formats import hierarchy
 
 
 def told(path: Path, top: str | None = None) -> dict[str, Any]:

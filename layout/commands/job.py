@@ -3,13 +3,12 @@
 import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from layout.commands.stages import Stages
 from layout.drc import DrcReport
-from layout.files import Window, handover, verify
+from layout.formats import Window, compare, handover
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
@@ -35,11 +34,9 @@ class Options(Distributed):
         oasis: write OASIS (with --gds the default where neither is asked for).
         gds: write GDSII.
         dxf: write DXF of a window.
-        step: write STEP of die, aperture, mount and module, with a tile of pillars.
-        stl: write STL, 3MF and glTF of the tapered pillars of a window.
-        form: of OASIS: fewest bytes, least time, or one repetition for each diameter.
-        circles: true circles in OASIS in place of polygons.
-        window: of DXF and STL.
+        step: write STEP of the tapered pillars of a window.
+        stl: write STL of the tapered pillars of a window.
+        window: of DXF, STL and STEP.
         name: of the top cell.
         dose: proximity correction, where the process asks for it.
         study: add stitching and tolerance (Monte Carlo) to the report.
@@ -53,8 +50,6 @@ class Options(Distributed):
     dxf: bool = False
     step: bool = False
     stl: bool = False
-    form: Literal["small", "fast", "reader"] = "small"
-    circles: bool = False
     window: Window = field(default_factory=Window)
     name: str = "METALENS"
     dose: bool = True
@@ -106,7 +101,7 @@ class Job:
     drc: DrcReport
     stages: Stages
     written: dict[str, int] = field(default_factory=dict)
-    compared: dict[str, verify.Comparison] = field(default_factory=dict)
+    compared: dict[str, compare.Comparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None

@@ -16,12 +16,18 @@ from layout.commands import page
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
 from layout.drc import check_plan, write_lyp, write_lyrdb
-from layout.files import MaskContent, doses, dxf, handover, verify
-from layout.gdsii import read as gdsii_read
-from layout.gdsii import write as gdsii_write
+from layout.formats import (
+    MaskContent,
+    compare,
+    doses,
+    dxf,
+    gdsii_read,
+    gdsii_write,
+    handover,
+    oasis_read,
+    oasis_write,
+)
 from layout.mask import MaskPlan, build, fields, with_fields
-from layout.oasis import read as oasis_read
-from layout.oasis import write as oasis_write
 from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import ExposureReport, LensRows, verify_exposure
@@ -139,7 +145,7 @@ def _write_masks(job: Job, target: Path) -> None:
     if options.writes_oasis:
         path = target / "mask.oas"
         with job.stages("write OASIS"):
-            oasis_write.write(plan, path, form=options.form, circles=options.circles)
+            oasis_write.write(plan, path)
         _read_back(job, path, oasis_read.read)
     if options.writes_gds:
         path = target / "mask.gds"
@@ -151,7 +157,7 @@ def _write_masks(job: Job, target: Path) -> None:
         with job.stages("write DXF"):
             count = dxf.write(plan, path, window=options.window)
         with job.stages("read back dxf"):
-            job.compared[path.name] = verify.Comparison(
+            job.compared[path.name] = compare.Comparison(
                 count, dxf.differences(plan, path, window=options.window)
             )
         job.written[path.name] = path.stat().st_size
@@ -184,7 +190,7 @@ def _write_solids(job: Job, target: Path) -> None:
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
-        job.compared[path.name] = verify.compare(job.plan, content)
+        job.compared[path.name] = compare.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)
     if _is_verifiable(job) and job.compared[path.name].ok:
@@ -205,7 +211,7 @@ def _verified(
     """What a file makes that holds the plan's places; two files of the same polygons
     make the same.
     """
-    if job.verified and not job.options.circles:
+    if job.verified:
         return next(iter(job.verified.values()))
     lattice = job.plan.lattices[0]
     small = not job.verified and lattice.rows * lattice.columns <= MOST_MADE

@@ -9,7 +9,7 @@ import numpy as np
 from layout.commands import pictures
 from layout.commands.job import Job
 from layout.drc import DrcReport, format_size
-from layout.files import Window, handover
+from layout.formats import Window, handover
 from layout.mask import MaskPlan
 from layout.pec.psf import PointExposure
 from layout.process import Exposure
@@ -157,10 +157,9 @@ def _rules(job: Job, shots: dict[str, bytes]) -> Section:
             ]
             for v in found.violations[:50]
         ]
-        head = ("rule", "(x, y) / nm", "found", "needed", "where")
         items.append(
             Table(
-                head,
+                ("rule", "(x, y) / nm", "measured", "needed", "where"),
                 places,
                 "The first violations; mask.lyrdb marks up to 500 of each rule.",
             )
@@ -169,7 +168,8 @@ def _rules(job: Job, shots: dict[str, bytes]) -> Section:
 
 
 def _limit(rule: str, value: float) -> str:
-    return f"{100 * value:g} %" if rule == "density" else f"{value:g} nm"
+    units = {"density": " %", "corner": " degrees"}
+    return f"{100 * value if rule == 'density' else value:g}{units.get(rule, ' nm')}"
 
 
 def _shaped(job: Job) -> Section:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from layout.drc import DrcReport
-from layout.files import Window, sites_in
+from layout.formats import Window, sites_in
 from layout.mask import Lattice, MaskPlan
 from layout.verify import ExposureReport
 from metalens.ground import report

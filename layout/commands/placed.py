@@ -23,9 +23,15 @@ from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.stages import Stages
 from layout.drc import DrcReport, Violation, check_library, check_plan
-from layout.files import MaskContent, hierarchy, placement_limit, verify
-from layout.mask import FieldPlan, build
-from layout.oasis import write as oasis_write
+from layout.formats import (
+    MaskContent,
+    compare,
+    hierarchy,
+    library_of,
+    oasis_write,
+    placement_limit,
+)
+from layout.mask import FieldPlan, Lattice, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import verify_exposure
@@ -123,8 +129,15 @@ def lens_part(work: Work, drawing: make.Drawing, made: build.MadePlan) -> parts.
         content,
         work.process,
         corrected=made.dose is not None,
-        lattices=oasis_write.placed_lattices(job.plan),
+        lattices=_lattices(job.plan),
     )
+
+
+def _lattices(plan: MaskPlan) -> dict[str, Lattice]:
+    """{cell: its lattice} in the files of a plan, stored whole or as an eighth."""
+    pieces = library_of(plan, fold=True).sites
+    whole = {lattice.name: lattice for lattice in plan.lattices}
+    return whole | {name: piece.lattice for name, piece in pieces.items()}
 
 
 def cell_part(work: Work, part: CellPart) -> parts.Part:
@@ -233,7 +246,7 @@ def written_part(work: Work, made: build.MadePlan) -> parts.Part:
     content = read(path, make.MOST_READ)
     path.unlink()
     work.failures += [
-        f"{name}: {text}" for text in verify.compare(plan, content).differences
+        f"{name}: {text}" for text in compare.compare(plan, content).differences
     ]
     if made.dose is not None and process.exposure.csv is None:
         with work.stages(f"{name}: verify exposure"):

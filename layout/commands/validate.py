@@ -4,12 +4,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from layout.files import CellContent, MaskContent, hierarchy, mapped
-from layout.gdsii import bytes as gdsii_bytes
-from layout.gdsii import read as gdsii_read
-from layout.oasis import Cursor
-from layout.oasis import bytes as oasis_bytes
-from layout.oasis import read as oasis_read
+from layout.formats import (
+    CellContent,
+    MaskContent,
+    gdsii_read,
+    hierarchy,
+    mapped,
+    oasis_read,
+)
+from layout.formats import gdsii_records as gdsii_bytes
+from layout.formats import oasis_records as oasis_bytes
+from layout.formats.oasis_cursor import Cursor
 from layout.process import names
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError, ProcessError

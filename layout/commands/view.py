@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from layout.commands.check import read
-from layout.files import MaskContent, doses, flat, hierarchy, placement_limit
+from layout.formats import MaskContent, doses, flatten, hierarchy, placement_limit
 from layout.process import LayerNumber
 from layout.shapes import polygon
 from metalens.commands import MASKS
@@ -36,7 +36,7 @@ def panels(path: Path) -> list[Panel]:
     hierarchy.refuse_beyond(content, most)
     table = found.with_name("doses.csv")
     dose = doses.read(table) if table.is_file() else {}
-    groups = flat.alike(content, lambda shape: (shape.cell, shape.layer))
+    groups = flatten.alike(content, lambda shape: (shape.cell, shape.layer))
     outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:
         raise MaskFileError(f"{found} holds no shape to be shown")
@@ -51,7 +51,7 @@ def panels(path: Path) -> list[Panel]:
 
 
 def _outline(
-    content: MaskContent, group: list[flat.Shapes], dose: dict[LayerNumber, float]
+    content: MaskContent, group: list[flatten.Shapes], dose: dict[LayerNumber, float]
 ) -> Outline:
     """Copies of one polygon."""
     shape = group[0]

@@ -30,9 +30,11 @@ class Measurement:
 
 
 def clean_contour(points: Array) -> Array:
-    """Remove repeated and collinear corners, and dents shallower than one database unit.
+    """Remove repeated and collinear corners, and dents shallower than one database
+    unit.
 
-    Such dents come from rounding a convex outline to the grid; its convex hull replaces it.
+    Such dents come from rounding a convex outline to the grid; its convex hull replaces
+    it.
 
     Args:
         points: (n, 2) corners in whole database units.
@@ -55,11 +57,13 @@ def clean_contour(points: Array) -> Array:
         return points
     x, y = points.T
     is_hole = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() < 0
-    return points[hull.vertices[::-1] if is_hole else hull.vertices]
+    return np.asarray(points[hull.vertices[::-1] if is_hole else hull.vertices])
 
 
 def is_convex(points: Array) -> bool:
-    """Whether a contour without collinear corners turns left at every corner, once around."""
+    """Whether a contour without collinear corners turns left at every corner, once
+    around.
+    """
     before = points - np.roll(points, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
@@ -70,7 +74,9 @@ def is_convex(points: Array) -> bool:
 
 
 def contour_edges(contours: Sequence[Array]) -> Array:
-    """(m, 4) edges x1, y1, x2, y2 of closed contours; the interior is on the left of each edge."""
+    """(m, 4) edges x1, y1, x2, y2 of closed contours; the interior is on the left of
+    each edge.
+    """
     edges = [np.hstack([points, np.roll(points, -1, axis=0)]) for points in contours]
     return np.concatenate([np.empty((0, 4)), *edges])
 
@@ -88,17 +94,21 @@ def measure_polygon(
 ) -> list[Measurement]:
     """Widths, notches and sharp corners of one polygon in the projection metric.
 
-    A convex contour is as wide as its two nearest parallel supporting lines (calipers); a convex hole is a notch of
-    that size. All other edges are measured in pairs (see :func:`projected_distance`); edges that share a corner are
-    no pair (see :func:`find_sharp_corners`). Pairs hidden behind a nearer edge are counted, too.
+    A convex contour is as wide as its two nearest parallel supporting lines (calipers);
+    a convex hole is a notch of that size. All other edges are measured in pairs (see
+    :func:`projected_distance`); edges that share a corner are no pair (see
+    :func:`find_sharp_corners`). Pairs hidden behind a nearer edge are counted, too.
 
     Args:
         contours: cleaned contours, outer ones counter-clockwise, holes clockwise.
-        width_limit: pairs facing through the interior are reported below it, database units.
-        space_limit: pairs facing through the exterior are reported below it, database units.
+        width_limit: pairs facing through the interior are reported below it, database
+            units.
+        space_limit: pairs facing through the exterior are reported below it, database
+            units.
 
     Returns:
-        Pairs below the limits, and the caliper width of each convex contour whatever it is.
+        Pairs below the limits, and the caliper width of each convex contour whatever it
+        is.
     """
     found = find_sharp_corners(contours)
     convex_contour = []
@@ -165,7 +175,8 @@ def edge_boxes(edges: Array) -> Array:
 
 
 def find_close_boxes(boxes: Array, distance: float) -> Array:
-    """Plane sweep along x in horizontal bands: pairs of boxes closer than a distance along x and along y.
+    """Plane sweep along x in horizontal bands: pairs of boxes closer than a distance
+    along x and along y.
 
     Args:
         boxes: (n, 4) left, bottom, right, top.
@@ -226,7 +237,9 @@ def _sweep_bands(
     distance: float,
     pairs: Array,
 ) -> int:
-    """Count the close pairs, and store as many as ``pairs`` holds; a pair belongs to its lowest common band."""
+    """Count the close pairs, and store as many as ``pairs`` holds; a pair belongs to
+    its lowest common band.
+    """
     count = 0
     for band in range(len(start) - 1):
         for k in range(start[band], start[band + 1]):
@@ -261,11 +274,13 @@ def measure_separation(
         offset: (n, 2) displacement of the second polygon of each pair.
 
     Returns:
-        (n,) Euclidean distance, 0 where the polygons touch, overlap or contain each other; and (n,) distance in the
-        projection metric, inf where no edges face each other.
+        (n,) Euclidean distance, 0 where the polygons touch, overlap or contain each
+        other; and (n,) distance in the projection metric, inf where no edges face each
+        other.
 
     Accuracy:
-        Intersections are exact for extents below 2^26 database units; distances are rounded as float64.
+        Intersections are exact for extents below 2^26 database units; distances are
+        rounded as float64.
     """
     start = np.cumsum([0, *(len(edges) for edges in polygons)])
     edges = np.concatenate([np.empty((0, 4)), *polygons]).astype(float)
@@ -327,7 +342,7 @@ def _on_both_sides(e: Array, f: Array) -> bool:
     dx, dy = e[2] - e[0], e[3] - e[1]
     start = dx * (f[1] - e[1]) - dy * (f[0] - e[0])
     end = dx * (f[3] - e[1]) - dy * (f[2] - e[0])
-    return (start <= 0 <= end) or (end <= 0 <= start)
+    return bool(start <= 0 <= end or end <= 0 <= start)
 
 
 @compiled
@@ -347,7 +362,7 @@ def _point_distance_squared(x: float, y: float, e: Array) -> float:
     dx, dy = e[2] - e[0], e[3] - e[1]
     along = ((x - e[0]) * dx + (y - e[1]) * dy) / (dx * dx + dy * dy)
     along = min(max(along, 0.0), 1.0)
-    return (x - e[0] - along * dx) ** 2 + (y - e[1] - along * dy) ** 2
+    return float((x - e[0] - along * dx) ** 2 + (y - e[1] - along * dy) ** 2)
 
 
 @compiled
@@ -376,8 +391,9 @@ def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
 def projected_distance(e: Array, f: Array, side: float) -> float:
     """Distance of two edges in the projection metric, as KLayout measures it.
 
-    Edges face each other where their directions are opposed by more than 90 degrees, each lies on the wanted side of
-    the other, and the perpendicular projection of each onto the other has a length.
+    Edges face each other where their directions are opposed by more than 90 degrees,
+    each lies on the wanted side of the other, and the perpendicular projection of each
+    onto the other has a length.
 
     Args:
         e: x1, y1, x2, y2 with the interior on the left.
@@ -385,7 +401,8 @@ def projected_distance(e: Array, f: Array, side: float) -> float:
         side: 1 through the interior (width), -1 through the exterior (space, notch).
 
     Returns:
-        The larger of the two perpendicular distances; inf where the edges do not face, or share a corner.
+        The larger of the two perpendicular distances; inf where the edges do not face,
+        or share a corner.
     """
     if (e[2] - e[0]) * (f[2] - f[0]) + (e[3] - e[1]) * (f[3] - f[1]) >= 0:
         return np.inf
@@ -396,7 +413,9 @@ def projected_distance(e: Array, f: Array, side: float) -> float:
 
 @compiled
 def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
-    """Least distance from the line of e of that part of f which projects onto e and lies on one side of it."""
+    """Least distance from the line of e of that part of f which projects onto e and
+    lies on one side of it.
+    """
     length = ((e[2] - e[0]) ** 2 + (e[3] - e[1]) ** 2) ** 0.5
     ux, uy = (e[2] - e[0]) / length, (e[3] - e[1]) / length
     along_start = (f[0] - e[0]) * ux + (f[1] - e[1]) * uy
@@ -411,14 +430,16 @@ def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
     if (high - low) * abs(along_end - along_start) <= 1e-9:
         return np.inf
     slope = away_end - away_start
-    return max(min(away_start + low * slope, away_start + high * slope), 0.0)
+    return float(max(min(away_start + low * slope, away_start + high * slope), 0.0))
 
 
 @compiled
 def _clip_to_range(
     start: float, end: float, low: float, high: float
 ) -> tuple[float, float]:
-    """Part (0 to 1) of the way from start to end that lies between two values; empty where the second is smaller."""
+    """Part (0 to 1) of the way from start to end that lies between two values; empty
+    where the second is smaller.
+    """
     if start == end:
         return (0.0, 1.0) if low <= start <= high else (1.0, 0.0)
     first, last = (low - start) / (end - start), (high - start) / (end - start)

@@ -4,7 +4,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from layout.drc.report import DrcReport, Violation
-from layout.files import Assembly
+from layout.formats import Assembly
 from layout.mask import MaskPlan
 from metalens.ground import store
 
@@ -44,7 +44,8 @@ def write_lyp(plan: MaskPlan | Assembly, path: str | Path) -> None:
 
 
 def write_lyrdb(report: DrcReport, top_cell: str, path: str | Path) -> None:
-    """Write a marker database: a category for each rule, a box for each listed violation.
+    """Write a marker database: a category for each rule, a box for each listed
+    violation.
 
     Args:
         report: of any check.

@@ -1,4 +1,6 @@
-"""Design-rule check of a lens's own mask: exact, by classes of neighbouring pillars on its lattices."""
+"""Design-rule check of a lens's own mask: exact, by classes of neighbouring pillars on
+its lattices.
+"""
 
 import itertools
 import math
@@ -31,15 +33,18 @@ MAX_OUTLINES = (
 def check_plan(
     plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None
 ) -> DrcReport:
-    """Check width, space, overlap, grid, density, exclusion zones and clearance of a mask plan.
+    """Check width, space, overlap, grid, density, exclusion zones and clearance of a
+    mask plan.
 
-    Neighbouring pillars are counted by class pair and lattice vector; each such pair is measured once, polygon to
-    polygon. Of a negative tone the pillars that remain are checked, and the frame that is written around them.
+    Neighbouring pillars are counted by class pair and lattice vector; each such pair is
+    measured once, polygon to polygon. Of a negative tone the pillars that remain are
+    checked, and the frame that is written around them.
 
     Args:
         plan: lattices of pillar classes, and figures.
         rules: limits.
-        foot_nm: (classes,) diameter of each class at its foot after the etch; None: feet are not checked.
+        foot_nm: (classes,) diameter of each class at its foot after the etch; None:
+            feet are not checked.
 
     Returns:
         Report with the smallest width and space of all pillars, also above the limits.
@@ -48,7 +53,8 @@ def check_plan(
         ProcessError: more than 1500 distinct outlines.
 
     Accuracy:
-        Exact for width, space (Euclidean), overlap and grid; density in windows that step by half their size.
+        Exact for width, space (Euclidean), overlap and grid; density in windows that
+        step by half their size.
     """
     report = DrcReport.empty(plan.unit_nm, rules)
     _check_grid(plan, report)
@@ -70,7 +76,9 @@ def check_plan(
 
 @dataclass(eq=False, slots=True)
 class _LatticeCheck:
-    """Widths and spaces of one lattice. counts: (classes + 1,) sites of each class number."""
+    """Widths and spaces of one lattice. counts: (classes + 1,) sites of each class
+    number.
+    """
 
     plan: MaskPlan
     lattice: Lattice
@@ -79,7 +87,7 @@ class _LatticeCheck:
     report: DrcReport
 
     def run(self, foot_nm: Array | None) -> None:
-        """Enter the violations of the lattice, and its smallest sizes, into the report."""
+        """Report the violations of the lattice and its smallest sizes."""
         used = np.flatnonzero(self.counts[1:]) + 1
         if not len(used):
             return
@@ -166,9 +174,11 @@ class _LatticeCheck:
         radius: Array,
         limit: float,
     ) -> dict[tuple[int, int, int], float]:
-        """{(vector, outline, outline): space}, database units, of all pairs below the limit and of the nearest.
+        """{(vector, outline, outline): space}, database units, of all pairs below the
+        limit and of the nearest.
 
-        Pairs are measured in the order of the least space their radii allow, until none can be nearer.
+        Pairs are measured in the order of the least space their radii allow, until none
+        can be nearer.
         """
         vector, first, second = np.nonzero(table)
         filled = (first > 0) & (second > 0)
@@ -233,7 +243,9 @@ class _LatticeCheck:
         marked: Array,
         values: dict[tuple[int, int, int], float],
     ) -> Iterator[Violation]:
-        """Violations of marked pairs (vector, outline, outline), with a box around both pillars."""
+        """Violations of marked pairs (vector, outline, outline), with a box around both
+        pillars.
+        """
         limit = self.rules.minimum_gap_nm
         for block, new, top in self._blocks(vectors):
             found = np.empty((MAX_LISTED, 3), np.int64)
@@ -314,7 +326,9 @@ class _LatticeCheck:
         )
 
     def _blocks(self, vectors: Array) -> Iterator[tuple[Array, int, int]]:
-        """(class numbers, rows repeated from the block before, number of the first row)."""
+        """(class numbers, rows repeated from the block before, number of the first
+        row).
+        """
         above = int(vectors[:, 1].max())
         repeated = None
         for top, block in self.lattice.blocks(
@@ -329,7 +343,9 @@ class _LatticeCheck:
 def _distinct_outlines(
     classes: tuple[PillarClass, ...], used: Array
 ) -> tuple[list[tuple[Array, ...]], Array]:
-    """Distinct contours, and (classes + 1,) number of each class among them from 1 on, 0 for unused ones."""
+    """Distinct contours, and (classes + 1,) number of each class among them from 1 on,
+    0 for unused ones.
+    """
     numbers: dict[bytes, int] = {}
     outlines = []
     kind = np.zeros(len(classes) + 1, np.int64)
@@ -351,7 +367,8 @@ def _distinct_outlines(
 
 
 def lattice_vectors(lattice: Lattice, reach: float) -> Array:
-    """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one of each opposite pair.
+    """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one
+    of each opposite pair.
 
     The nearest sites on all sides are always among them.
     """
@@ -373,7 +390,8 @@ def lattice_vectors(lattice: Lattice, reach: float) -> Array:
 def count_pairs(
     block: Array, new: int, kind: Array, vectors: Array, table: Array
 ) -> None:
-    """Add to ``table`` (vectors, kinds, kinds) the pairs whose lower site stands in row ``new`` or below it.
+    """Add to ``table`` (vectors, kinds, kinds) the pairs whose lower site stands in row
+    ``new`` or below it.
 
     Args:
         block: (rows, columns) class numbers.
@@ -396,7 +414,9 @@ def count_pairs(
 def locate_pairs(
     block: Array, new: int, kind: Array, vectors: Array, marked: Array, found: Array
 ) -> int:
-    """Fill ``found`` (n, 3) with row, column, vector of marked pairs; arguments as in :func:`count_pairs`."""
+    """Fill ``found`` (n, 3) with row, column, vector of marked pairs; arguments as in
+    :func:`count_pairs`.
+    """
     rows, columns = block.shape
     count = 0
     for m in range(len(vectors)):
@@ -419,7 +439,9 @@ def locate_pairs(
 def _check_density(
     plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport
 ) -> Array:
-    """Sites of each class number; windows denser than the rule are entered into the report."""
+    """Sites of each class number; windows denser than the rule are entered into the
+    report.
+    """
     half = rules.density_window_um * 1e3 / plan.unit_nm / 2
     across, down = (
         max(1, round(half / step)) for step in (lattice.pitch, lattice.down)
@@ -473,7 +495,8 @@ def add_coverage(
     counts: Array,
     covered: Array,
 ) -> None:
-    """Add the sites of each class to ``counts``, and their area to ``covered`` in tiles of (rows, columns) sites.
+    """Add the sites of each class to ``counts``, and their area to ``covered`` in tiles
+    of (rows, columns) sites.
 
     Args:
         block: (rows, columns) class numbers.
@@ -507,12 +530,14 @@ def _check_figures(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
                 polygons.setdefault(layer[0], []).extend(
                     np.asarray(points, np.int64) for points in drawn
                 )
-    for layer, drawn in polygons.items():
-        _check_merged(drawn, rules, {}, layer, f"figures of layer {layer}", report)
+    for number, merged in polygons.items():
+        _check_merged(merged, rules, {}, number, f"figures of layer {number}", report)
 
 
 def _check_negative_frame(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
-    """Frame written around the lattices of a negative tone: its width is a space, its notches are widths."""
+    """Frame written around the lattices of a negative tone: its width is a space, its
+    notches are widths.
+    """
     drawn = [tone.lattice_box(lattice, plan.grid) for lattice in plan.lattices]
     aperture = {
         layer
@@ -652,7 +677,9 @@ def _sites_near(
 def clipped_area(
     contours: list[Array], box: tuple[float, float, float, float]
 ) -> float:
-    """Area that contours (holes clockwise) share with a box: Sutherland-Hodgman clipping, then the shoelace sum."""
+    """Area that contours (holes clockwise) share with a box: Sutherland-Hodgman
+    clipping, then the shoelace sum.
+    """
     total = 0.0
     for contour in contours:
         points = contour.astype(float)
@@ -677,7 +704,9 @@ def clipped_area(
 
 
 def _check_clearance(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
-    """Lattices, marks, labels and verniers keep the minimum space from each other, box to box."""
+    """Lattices, marks, labels and verniers keep the minimum space from each other, box
+    to box.
+    """
     outlines = (int(np.abs(shape.outline).max()) for shape in plan.classes)
     reach = max(outlines, default=0)
     names, boxes = [], []

@@ -21,7 +21,7 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
-from layout.files import QUARTERS, MaskContent, Turn, flat, hierarchy
+from layout.formats import QUARTERS, MaskContent, Turn, flatten, hierarchy
 from layout.process import LayerNumber, Rules
 from layout.shapes import region
 from metalens.ground.arrays import Array
@@ -200,7 +200,9 @@ class _LayerCheck:
     # hierarchy
 
     def _polygons(self, cell: str) -> list[tuple[Array, Array]]:
-        """Distinct polygons of a cell from their lowest corners, and (n, 2) places of each."""
+        """Distinct polygons of a cell from their lowest corners, and (n, 2) places of
+        each.
+        """
         held = self.content.cells[cell]
         drawn = [
             p
@@ -214,7 +216,7 @@ class _LayerCheck:
             if layer in self.layers
             for c in some
         ]
-        drawn += [flat.circle(*c) for c in circles]
+        drawn += [flatten.circle(*c) for c in circles]
         by_corners: dict[int, list[Array]] = {}
         for points in drawn:
             by_corners.setdefault(len(points), []).append(points)
@@ -231,7 +233,9 @@ class _LayerCheck:
         return found
 
     def _references(self, cell: str) -> list[tuple[str, Turn, Array]]:
-        """(referenced cell, orientation, (n, 2) places) of all references that draw on the layer."""
+        """(referenced cell, orientation, (n, 2) places) of all references that draw on
+        the layer.
+        """
         placed = self.content.cells[cell].kept()
         key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
         found = []
@@ -313,7 +317,7 @@ class _LayerCheck:
         total = 0
         for number, members in _group(placed.element):
             element = self.elements[number]
-            contents = self._contents(element.cell, element.turn)
+            contents = self._contents(element.cell, element.turn or UPRIGHT)
             places = placed.xy[members]
             total += len(places) * len(contents.element)
             if total > self.max_elements:
@@ -362,12 +366,15 @@ class _LayerCheck:
         return report
 
     def _close_pairs(self, placed: _Placements) -> tuple[Array, Array, Array]:
-        """(n, 2) pairs with boxes closer than the minimum space; their Euclidean and projected distances."""
+        """(n, 2) pairs with boxes closer than the minimum space; their Euclidean and
+        projected distances.
+        """
         used, element = np.unique(placed.element, return_inverse=True)
         elements = [self.elements[number] for number in used.tolist()]
-        boxes = [contour_box(element.contours) for element in elements]
-        boxes = np.array(boxes, np.int64).reshape(-1, 4)
-        boxes = boxes[element] + np.hstack([placed.xy, placed.xy])
+        corners = [contour_box(one.contours) for one in elements]
+        boxes = np.array(corners, np.int64).reshape(-1, 4)[element] + np.hstack(
+            [placed.xy, placed.xy]
+        )
         pairs = find_close_boxes(boxes, max(self.space, 1.0))
         first, second = element[pairs].T
         offset = placed.xy[pairs[:, 1]].astype(np.int64) - placed.xy[pairs[:, 0]]
@@ -379,7 +386,9 @@ class _LayerCheck:
         return pairs, euclidean[which], projected[which]
 
     def _check_isolated(self, placed: _Placements, report: DrcReport) -> None:
-        """Widths and notches of isolated polygons, and the findings of isolated references."""
+        """Widths and notches of isolated polygons, and the findings of isolated
+        references.
+        """
         for number, members in _group(placed.element):
             element, places = self.elements[number], placed.xy[members]
             if element.turn is None:
@@ -400,7 +409,7 @@ class _LayerCheck:
         places: Array,
         names: dict[str, str] | None = None,
     ) -> None:
-        """Count the findings of a cell for all its instances; list those of the first."""
+        """Count the findings of a cell for all its instances; list the first."""
         names = names or {}
         for (rule, layer, cell), tally in found.tallies.items():
             rule = names.get(rule, rule)
@@ -460,7 +469,9 @@ class _LayerCheck:
             )
 
     def _check_close(self, cell: str, placed: _Placements, report: DrcReport) -> None:
-        """Merge polygons that touch; then widths and notches of each, and the space of each close pair."""
+        """Merge polygons that touch; then widths and notches of each, and the space of
+        each close pair.
+        """
         report.shapes += len(placed.element)
         pairs, distance, projected = self._close_pairs(placed)
         if (distance == 0).any():
@@ -535,7 +546,9 @@ class _LayerCheck:
     # grid
 
     def _check_grid(self, report: DrcReport) -> None:
-        """Polygons with corners off the grid, counted for each cell by the positions of its instances on the grid."""
+        """Polygons with corners off the grid, counted for each cell by the positions of
+        its instances on the grid.
+        """
         step = self.rules.grid_nm / self.content.unit_nm
         if step == 1:
             return
@@ -558,9 +571,8 @@ class _LayerCheck:
                             key, [0, x + int(first[0]), y + int(first[1])]
                         )
                         entry[0] += times * int(count)
-                self._check_grid_of_cell(
-                    name, turn, (step, *phase), (times, x, y), report
-                )
+                grid = step, phase[0], phase[1]
+                self._check_grid_of_cell(name, turn, grid, (times, x, y), report)
 
     def _check_grid_of_cell(
         self,
@@ -570,7 +582,9 @@ class _LayerCheck:
         instances: tuple[int, int, int],
         report: DrcReport,
     ) -> None:
-        """Polygons off the grid (step, x, y) in one of several alike instances (number, x and y of the first)."""
+        """Polygons off the grid (step, x, y) in one of several alike instances (number,
+        x and y of the first).
+        """
         step, *phase = grid
         times, x, y = instances
         limit = float(self.rules.grid_nm)
@@ -629,7 +643,9 @@ def _instance_violations(
 def _turned_box(
     box: tuple[int, int, int, int] | None, turn: Turn
 ) -> tuple[int, int, int, int]:
-    """Box around a box in some orientation."""
+    """Box around the box of a cell that draws, in some orientation."""
+    if box is None:
+        raise ValueError("a cell that draws nothing has no box")
     left, bottom, right, top = box
     corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     return contour_box([np.column_stack(turn.apply(*corners.T))])

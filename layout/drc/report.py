@@ -137,14 +137,14 @@ class DrcReport:
 
     @property
     def sizes(self) -> dict[str, float | None]:
-        """The smallest sizes measured in nm; None where there was nothing to measure."""
+        """The smallest sizes measured in nm; None where nothing was measured."""
         names = ("minimum_width_nm", "minimum_space_nm", "minimum_foot_space_nm")
         values = {name: getattr(self, name) for name in names}
         return {n: v if math.isfinite(v) else None for n, v in values.items()}
 
     @property
     def worst(self) -> list[dict[str, Any]]:
-        """Count and worst value of each rule, layer and cell, the most frequent first."""
+        """Count and worst value by rule, layer and cell, the most frequent first."""
         tallies = sorted(self.tallies.items(), key=lambda item: -item[1].count)
         return [
             {
@@ -201,7 +201,7 @@ class DrcReport:
         self.list_violations(rule, examples)
 
     def list_violations(self, rule: str, violations: Iterable[Violation]) -> None:
-        """List violations of a rule as far as the list takes them, and generate no more.
+        """List violations of a rule as far as there is room, and generate no more.
 
         Args:
             rule: one of ``RULES``.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.files import NOTHING, MaskContent, flat
+from layout.formats import NOTHING, MaskContent, flatten
 from layout.mask import Lattice, MaskPlan
 from layout.pec import (
     Discs,
@@ -147,8 +147,8 @@ def read_scene(
     skipped = {layers.aperture[0], layers.outline[0], layers.fields[0]}
     undosed: set[LayerNumber] = set()
 
-    def exposed(cell: str) -> Iterator[flat.Stack]:
-        for stack in flat.stacks(content, cell):
+    def exposed(cell: str) -> Iterator[flatten.Stack]:
+        for stack in flatten.stacks(content, cell):
             if stack.layer[0] not in skipped:
                 if stack.layer in doses:
                     yield stack
@@ -197,7 +197,7 @@ def read_scene(
     )
 
 
-def _one_outline(name: str, stacks: Sequence[flat.Stack]) -> list[Array]:
+def _one_outline(name: str, stacks: Sequence[flatten.Stack]) -> list[Array]:
     """Contours of what a class of pillars draws, in database units."""
     drawn = [
         outline + np.array(place)

@@ -21,7 +21,7 @@ def attach(
         names: public name to the module that defines it, below the package
             (``"stack"``) or absolute where it has
             a dot, with the name there after a colon where it is another
-            (``"layout.oasis.write:write"``); ``""`` for
+            (``"layout.formats.oasis_write:write"``); ``""`` for
             a module of the package that is itself public.
 
     >>> load, listed, public = attach("metalens.ground", {"units": "", "Console": "console"})

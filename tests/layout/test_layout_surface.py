@@ -10,8 +10,8 @@ import layout
 
 def test_public_names_are_functions_even_after_their_modules_are_loaded():
     import layout.drc.lattice
+    import layout.formats.oasis_write
     import layout.mask.build
-    import layout.oasis.write
 
     for name in (
         "plan",

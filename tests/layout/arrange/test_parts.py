@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from layout.arrange import At, apart, joined, parts
-from layout.files import QUARTERS, CellContent, MaskContent, Placed
+from layout.formats import QUARTERS, CellContent, MaskContent, Placed
 from layout.process.process import Exposure, Process, Rules
 from metalens.ground.errors import MaskFileError, ProcessError
 

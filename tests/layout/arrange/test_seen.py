@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from layout.arrange import At, joined, parts, seen
-from layout.files import CellContent, Placed, Sites
+from layout.formats import CellContent, Placed, Sites
 from layout.mask import Lattice
 from layout.process.process import Process
 

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 import layout
-from layout.arrange import readback
-from layout.files import QUARTERS, Assembly, CellContent, Copies, Sites
-from layout.gdsii import assemble as gdsii_assemble
+from layout.formats import (
+    QUARTERS,
+    Assembly,
+    CellContent,
+    Copies,
+    Sites,
+    compare,
+    gdsii_write,
+    oasis_write,
+)
 from layout.mask import Lattice
-from layout.oasis import assemble as oasis_assemble
 
 NAMES = (
     "THIN",
@@ -50,8 +56,8 @@ def assembly(block):
 @pytest.mark.parametrize(
     ("write", "read"),
     [
-        (gdsii_assemble.write, layout.read_gdsii),
-        (oasis_assemble.write, layout.read_oasis),
+        (gdsii_write.write, layout.read_gdsii),
+        (oasis_write.write, layout.read_oasis),
     ],
     ids=["gds", "oas"],
 )
@@ -63,7 +69,7 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     made = assembly(block)
     write(made, tmp_path / "m")
     content = read(tmp_path / "m", keep=keep)
-    assert readback.differences(made, content) == []
+    assert compare.differences(made, content) == []
     if keep is None:
         row, column = np.nonzero(block == 3)
         x, y = content.sites("LENS")["WIDER_ONE"]
@@ -77,10 +83,10 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     lost[np.unravel_index(np.flatnonzero(block == 3)[-1], block.shape)] = 0
     for other in (swapped, lost, np.roll(block, 1, axis=1)):
         assert not np.array_equal(other, block)
-        found = readback.differences(assembly(other), content)
-        assert any("cell LENS: copies of" in text for text in found), found
+        found = compare.differences(assembly(other), content)
+        assert any(text.startswith("cell LENS: ") for text in found), found
     moved = dataclasses.replace(
         made,
         copies={"TOP": (dataclasses.replace(made.copies["TOP"][0], turn=QUARTERS[4]),)},
     )
-    assert readback.differences(moved, content)
+    assert compare.differences(moved, content)

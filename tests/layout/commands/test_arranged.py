@@ -9,8 +9,7 @@ import pytest
 
 import layout
 from layout.commands import make
-from layout.files import QUARTERS, Assembly, CellContent, Copies, doses
-from layout.gdsii import assemble as gdsii_assemble
+from layout.formats import QUARTERS, Assembly, CellContent, Copies, doses, gdsii_write
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -51,7 +50,7 @@ def folder(tmp_path_factory):
     chip = CellContent("CHIP", {(20, 3): [np.array([[0, 0], [9, 0], [9, 11]])]})
     pads = Copies("PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900))
     made = Assembly("PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0)
-    gdsii_assemble.write(made, target / "pads.gds")
+    gdsii_write.write(made, target / "pads.gds")
     (target / "process.toml").write_text(
         "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
     )
@@ -210,7 +209,9 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
     assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
     told = capsys.readouterr().out
-    assert "  FAILED: PADS: design rules violated: 1 width" in told.splitlines()
+    assert (
+        "  FAILED: PADS: design rules violated: 1 width, 2 corner" in told.splitlines()
+    )
     assert "passes its own checks" not in told
     page = (tmp_path / "m" / "report.html").read_text()
     assert (

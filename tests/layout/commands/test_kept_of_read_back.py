@@ -10,7 +10,7 @@ import pytest
 
 import layout
 from layout.commands import make
-from layout.files import doses
+from layout.formats import doses
 from layout.process.process import Process
 from metalens.lens.record import DiameterMap
 

@@ -13,7 +13,7 @@ import pytest
 import layout
 from layout.commands import make, page
 from layout.drc import check_plan, write_lyp, write_lyrdb
-from layout.files import dxf
+from layout.formats import dxf
 from layout.pec.psf import point_exposure
 from layout.process.process import Exposure, Rules
 from layout.shapes import polygon
@@ -265,7 +265,8 @@ def test_an_existing_mask_stays_without_force_and_stale_files_go_with_it(
     assert run(lens_file, "-o", target, "--quiet") == 2
     assert (target / "mask.oas").read_bytes() == before
     assert (
-        run(lens_file, "-o", target, "--quiet", "--force", "--oasis", "--circles") == 0
+        run(lens_file, "-o", target, "--quiet", "--force", "--oasis", "--name", "B")
+        == 0
     )
     assert not (target / "mask.gds").exists()
     assert (target / "mask.oas").read_bytes() != before

@@ -6,11 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from layout.files import QUARTERS, Assembly, CellContent, Copies
-from layout.gdsii import assemble as gdsii_assemble
-from layout.gdsii import write as gdsii_write
-from layout.oasis import assemble as oasis_assemble
-from layout.oasis import write as oasis_write
+from layout.formats import (
+    QUARTERS,
+    Assembly,
+    CellContent,
+    Copies,
+    gdsii_write,
+    oasis_write,
+)
 from metalens.cli import BAD_INPUT, SUCCESS, main
 
 klayout = pytest.importorskip("klayout.db")
@@ -99,7 +102,7 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
         ),
     }
     cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
-    write = oasis_assemble.write if ending == "oas" else gdsii_assemble.write
+    write = oasis_write.write if ending == "oas" else gdsii_write.write
     write(Assembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
     assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
@@ -124,7 +127,7 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
         "ONE": (Copies("A", 0, 0), Copies("EMPTY", 0, 0, rows=9, up=(0, 5))),
         "TWO": (Copies("A", 3, 4),) * 3,
     }
-    gdsii_assemble.write(
+    gdsii_write.write(
         Assembly("L", {cell.name: cell for cell in cells}, copies), tmp_path / "w.gds"
     )
     assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS

@@ -12,8 +12,7 @@ import pytest
 
 from layout.commands import view
 from layout.drc import DrcReport, Violation, write_lyrdb
-from layout.gdsii import write as gdsii_write
-from layout.oasis import write as oasis_write
+from layout.formats import gdsii_write, oasis_write
 from layout.process.process import Rules
 from metalens import cli
 from metalens.ground.errors import MaskFileError

@@ -9,7 +9,7 @@ import pytest
 import layout
 from layout.commands.check import read
 from layout.drc import check_library, check_plan
-from layout.files import CellContent, MaskContent
+from layout.formats import CellContent, MaskContent
 from layout.mask import build
 from layout.process import process as processes
 from layout.process.process import Rules

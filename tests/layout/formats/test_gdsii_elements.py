@@ -7,7 +7,7 @@ import pytest
 
 import layout
 from layout.commands.check import read
-from layout.files import flat
+from layout.formats import flatten
 from metalens import cli
 
 SQUARE = [(0, 0), (500, 0), (500, 300), (0, 300), (0, 0)]
@@ -72,7 +72,7 @@ def reference(name, x, y, *transform):
 def region_of(db, file):
     own = db.Region()
     content = layout.read_gdsii(file)
-    for shape in (s for top in content.tops for s in flat.shapes(content, top)):
+    for shape in (s for top in content.tops for s in flatten.shapes(content, top)):
         for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True):
             corners = [db.Point(int(a) + x, int(b) + y) for a, b in shape.outline]
             own.insert(db.Polygon(corners))

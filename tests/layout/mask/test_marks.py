@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.files import handover
+from layout.formats import handover
 from layout.mask import fields
 from layout.mask.build import prepare
 from layout.process.process import Die, Exposure, Process, Rules

@@ -10,12 +10,8 @@ import numpy as np
 import pytest
 
 from layout.drc import check_plan
-from layout.files import verify
-from layout.gdsii import read as gdsii_read
-from layout.gdsii import write as gdsii_write
+from layout.formats import compare, gdsii_read, gdsii_write, oasis_read, oasis_write
 from layout.mask import build, shaped
-from layout.oasis import read as oasis_read
-from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import (
@@ -97,7 +93,7 @@ def written(made, folder, suffix):
     else:
         oasis_write.write(plan, path)
         content = oasis_read.read(path)
-    outcome = verify.compare(plan, content)
+    outcome = compare.compare(plan, content)
     assert outcome.ok, outcome.differences
     return plan, shapes(path)
 
@@ -608,17 +604,24 @@ def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
     found = check_plan(plan, PROCESS.rules)
     # of curves chords at an angle are no widths; edges that share a corner count for
     # neither
-    how = (
-        (db.Region.Projection, 10)
-        if shape.kind == "ring"
-        else (db.Region.Euclidian, 45)
-    )
-    for value, check in (
-        (found.minimum_width_nm, drawn.width_check),
-        (found.minimum_space_nm, drawn.space_check),
+    angle = 10 if shape.kind == "ring" else 45
+    facing = db.Region.Projection, angle
+
+    def keeps_width(limit):
+        return drawn.width_check(limit, False, *facing).is_empty()
+
+    def keeps_space(limit):
+        """Between pillars to their corners, within one as edges face each other."""
+        between = drawn.isolated_check(limit, False, db.Region.Euclidian, 90)
+        within = drawn.notch_check(limit, False, *facing)
+        return between.is_empty() and within.is_empty()
+
+    for value, is_kept in (
+        (found.minimum_width_nm, keeps_width),
+        (found.minimum_space_nm, keeps_space),
     ):
-        assert check(math.floor(value), False, *how).is_empty()
-        assert not check(math.floor(value) + 1, False, *how).is_empty()
+        assert is_kept(math.floor(value))
+        assert not is_kept(math.floor(value) + 1)
     outline = made.cell.outline(0.22)
     solid, space = (1e3 * v for v in outline.spans_um)
     assert found.minimum_width_nm == pytest.approx(
@@ -719,7 +722,7 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
     for tone in ("positive", "negative"):
         plan = build.plan(made, dataclasses.replace(PROCESS, tone=tone))
         gdsii_write.write(plan, tmp_path / f"{tone}.gds")
-        assert verify.compare(plan, gdsii_read.read(tmp_path / f"{tone}.gds")).ok
+        assert compare.compare(plan, gdsii_read.read(tmp_path / f"{tone}.gds")).ok
         found.append(exposed(tmp_path / f"{tone}.gds"))
     (stays, _, die), (drawn, area, _) = found
     assert (drawn & stays).is_empty()

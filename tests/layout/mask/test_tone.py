@@ -9,7 +9,7 @@ import pytest
 
 import layout
 from layout.drc import check_plan
-from layout.files import flat
+from layout.formats import flatten
 from layout.mask import tone
 from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
 from layout.process.process import Die, Exposure, Process, Rules
@@ -117,7 +117,7 @@ def test_every_point_of_the_lens_is_a_pillar_or_drawn_once(tmp_path):
     content = layout.read_gdsii(path)
     polygons = [
         shape.outline + np.array([x, y])
-        for shape in flat.shapes(content, "METALENS")
+        for shape in flatten.shapes(content, "METALENS")
         for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True)
     ]
     points = np.random.default_rng(0).uniform((-4598, -3798), (4598, 3798), (4000, 2))
@@ -155,7 +155,8 @@ def bare(figures=(), pitch=400, diameter=200):
 
 
 @pytest.mark.parametrize(
-    ("arm", "gap", "broken"), [(81, 71, {}), (20, 71, {"width"}), (81, 30, {"space"})]
+    ("arm", "gap", "broken"),
+    [(81, 71, {}), (20, 71, {"width"}), (81, 30, {"space", "notch"})],
 )
 def test_thin_marks_and_narrow_gaps_of_a_negative_mask_are_seen(arm, gap, broken):
     bars = [

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.files import doses
+from layout.formats import doses
 from layout.mask import build
 from layout.pec import psf
 from layout.process.process import Etch, Exposure, Process

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.files import doses
+from layout.formats import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
 from layout.verify import polygon_edges

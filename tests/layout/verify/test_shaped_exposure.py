@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.files import doses
+from layout.formats import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
 from layout.verify import LensRows, verify_exposure

@@ -1,0 +1,370 @@
+"""GDSII reader: every record is checked; what is wrong is named with its byte offset."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from layout.formats import gdsii_records as gds
+from layout.formats import paths
+from layout.formats.content import (
+    CONTEXT_CELL,
+    NOTHING,
+    QUARTERS,
+    CellContent,
+    Gathered,
+    MaskContent,
+    Placed,
+    Turn,
+    decode_name,
+    forget,
+    has_area,
+    mapped,
+)
+from layout.formats.digest import Sums
+from layout.formats.read_loops import FARTHEST, sref_run
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+# records that libraries may have before UNITS
+_HEADS = {0x00, 0x05, 0x1F, 0x20, 0x22, 0x23, 0x36, 0x37, 0x38, 0x39, 0x3A, 0x3B}
+_PATHS = (gds.PATH, gds.MBMSPATH)
+_SHAPES = {gds.BOUNDARY, gds.BOX, gds.TEXT, gds.NODE, gds.SREF, gds.AREF, *_PATHS}
+LIMIT = 2**29
+_AT_ONCE = 1 << 20  # copies of an array
+
+
+@dataclass(eq=False, slots=True)
+class _Batch:
+    """Placements of the structure that is being read."""
+
+    held: Gathered
+    names: dict[str, int] = field(default_factory=dict)
+    turns: dict[Turn, int] = field(
+        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
+    )
+
+    def add(self, child: Array, x: Array, y: Array, turn: Turn) -> None:
+        number = self.turns.setdefault(turn, len(self.turns))
+        turned = np.full(len(child), number, np.uint8 if number < 256 else np.int32)
+        self.held.add(
+            child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned
+        )
+
+    def number(self, name: str) -> int:
+        return self.names.setdefault(name, len(self.names))
+
+    def sums(self) -> Sums | None:
+        return (
+            None
+            if self.held.digest is None
+            else self.held.digest.of(np.arange(len(self.names)))
+        )
+
+    def placed(self) -> Placed:
+        if not self.held.count:
+            return NOTHING
+        names = tuple(self.names)
+        if self.held.digest is not None:
+            return dataclasses.replace(NOTHING, children=names)
+        return Placed(names, *self.held.columns(), tuple(self.turns))
+
+
+def read(
+    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+) -> MaskContent:
+    """Read a GDSII file.
+
+    Args:
+        limit: most placements, arrays of references taken apart, that are read.
+        keep: most placements of one structure that are kept; of more only the sums are
+            (:mod:`layout.formats.digest`),
+            in bounded memory. None: all are kept.
+
+    Raises:
+        MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte
+            offset.
+        OSError: the file cannot be opened.
+    """
+    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
+
+
+def parse(
+    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+) -> MaskContent:
+    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
+    in errors.
+    """
+    return _Reader(where, data, limit, keep).library()
+
+
+class _Reader:
+    """A cursor over the records."""
+
+    def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
+        self.path, self.data, self.at, self.limit, self.keep = (
+            path,
+            data,
+            0,
+            limit,
+            keep,
+        )
+        self.begin = 0  # of the latest record
+        self.placed = 0
+
+    def fail(self, text: str, at: int | None = None) -> MaskFileError:
+        return MaskFileError(
+            f"{self.path}: byte {self.begin if at is None else at}: {text}"
+        )
+
+    def next(self, *wanted: int) -> tuple[int, bytes]:
+        """Kind and data of the next record, which must be one of ``wanted`` (any, if
+        none is named).
+        """
+        self.begin, left = self.at, len(self.data) - self.at
+        if left < 4:
+            raise self.fail(
+                f"the file ends within a record ({left} bytes left); it is cut"
+            )
+        high, low, kind, data_type = (int(v) for v in self.data[self.at : self.at + 4])
+        length = high << 8 | low
+        if length < 4 or length % 2 or length > left:
+            raise self.fail(
+                f"record of {length} bytes, {left} left in the file; need an even length from 4 on"
+            )
+        if kind in gds.DATA and gds.DATA[kind] != data_type:
+            raise self.fail(
+                f"{gds.NAMES[kind]} with data type {data_type}, need {gds.DATA[kind]}"
+            )
+        if wanted and kind not in wanted:
+            needed = " or ".join(gds.NAMES[k] for k in wanted)
+            raise self.fail(
+                f"found {gds.NAMES.get(kind, f'record 0x{kind:02x}')}, need {needed}"
+            )
+        self.at += length
+        return kind, self.data[self.begin + 4 : self.at].tobytes()
+
+    def library(self) -> MaskContent:
+        self.next(gds.HEADER)
+        self.next(gds.BGNLIB)
+        while self.next()[0] != gds.LIBNAME:
+            if int(self.data[self.begin + 2]) not in _HEADS:
+                raise self.fail("LIBNAME is missing")
+        kind, data = self.next()
+        while kind in _HEADS and kind != gds.BGNSTR:
+            kind, data = self.next()
+        if kind != gds.UNITS or len(data) != 16:
+            raise self.fail("UNITS of two numbers is missing")
+        user, meters = gds.to_float(data[:8]), gds.to_float(data[8:])
+        if not (1e-15 < meters < 1 and user > 0):
+            raise self.fail(f"database unit of {meters} m")
+        cells: dict[str, CellContent] = {}
+        while self.next(gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
+            cell = self.structure()
+            if cell.name in cells:
+                raise self.fail(f"structure {cell.name!r} comes twice")
+            cells[cell.name] = cell
+        if self.data[self.at :].any():
+            raise self.fail("data after ENDLIB", self.at)
+        cells.pop(CONTEXT_CELL, None)
+        return MaskContent("GDSII", meters * 1e9, cells)
+
+    def name(self, data: bytes) -> str:
+        text = decode_name(data)
+        if not text:
+            raise self.fail("a structure or reference without a name")
+        return text
+
+    def structure(self) -> CellContent:
+        name = self.name(self.next(gds.STRNAME)[1])
+        batch, skipped = _Batch(Gathered(self.keep)), Counter[str]()
+        polygons: dict[tuple[int, int], list[Array]] = {}
+        while True:
+            self.references(batch)
+            kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
+            if kind == gds.ENDSTR:
+                texts = skipped.pop(gds.NAMES[gds.TEXT], 0)
+                return CellContent(
+                    name, polygons, {}, batch.placed(), texts, batch.sums(), skipped
+                )
+            if kind in (gds.SREF, gds.AREF):
+                self.reference(batch, kind)
+            elif kind in (gds.BOUNDARY, gds.BOX, *_PATHS):
+                layer, points = self.line() if kind in _PATHS else self.boundary(kind)
+                if has_area(points):
+                    polygons.setdefault(layer, []).append(points)
+                else:
+                    skipped[f"{gds.NAMES[kind]} without area"] += 1
+            elif kind != gds.STRCLASS:  # TEXT, NODE
+                skipped[gds.NAMES[kind]] += 1
+                while self.next()[0] != gds.ENDEL:
+                    self.refuse_outside_element()
+
+    def refuse_outside_element(self) -> None:
+        kind = int(self.data[self.begin + 2])
+        if kind in _SHAPES or kind in (gds.BGNSTR, gds.ENDSTR, gds.ENDLIB, gds.HEADER):
+            raise self.fail(f"{gds.NAMES[kind]} within an element; ENDEL is missing")
+
+    def references(self, batch: _Batch) -> None:
+        """Plain references in a row, by the compiled loop."""
+        while True:
+            names, child, x, y, end = sref_run(self.data, self.at)
+            if not len(child):
+                return
+            numbers = np.array([batch.number(self.name(n)) for n in names], np.int32)
+            batch.add(numbers[child], x, y, QUARTERS[0])
+            self.at = end
+            forget(self.data, end)
+            self.count(len(child))
+
+    def count(self, more: int) -> None:
+        self.placed += more
+        if self.placed > self.limit:
+            raise self.fail(
+                f"{self.placed:,} placements up to here, at most {self.limit:,} are read (metalens check --max-shapes "
+                "sets another limit)"
+            )
+
+    def fields(self) -> dict[int, bytes]:
+        """{kind: data} up to ENDEL."""
+        found: dict[int, bytes] = {}
+        while True:
+            kind, data = self.next()
+            if kind == gds.ENDEL:
+                return found
+            self.refuse_outside_element()
+            if kind == gds.XY:  # writers split long outlines over several records
+                found[kind] = found.get(kind, b"") + data
+                continue
+            if kind in found and kind not in (gds.PROPATTR, gds.PROPVALUE):
+                raise self.fail(
+                    f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice"
+                )
+            found[kind] = data
+
+    def numbers(self, found: dict[int, bytes], kind: int, count: int | None) -> Array:
+        """Integers of a record that an element needs."""
+        size = 4 if kind == gds.XY else 2
+        data = found.get(kind)
+        if (
+            data is None
+            or len(data) % size
+            or (count is not None and len(data) != count * size)
+        ):
+            raise self.fail(f"element with a wrong or missing {gds.NAMES[kind]}")
+        return np.frombuffer(data, f">i{size}").astype(np.int64)
+
+    def boundary(self, kind: int) -> tuple[tuple[int, int], Array]:
+        """Layer and corners of an outline, closed where the file leaves it open."""
+        found = self.fields()
+        layer = int(self.numbers(found, gds.LAYER, 1)[0])
+        datatype = int(
+            self.numbers(
+                found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
+            )[0]
+        )
+        points = self.points(found)
+        closed = len(points) > 1 and (points[0] == points[-1]).all()
+        return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1] if closed else points
+
+    def points(self, found: dict[int, bytes]) -> Array:
+        """(n, 2) points of an element, n >= 1."""
+        numbers = self.numbers(found, gds.XY, None)
+        if len(numbers) % 2 or not len(numbers):
+            raise self.fail(f"element with {len(numbers)} coordinates, need pairs")
+        return numbers.reshape(-1, 2)
+
+    def reference(self, batch: _Batch, kind: int) -> None:
+        start = self.begin
+        found = self.fields()
+        number = batch.number(self.name(found.get(gds.SNAME, b"")))
+        turn = self.turn(found, start)
+        xy = self.numbers(found, gds.XY, 2 if kind == gds.SREF else 6)
+        if kind == gds.SREF:
+            batch.add(np.full(1, number), xy[:1], xy[1:], turn)
+            return
+        for x, y in self.array(found, xy, start):
+            batch.add(np.full(len(x), number, np.int32), x, y, turn)
+
+    def array(
+        self, found: dict[int, bytes], xy: Array, start: int
+    ) -> Iterator[tuple[Array, Array]]:
+        """Places of an array of references, some rows at a time, so that no memory is
+        taken before it is counted.
+
+        Steps are parts of its ends: where they are no whole units, each copy stands on
+        the unit next to its place.
+        """
+        columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
+        if columns < 1 or rows < 1:
+            raise self.fail(f"array of {columns} x {rows}", start)
+        self.count(columns * rows)
+        across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
+        ends = [
+            xy[:2] + across * i + along * j
+            for i in (0, 1 - 1 / columns)
+            for j in (0, 1 - 1 / rows)
+        ]
+        if np.abs(ends).max() > FARTHEST:
+            raise self.fail("array that reaches beyond 32 bits", start)
+        i = np.arange(columns)
+        for part in np.array_split(np.arange(rows), -(-columns * rows // _AT_ONCE)):
+            off = (
+                part[:, None] * along[k] / rows + i * across[k] / columns
+                for k in (0, 1)
+            )
+            x, y = (
+                xy[k] + np.floor(v + 0.5).astype(np.int64).ravel()
+                for k, v in enumerate(off)
+            )
+            yield x, y
+
+    def turn(self, found: dict[int, bytes], start: int) -> Turn:
+        flags = found.get(gds.STRANS, b"\0\0")
+        angle, size = (
+            gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d
+            for k, d in _DEFAULTS
+        )
+        if len(flags) != 2 or not 0 < size < 1e9:
+            raise self.fail(
+                f"reference scaled by {size}, or with broken STRANS; need a scale above 0",
+                start,
+            )
+        # absolute angle and size (bits 13, 14) are ignored, as other readers do
+        return Turn(angle % 360, bool(flags[0] & 128), size)
+
+    def line(self) -> tuple[tuple[int, int], Array]:
+        """Layer and outline of a path; a negative width does not scale with references,
+        which is ignored as other readers do.
+        """
+        found = self.fields()
+        layer, datatype = (
+            int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE)
+        )
+        points = self.points(found)
+        width, begin, end = (
+            self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
+        )
+        ends = (
+            int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
+        )
+        half = abs(width) / 2
+        if not half:
+            return (layer & 0xFFFF, datatype & 0xFFFF), points[:1]
+        extensions = {1: (half, half), 2: (half, half), 4: (float(begin), float(end))}
+        first, last = extensions.get(ends, (0.0, 0.0))
+        outline = paths.outline(points, half, begin=first, end=last, rounded=ends == 1)
+        return (layer & 0xFFFF, datatype & 0xFFFF), outline
+
+    def whole(self, found: dict[int, bytes], kind: int) -> int:
+        """A 32-bit number that an element may have; 0 without."""
+        data = found.get(kind, bytes(4))
+        if len(data) != 4:
+            raise self.fail(f"element with a wrong {gds.NAMES[kind]}")
+        return int.from_bytes(data, "big", signed=True)
+
+
+_DEFAULTS = ((gds.ANGLE, 0.0), (gds.MAG, 1.0))

@@ -1,0 +1,258 @@
+"""GDSII writer: references of pillars in blocks of rows, arrays of copies as AREF.
+
+Bytes are the same for the same mask: the time stamps are fixed. Memory is one block,
+whatever the lens.
+"""
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from layout.formats import flatten
+from layout.formats import gdsii_records as gds
+from layout.formats.assembly import Assembly, Copies, Sites, library_of
+from layout.formats.content import QUARTERS, CellContent, Placed, Turn
+from layout.mask import Lattice, MaskPlan
+from layout.process import LayerNumber, compiled
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ProcessError
+
+# bytes of references filled before they are written: within the processor's cache
+_BLOCK = 1 << 19
+_FLUSHED = 16  # pieces after which the disk is given what was written
+_AT_ONCE = 1 << 18  # references
+REFERENCE_BYTES = 28  # of each pillar: a reference to a cell of a four-letter name
+MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
+
+
+def write(mask: MaskPlan | Assembly, path: str | Path) -> None:
+    """Write a mask as GDSII; the file appears whole or not at all.
+
+    Args:
+        mask: plan of a die, or cells; true circles become polygons of 64 corners.
+        path: of the file.
+
+    Raises:
+        ProcessError: a layer number beyond 32 767, a polygon beyond 8190 points, an
+            array of more than 32 767 columns or beyond 32 bits.
+        OSError: the target cannot be written; what was there before stays.
+    """
+    library = library_of(mask) if isinstance(mask, MaskPlan) else mask
+    with store.replacing(path) as part, open(part, "wb", buffering=0) as file:
+        _write_concurrently(file, _pieces(library))
+
+
+def _write_concurrently(file: BinaryIO, pieces: Iterator[bytes | memoryview]) -> None:
+    """Write each piece while the next is filled, and flush meanwhile.
+
+    Args:
+        file: unbuffered.
+        pieces: each unchanged until the next but one is requested.
+    """
+    with (
+        ThreadPoolExecutor(1, thread_name_prefix="mask") as pool,
+        ThreadPoolExecutor(1, thread_name_prefix="disk") as disk,
+    ):
+        busy: Future[None] | None = None
+        flush: Future[None] | None = None
+        for count, piece in enumerate(pieces, 1):
+            if busy is not None:
+                busy.result()
+            busy = pool.submit(_write_all, file, piece)
+            if count % _FLUSHED == 0 and (flush is None or flush.done()):
+                flush = disk.submit(os.fsync, file.fileno())
+        for job in (busy, flush):
+            if job is not None:
+                job.result()
+
+
+def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
+    """Raw files may take less than they are given."""
+    view = memoryview(piece)
+    while len(view):
+        view = view[file.write(view) :]
+
+
+def _pieces(library: Assembly) -> Iterator[bytes | memoryview]:
+    yield gds.library(library.name, library.unit_nm)
+    for name, cell in library.cells.items():
+        head = gds.shorts(gds.BGNSTR, *gds.TIMES) + gds.text(gds.STRNAME, name)
+        shapes = [boundary(layer, polygon) for layer, polygon in _polygons(cell)]
+        copies = [_copies(one) for one in library.copies.get(name, ())]
+        yield b"".join([head, *shapes, *copies])
+        yield from _placements(cell.kept())
+        if name in library.sites:
+            yield from _pillars(library.sites[name])
+        yield gds.record(gds.ENDSTR)
+    yield gds.record(gds.ENDLIB)
+
+
+def _polygons(cell: CellContent) -> Iterator[tuple[LayerNumber, Array]]:
+    for layer, polygons in cell.polygons.items():
+        yield from ((layer, points) for points in polygons)
+    for layer, circles in cell.circles.items():
+        yield from ((layer, flatten.circle(*circle)) for circle in circles)
+
+
+def boundary(layer: LayerNumber, polygon: Array) -> bytes:
+    """A polygon.
+
+    Raises:
+        ProcessError: a layer number or a polygon that the format cannot hold.
+    """
+    if len(polygon) + 1 > gds.MOST_POINTS:
+        raise ProcessError(
+            f"polygon of {len(polygon)} vertices on layer {layer}: GDSII holds "
+            f"{gds.MOST_POINTS - 1}; split it"
+        )
+    if max(layer) > MAX_NUMBER:
+        raise ProcessError(
+            f"layer {layer[0]}/{layer[1]}: GDSII holds numbers to {MAX_NUMBER}; change "
+            "the layer map"
+        )
+    head = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, layer[0])
+    closed = np.concatenate([polygon, polygon[:1]])
+    return (
+        head
+        + gds.shorts(gds.DATATYPE, layer[1])
+        + gds.points(closed)
+        + gds.record(gds.ENDEL)
+    )
+
+
+def _head(name: str, turn: Turn = QUARTERS[0], *, array: bool = False) -> bytes:
+    """A reference up to its places."""
+    head = gds.record(gds.AREF if array else gds.SREF) + gds.text(gds.SNAME, name)
+    if turn == QUARTERS[0]:
+        return head
+    head += gds.record(gds.STRANS, bytes([128 if turn.mirrored else 0, 0]))
+    if turn.scale != 1:
+        head += gds.record(gds.MAG, gds.real(turn.scale))
+    if turn.angle_deg:
+        head += gds.record(gds.ANGLE, gds.real(turn.angle_deg))
+    return head
+
+
+def _copies(one: Copies) -> bytes:
+    """A reference, or an array of them."""
+    if one.count == 1:
+        place = gds.points(np.array([[one.x, one.y]]))
+        return _head(one.child, one.turn) + place + gds.record(gds.ENDEL)
+    if max(one.columns, one.rows) > MAX_NUMBER:
+        raise ProcessError(
+            f"an array of {one.columns} x {one.rows} copies of {one.child}: GDSII holds "
+            f"{MAX_NUMBER} each way; write OASIS"
+        )
+    ends = np.array([(0, 0), (one.columns, 0), (0, one.rows)])
+    corners = ends @ np.array([one.across, one.up]) + (one.x, one.y)
+    if np.abs(corners).max() > 2**31 - 1:
+        raise ProcessError(
+            f"an array of {one.child} reaches beyond 32 bits; GDSII cannot hold it, "
+            "write OASIS"
+        )
+    return (
+        _head(one.child, one.turn, array=True)
+        + gds.shorts(gds.COLROW, one.columns, one.rows)
+        + gds.points(corners)
+        + gds.record(gds.ENDEL)
+    )
+
+
+def _placements(placed: Placed) -> Iterator[bytes]:
+    """All placements, those of one cell and orientation together."""
+    key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
+    order = np.argsort(key, kind="stable")
+    kinds, starts = np.unique(key[order], return_index=True)
+    groups = np.split(order, starts[1:]) if len(kinds) else []
+    tail = np.frombuffer(gds.record(gds.ENDEL), np.uint8)
+    for kind, members in zip(kinds.tolist(), groups, strict=True):
+        child, turn = divmod(kind, len(placed.turns))
+        start = _head(placed.children[child], placed.turns[turn])
+        head = np.frombuffer(start + gds.points(np.zeros((1, 2))), np.uint8)
+        for some in np.array_split(members, math.ceil(len(members) / _AT_ONCE)):
+            block = np.empty((len(some), len(head) + len(tail)), np.uint8)
+            block[:, : len(head)], block[:, len(head) :] = head, tail
+            xy = np.column_stack([placed.x[some], placed.y[some]]).astype(">i4")
+            block[:, len(head) - 8 : len(head)] = xy.view(np.uint8).reshape(-1, 8)
+            yield block.tobytes()
+
+
+def _pillars(some: Sites) -> Iterator[memoryview]:
+    """References of a lattice, cells with equally long names together."""
+    for length in sorted({len(child.encode()) for child in some.children if child}):
+        children = [child for child in some.children if len(child.encode()) == length]
+        numbers = {child: n for n, child in enumerate(children)}
+        yield from _references(children, some.numbered(numbers))
+
+
+def _references(children: Sequence[str], lattice: Lattice) -> Iterator[memoryview]:
+    """References of a lattice to cells, in two buffers filled in turn."""
+    made = [
+        _head(name) + gds.points(np.zeros((1, 2))) + gds.record(gds.ENDEL)
+        for name in children
+    ]
+    dtype = np.dtype(np.uint16 if len(made[0]) % 4 else np.uint32)
+    templates = np.frombuffer(b"".join(made), dtype).reshape(len(made), -1)
+    size = templates.shape[1]
+    buffers = np.empty((2, _BLOCK // (size * dtype.itemsize), size), dtype)
+    turn = 0
+    xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), dtype)
+    for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
+        rows = np.arange(first, first + len(block))
+        ys = _words(lattice.y0 - lattice.down * rows, dtype)
+        row, column = 0, 0
+        while row < len(block):
+            row, column, used = _fill(
+                buffers[turn], block, row, column, templates, xs, ys
+            )
+            if used:
+                yield buffers[turn, :used].data.cast("B")
+                turn = 1 - turn  # the last one is still being written
+
+
+def _words(values: Array, dtype: np.dtype[Any]) -> Array:
+    """(n, words) big-endian 32-bit numbers as they lie in the file."""
+    return (
+        np.ascontiguousarray(values.astype(">i4")).view(dtype).reshape(len(values), -1)
+    )
+
+
+@compiled
+def _fill(
+    buffer: Array,
+    block: Array,
+    row: int,
+    column: int,
+    templates: Array,
+    xs: Array,
+    ys: Array,
+) -> tuple[int, int, int]:
+    """References of the sites from (row, column) on, until the buffer is full; (next
+    row, column, references).
+    """
+    size, wide = templates.shape[1], xs.shape[1]
+    head, used = size - 3 * wide, 0
+    while row < block.shape[0]:
+        while column < block.shape[1]:
+            kind = block[row, column]
+            if kind:
+                if used == buffer.shape[0]:
+                    return row, column, used
+                for i in range(head):
+                    buffer[used, i] = templates[kind - 1, i]
+                for i in range(wide):
+                    buffer[used, head + i] = xs[column, i]
+                    buffer[used, head + wide + i] = ys[row, i]
+                    buffer[used, head + 2 * wide + i] = templates[
+                        kind - 1, head + 2 * wide + i
+                    ]
+                used += 1
+            column += 1
+        row, column = row + 1, 0
+    return row, column, used

@@ -1,0 +1,446 @@
+"""What stands in the cells of an OASIS file: placements, rectangles, polygons, circles,
+texts, with modal values.
+"""
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from layout.formats import oasis_records as oasis
+from layout.formats import oasis_trapezoids as trapezoids
+from layout.formats import paths
+from layout.formats.content import (
+    NOTHING,
+    QUARTERS,
+    CellContent,
+    Gathered,
+    Placed,
+    Turn,
+    has_area,
+)
+from layout.formats.oasis_cursor import Cursor, Repetition
+from layout.formats.read_loops import placements
+from metalens.ground.arrays import Array
+
+Child = int | str  # reference number, or name
+Value = TypeVar("Value")
+_BATCH = 1 << 18
+_DRAWN = 8  # placements that take as much memory as a polygon without its corners
+
+
+@dataclass(slots=True)
+class Budget:
+    """Placements and copies of a whole file: at most ``limit``, ``used`` so far."""
+
+    limit: int
+    used: int = 0
+
+    @property
+    def left(self) -> int:
+        """How many more may come."""
+        return self.limit - self.used
+
+
+@dataclass(eq=False, slots=True)
+class Modal:
+    """Values that a record may leave out because an earlier one gave them; forgotten at
+    each cell.
+    """
+
+    relative: bool = False
+    placement_x: int = 0
+    placement_y: int = 0
+    child: Child | None = None
+    x: int = 0
+    y: int = 0
+    text_x: int = 0
+    text_y: int = 0
+    layer: int | None = None
+    datatype: int | None = None
+    width: int | None = None
+    height: int | None = None
+    radius: int | None = None
+    points: Array | None = None
+    half_width: int | None = None
+    path_points: Array | None = None
+    path_begin: int | None = None
+    path_end: int | None = None
+    kind: int | None = None
+    repetition: Repetition | None = None
+
+
+@dataclass(eq=False, slots=True)
+class OpenCell:
+    """A cell while it is read. names: of children that are placed by name, numbered
+    from -2 down.
+    """
+
+    key: Child
+    polygons: dict[tuple[int, int], list[Array]] = field(default_factory=dict)
+    circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(
+        default_factory=dict
+    )
+    held: Gathered = field(default_factory=Gathered)
+    names: dict[str, int] = field(default_factory=dict)
+    turns: dict[Turn, int] = field(
+        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
+    )
+    texts: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def close(self, name: str, table: dict[int, str]) -> CellContent:
+        """The finished cell; KeyError names a reference number without a name."""
+        digest = self.held.digest
+        sums = None if digest is None else digest.of(digest.children)
+        return CellContent(
+            name,
+            self.polygons,
+            self.circles,
+            self._placed(table),
+            self.texts,
+            sums,
+            self.skipped,
+        )
+
+    def _placed(self, table: dict[int, str]) -> Placed:
+        if not self.held.count:
+            return NOTHING
+        own = {number: name for name, number in self.names.items()}
+        if self.held.digest is not None:
+            every = self.held.digest.children.tolist()
+            return dataclasses.replace(
+                NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every)
+            )
+        child, x, y, turn = self.held.columns()
+        used, index = _numbered(child)
+        names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
+        return Placed(names, index, x, y, turn, tuple(self.turns))
+
+
+def _numbered(child: Array) -> tuple[Array, Array]:
+    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it
+    is changed in place.
+    """
+    low, high = int(child.min()), int(child.max())
+    if high - low >= 1 << 22:
+        used, index = np.unique(child, return_inverse=True)
+        return used, index.astype(np.int32)
+    occurs = np.zeros(high - low + 1, bool)
+    pieces = [
+        child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
+    ]  # numpy widens what it indexes by
+    for some in pieces:
+        some -= low
+        occurs[some] = True
+    lookup = np.cumsum(occurs, dtype=np.int32) - 1
+    for some in pieces:
+        some[:] = lookup[some]
+    return np.flatnonzero(occurs) + low, child
+
+
+class CellReader:
+    """Reads the records of one cell."""
+
+    def __init__(self, cell: OpenCell, budget: Budget) -> None:
+        self.cell, self.budget, self.modal = cell, budget, Modal()
+
+    def record(self, c: Cursor, kind: int) -> bool:
+        """Read the record of this kind that stands at the cursor; False where cells
+        hold no such record.
+        """
+        if kind in (oasis.XYABSOLUTE, oasis.XYRELATIVE):
+            self.modal.relative = kind == oasis.XYRELATIVE
+        elif kind in (oasis.PLACEMENT, oasis.PLACEMENT_ANY):
+            self._placement(c, kind)
+        elif kind == oasis.TEXT:
+            self._text(c)
+        elif kind == oasis.RECTANGLE:
+            self._rectangle(c)
+        elif kind == oasis.POLYGON:
+            self._polygon(c)
+        elif kind == oasis.CIRCLE:
+            self._circle(c)
+        elif kind == oasis.PATH:
+            self._path(c)
+        elif kind in (oasis.TRAPEZOID, oasis.TRAPEZOID_A, oasis.TRAPEZOID_B):
+            self._trapezoid(c, kind)
+        elif kind == oasis.CTRAPEZOID:
+            self._compact(c)
+        elif kind == oasis.XELEMENT:
+            c.unsigned()
+            c.string()
+            self.cell.skipped["XELEMENT"] += 1
+        elif kind == oasis.XGEOMETRY:
+            self._extension(c)
+        else:
+            return False
+        return True
+
+    def plain_placements(self, c: Cursor) -> None:
+        """Placements in a row, by the compiled loop; stops before anything that it does
+        not know.
+        """
+        m = self.modal
+        state = np.array(
+            [
+                m.placement_x,
+                m.placement_y,
+                m.relative,
+                m.child if isinstance(m.child, int) else -1,
+            ]
+        )
+        while True:
+            size = min(_BATCH, c.left // 2 + 1)
+            out = np.empty((4, size), np.int32)
+            at, count = placements(c.data, c.at, c.end, state, out)
+            moved, c.at = at > c.at, int(at)
+            if count:
+                child, x, y, turn = (row.copy() for row in out[:, :count])
+                self._add(c, child, x, y, turn.astype(np.uint8))
+                m.placement_x, m.placement_y, m.child = (
+                    int(state[0]),
+                    int(state[1]),
+                    int(state[3]),
+                )
+            m.relative = bool(state[2])
+            if not moved:
+                return
+
+    def _add(self, c: Cursor, child: Array, x: Array, y: Array, turn: Array) -> None:
+        self._count(c, len(child))
+        self.cell.held.add(child, x, y, turn)
+
+    def _count(self, c: Cursor, more: int) -> None:
+        self.budget.used += more
+        if self.budget.used > self.budget.limit:
+            raise c.fail(
+                f"{self.budget.used:,} placements and copies up to here (a drawn copy counts as {_DRAWN} and its "
+                f"corners), at most {self.budget.limit:,} are read (metalens check --max-shapes sets another limit)"
+            )
+
+    def _need(self, c: Cursor, value: Value | None, what: str) -> Value:
+        if value is None:
+            raise c.fail(f"record without {what}, and none before it in this cell")
+        return value
+
+    def _position(
+        self, c: Cursor, info: int, bits: tuple[int, int], now: tuple[int, int]
+    ) -> tuple[int, int]:
+        place = []
+        for bit, old in zip(bits, now, strict=True):
+            new = c.coordinate() if info & bit else None
+            relative = self.modal.relative
+            place.append(
+                old if new is None else c.within(old + new) if relative else new
+            )
+        return place[0], place[1]
+
+    def _repeated(
+        self, c: Cursor, info: int, bit: int, x: int, y: int
+    ) -> tuple[Array, Array]:
+        if not info & bit:
+            return np.array([x]), np.array([y])
+        self.modal.repetition = c.repetition(self.modal.repetition, self.budget.left)
+        moved = self.modal.repetition
+        for offsets, start in ((moved.x, x), (moved.y, y)):
+            c.within(int(offsets.max()) + start)
+            c.within(int(offsets.min()) + start)
+        return moved.x + moved.x.dtype.type(x), moved.y + moved.y.dtype.type(y)
+
+    def _placement(self, c: Cursor, kind: int) -> None:
+        info, m = c.byte(), self.modal
+        if info & 0x80:
+            m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
+        child = m.child
+        if child is None:
+            raise c.fail("placement without a cell, and none before it in this cell")
+        turn = info >> 1 & 3 | (info & 1) << 2
+        if kind == oasis.PLACEMENT_ANY:
+            size = c.real() if info & 4 else 1.0
+            angle = c.real() if info & 2 else 0.0
+            if not 0 < size < 1e9 or not abs(angle) < 1e9:
+                raise c.fail(
+                    f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0"
+                )
+            turn = self.cell.turns.setdefault(
+                Turn(angle % 360, bool(info & 1), size), len(self.cell.turns)
+            )
+        m.placement_x, m.placement_y = self._position(
+            c, info, (0x20, 0x10), (m.placement_x, m.placement_y)
+        )
+        x, y = self._repeated(c, info, 8, m.placement_x, m.placement_y)
+        number = (
+            self.cell.names.setdefault(child, -2 - len(self.cell.names))
+            if isinstance(child, str)
+            else child
+        )
+        small = (
+            np.full(len(x), number, np.int32),
+            x.astype(np.int32),
+            y.astype(np.int32),
+        )
+        self._add(
+            c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32)
+        )
+
+    def _layer(self, c: Cursor, info: int) -> None:
+        if info & 1:
+            self.modal.layer = c.unsigned()
+        if info & 2:
+            self.modal.datatype = c.unsigned()
+
+    def _place(
+        self, c: Cursor, info: int, corners: int
+    ) -> tuple[tuple[int, int], Array, Array]:
+        """Layer and positions of a shape, from the end of its record."""
+        m = self.modal
+        m.x, m.y = self._position(c, info, (0x10, 8), (m.x, m.y))
+        x, y = self._repeated(c, info, 4, m.x, m.y)
+        self._count(c, len(x) * (_DRAWN + corners))
+        return (
+            (self._need(c, m.layer, "layer"), self._need(c, m.datatype, "datatype")),
+            x,
+            y,
+        )
+
+    def _polygons(self, c: Cursor, info: int, points: Array, what: str) -> None:
+        """Copies of a polygon; ``what`` names its kind where it draws nothing."""
+        layer, x, y = self._place(c, info, len(points))
+        if not has_area(points):
+            self.cell.skipped[f"{what} without area"] += len(x)
+            return
+        c.within(int(np.abs(points).max()) + max(abs(self.modal.x), abs(self.modal.y)))
+        shapes = self.cell.polygons.setdefault(layer, [])
+        shapes.extend(
+            points + np.array(place)
+            for place in zip(x.tolist(), y.tolist(), strict=True)
+        )
+
+    def _rectangle(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x40:
+            m.width = c.within(c.unsigned())
+        if info & 0x80:  # a square has no height of its own
+            m.height = m.width
+        elif info & 0x20:
+            m.height = c.within(c.unsigned())
+        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
+
+    def _polygon(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x20:
+            m.points = c.points()
+        self._polygons(c, info, self._need(c, m.points, "point list"), "POLYGON")
+
+    def _path(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x40:
+            m.half_width = c.within(c.unsigned())
+        if info & 0x80:
+            scheme = c.unsigned()
+            m.path_begin = self._extent(c, scheme >> 2 & 3, m.path_begin)
+            m.path_end = self._extent(c, scheme & 3, m.path_end)
+        if info & 0x20:
+            m.path_points = c.points(closed=False)
+        points, half = (
+            self._need(c, m.path_points, "point list"),
+            self._need(c, m.half_width, "width"),
+        )
+        begin = self._need(c, m.path_begin, "extension at its start")
+        end = self._need(c, m.path_end, "extension at its end")
+        outline = paths.outline(points, half, begin=begin, end=end)
+        self._polygons(c, info, outline if half else points[:1], "PATH")
+
+    def _extent(self, c: Cursor, form: int, last: int | None) -> int | None:
+        """Extension of a path: as before (0), none, its half width, or stated (3)."""
+        if form < 2:
+            return 0 if form else last
+        if form == 2:
+            return self._need(c, self.modal.half_width, "width")
+        return c.coordinate()
+
+    def _trapezoid(self, c: Cursor, kind: int) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        self._size(c, info)
+        a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
+        b = c.coordinate() if kind != oasis.TRAPEZOID_A else 0
+        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        if max(abs(a), abs(b), abs(a - b)) > (h if info & 0x80 else w):
+            raise c.fail(
+                f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross"
+            )
+        self._polygons(
+            c,
+            info,
+            trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80)),
+            "TRAPEZOID",
+        )
+
+    def _size(self, c: Cursor, info: int) -> None:
+        if info & 0x40:
+            self.modal.width = c.within(c.unsigned())
+        if info & 0x20:
+            self.modal.height = c.within(c.unsigned())
+
+    def _compact(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x80:
+            m.kind = c.unsigned()
+        self._size(c, info)
+        kind = self._need(c, m.kind, "type")
+        if kind >= trapezoids.KINDS:
+            raise c.fail(
+                f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}"
+            )
+        wide, high = trapezoids.needs(kind)
+        w = self._need(c, m.width, "width") if wide else 0
+        h = self._need(c, m.height, "height") if high else 0
+        size = trapezoids.dependent_size(kind, w, h)
+        m.width, m.height = size
+        self._polygons(c, info, trapezoids.compact(kind, w, h), "CTRAPEZOID")
+
+    def _circle(self, c: Cursor) -> None:
+        info, m = c.byte(), self.modal
+        self._layer(c, info)
+        if info & 0x20:
+            m.radius = c.within(c.unsigned())
+        radius = self._need(c, m.radius, "radius")
+        layer, x, y = self._place(c, info, 1)
+        if not radius:
+            self.cell.skipped["CIRCLE without area"] += len(x)
+            return
+        shapes = self.cell.circles.setdefault(layer, [])
+        shapes.extend(
+            (px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True)
+        )
+
+    def _extension(self, c: Cursor) -> None:
+        """XGEOMETRY, geometry of an extension of the format, is counted, no more."""
+        info = c.byte()
+        c.unsigned()
+        self._layer(c, info)
+        c.string()
+        _, x, _ = self._place(c, info, 1)
+        self.cell.skipped["XGEOMETRY"] += len(x)
+
+    def _text(self, c: Cursor) -> None:
+        """Texts are counted, no more."""
+        info, m = c.byte(), self.modal
+        if info & 0x40:
+            _ = c.unsigned() if info & 0x20 else c.string()
+        for bit in (1, 2):
+            if info & bit:
+                c.unsigned()
+        m.text_x, m.text_y = self._position(c, info, (0x10, 8), (m.text_x, m.text_y))
+        x, _ = self._repeated(c, info, 4, m.text_x, m.text_y)
+        self._count(c, len(x))
+        self.cell.texts += len(x)

@@ -1,0 +1,252 @@
+"""Reading the elements of OASIS: integers, reals, strings, point lists, repetitions.
+Errors name the byte offset.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.formats.content import decode_name
+from layout.formats.read_loops import FARTHEST, deltas
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+MOST_BYTES = 9  # of one integer
+MOST_COPIES = 1 << 24  # of one regular repetition, which take memory at once
+DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Repetition:
+    """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32
+    bits.
+    """
+
+    x: Array
+    y: Array
+
+
+class Cursor:
+    """A position in the bytes of a file, or in those of one decompressed block of it."""
+
+    def __init__(
+        self,
+        path: str,
+        data: Array,
+        *,
+        at: int = 0,
+        end: int | None = None,
+        block: int = -1,
+    ) -> None:
+        self.path, self.data, self.at, self.block = path, data, at, block
+        self.end = len(data) if end is None else end
+        self.begin = at  # of the latest record
+
+    def fail(self, text: str) -> MaskFileError:
+        """An error that says where: the byte in the file, or in a compressed block that
+        starts there.
+        """
+        where = (
+            f"byte {self.begin}"
+            if self.block < 0
+            else f"byte {self.block} (compressed block, its byte {self.begin})"
+        )
+        return MaskFileError(f"{self.path}: {where}: {text}")
+
+    @property
+    def left(self) -> int:
+        """Bytes not yet read."""
+        return self.end - self.at
+
+    def byte(self) -> int:
+        """The next byte."""
+        if self.at >= self.end:
+            raise self.fail("the file ends within a record; it is cut")
+        self.at += 1
+        return int(self.data[self.at - 1])
+
+    def take(self, count: int) -> bytes:
+        """The next ``count`` bytes."""
+        if count > self.left:
+            raise self.fail(
+                f"{count} bytes are announced, {self.left} are left; the file is cut or broken"
+            )
+        self.at += count
+        return self.data[self.at - count : self.at].tobytes()
+
+    def unsigned(self) -> int:
+        """A variable-length integer, below 2^63; some writers fill up space with zeros
+        at its end.
+        """
+        value = shift = 0
+        while True:
+            byte = self.byte()
+            if byte & 127 and shift >= 7 * MOST_BYTES:
+                raise self.fail(f"an integer of more than {MOST_BYTES} bytes")
+            value |= (byte & 127) << min(shift, 7 * MOST_BYTES)
+            if byte < 128:
+                return value
+            shift += 7
+
+    def signed(self) -> int:
+        """An integer with its sign in the lowest bit."""
+        value = self.unsigned()
+        return -(value >> 1) if value & 1 else value >> 1
+
+    def coordinate(self) -> int:
+        """A signed integer that must fit 32 bits."""
+        return self.within(self.signed())
+
+    def within(self, value: int) -> int:
+        """``value``, refused beyond 32 bits."""
+        if abs(value) > FARTHEST:
+            raise self.fail(f"coordinate {value} is beyond 32 bits")
+        return value
+
+    def real(self) -> float:
+        """One of the eight forms of a real number."""
+        form = self.unsigned()
+        if form in (0, 1):
+            return float(-self.unsigned() if form else self.unsigned())
+        if form in (2, 3, 4, 5):
+            upper = self.unsigned() if form >= 4 else 1
+            lower = self.unsigned()
+            if lower == 0:
+                raise self.fail("a real number with denominator 0")
+            return (-upper if form % 2 else upper) / lower
+        if form in (6, 7):
+            size, code = (4, "<f") if form == 6 else (8, "<d")
+            return float(struct.unpack(code, self.take(size))[0])
+        raise self.fail(f"real number of form {form}, need 0 to 7")
+
+    def string(self, *, name: bool = False) -> str:
+        """Characters; a ``name`` is not empty."""
+        text = decode_name(self.take(self.unsigned()))
+        if name and not text:
+            raise self.fail("an empty name")
+        return text
+
+    def delta(self) -> tuple[int, int]:
+        """A g-delta."""
+        word = self.unsigned()
+        if word & 1:
+            return (-(word >> 2) if word & 2 else word >> 2), self.signed()
+        dx, dy = DIRECTIONS[word >> 1 & 7]
+        return dx * (word >> 4), dy * (word >> 4)
+
+    def points(self, *, closed: bool = True) -> Array:
+        """A point list, from (0, 0) on: (n, 2), as it closes to a polygon, or as a path
+        has it.
+        """
+        form, count = self.unsigned(), self.unsigned()
+        if form > 5:
+            raise self.fail(f"point list of type {form}, need 0 to 5")
+        if not 0 < count <= self.left:
+            raise self.fail(f"point list of {count} points with {self.left} bytes left")
+        steps = [self._step(form, n) for n in range(count)]
+        if form == 5:
+            steps = list(
+                zip(
+                    *(np.cumsum(axis).tolist() for axis in np.array(steps, object).T),
+                    strict=True,
+                )
+            )
+        x, y = [0], [0]
+        for dx, dy in steps:
+            x.append(self.within(x[-1] + dx))
+            y.append(self.within(y[-1] + dy))
+        if closed and form in (
+            0,
+            1,
+        ):  # the last corner of a rectilinear polygon is implied
+            along = (form + count) % 2 == 0
+            x.append(x[-1] if not along else 0)
+            y.append(0 if not along else y[-1])
+        return np.array([x, y], np.int64).T
+
+    def _step(self, form: int, n: int) -> tuple[int, int]:
+        if form < 2:
+            size = self.signed()
+            return (size, 0) if n % 2 == form else (0, size)
+        if form in (2, 3):
+            word, bits = self.unsigned(), form
+            dx, dy = DIRECTIONS[word & (1 << bits) - 1]
+            return dx * (word >> bits), dy * (word >> bits)
+        return self.delta()
+
+    def repetition(self, last: Repetition | None, limit: int) -> Repetition:
+        """A repetition of any type; at most ``limit`` copies."""
+        form = self.unsigned()
+        if form == 0:
+            if last is None:
+                raise self.fail(
+                    "a repetition that repeats an earlier one, and there is none"
+                )
+            return last
+        if form in (1, 2, 3):
+            return self._matrix(form, limit)
+        if form in (4, 5, 6, 7):
+            count, grid = self._count(limit), self.unsigned() if form % 2 else 1
+            steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
+            line = self._sums(steps)
+            return (
+                Repetition(line, 0 * line) if form < 6 else Repetition(0 * line, line)
+            )
+        if form in (8, 9):
+            return self._vectors(form, limit)
+        if form in (10, 11):
+            count, grid = self._count(limit), self.unsigned() if form == 11 else 1
+            x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
+            at = deltas(self.data, self.at, self.end, self.within(grid), x, y)
+            if at < 0:
+                raise self.fail(
+                    f"list of {count - 1} steps that is cut or leaves 32 bits"
+                )
+            self.at = at
+            return Repetition(x, y)
+        raise self.fail(f"repetition of type {form}, need 0 to 11")
+
+    def _count(self, limit: int) -> int:
+        """Copies of a listed repetition: each needs a byte."""
+        count = self.unsigned() + 2
+        if count > min(self.left + 1, limit):
+            raise self.fail(f"repetition of {count} copies with {self.left} bytes left")
+        return count
+
+    def _sums(self, steps: list[int]) -> Array:
+        if sum(steps) > FARTHEST:
+            raise self.fail("repetition that leaves 32 bits")
+        return np.cumsum(np.array(steps, np.int64))
+
+    def _matrix(self, form: int, limit: int) -> Repetition:
+        columns = self.unsigned() + 2 if form != 3 else 1
+        rows = self.unsigned() + 2 if form != 2 else 1
+        step_x = self.unsigned() if form != 3 else 0
+        step_y = self.unsigned() if form != 2 else 0
+        return self._grid(columns, rows, (step_x, 0), (0, step_y), limit)
+
+    def _vectors(self, form: int, limit: int) -> Repetition:
+        first = self.unsigned() + 2
+        second = self.unsigned() + 2 if form == 8 else 1
+        along = self.delta()
+        return self._grid(
+            first, second, along, self.delta() if form == 8 else (0, 0), limit
+        )
+
+    def _grid(
+        self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int
+    ) -> Repetition:
+        if n * m > min(limit, MOST_COPIES):
+            most = min(limit, MOST_COPIES)
+            raise self.fail(
+                f"repetition of {n} x {m} = {n * m:,} copies, at most {most:,} more are read"
+            )
+        for i in (0, 1):
+            self.within(abs(n * a[i]) + abs(m * b[i]))
+        along, across = np.arange(n), np.arange(m)[:, None]
+        x, y = (
+            (along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32)
+            for k in (0, 1)
+        )
+        return Repetition(x.ravel(), y.ravel())

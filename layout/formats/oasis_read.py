@@ -1,0 +1,275 @@
+"""OASIS reader for mask files: names, cells, compressed blocks, checksum; what is wrong
+is named with its byte.
+"""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from layout.formats import oasis_records as oasis
+from layout.formats.content import (
+    CONTEXT_CELL,
+    CellContent,
+    Gathered,
+    MaskContent,
+    mapped,
+)
+from layout.formats.oasis_cells import Budget, CellReader, Child, OpenCell
+from layout.formats.oasis_cursor import Cursor
+from metalens.ground.arrays import Array
+
+LIMIT = 2**29
+_NUMBERED_NAMES = (
+    oasis.TEXTSTRING_REF,
+    oasis.PROPNAME_REF,
+    oasis.PROPSTRING_REF,
+    oasis.XNAME_REF,
+)
+_BYTES_EACH = 16  # of a compressed block, for each placement that may be read
+_LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
+
+
+def read(
+    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+) -> MaskContent:
+    """Read an OASIS file.
+
+    Args:
+        limit: most placements and copies that are read.
+        keep: most placements of one cell that are kept; of more only the sums are
+            (:mod:`layout.formats.digest`), in
+            bounded memory. None: all are kept.
+
+    Raises:
+        MaskFileError: not OASIS, cut, broken anywhere, of a wrong checksum, or with
+            records that no mask of
+            pillars holds; the message gives the byte offset.
+        OSError: the file cannot be opened.
+    """
+    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
+
+
+def parse(
+    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+) -> MaskContent:
+    """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
+    in errors.
+    """
+    return _Reader(Cursor(where, data), limit, keep).whole_file()
+
+
+class _Reader:
+    """The file level; ``cell`` reads what stands in the open cell."""
+
+    def __init__(self, cursor: Cursor, limit: int, keep: int | None) -> None:
+        self.file, self.budget, self.keep = cursor, Budget(limit), keep
+        self.cell: CellReader | None = None
+        self.cells: list[OpenCell] = []
+        self.names: dict[int, str] = {}
+        self.explicit: set[bool] = set()
+        self.layer_names: dict[tuple[int, int], str] = {}
+        self.end_at: int | None = None
+
+    def whole_file(self) -> MaskContent:
+        """Everything, from the magic bytes to the checksum."""
+        c = self.file
+        if c.left < len(oasis.MAGIC) or c.take(len(oasis.MAGIC)) != oasis.MAGIC:
+            raise c.fail("no OASIS file: the magic bytes are missing")
+        unit_nm, offsets_here = self._start()
+        self._records(c)
+        if self.end_at is None:
+            raise c.fail("the file ends without END; it is cut")
+        self._check_end(offsets_here)
+        return MaskContent("OASIS", unit_nm, self._contents(), self.layer_names)
+
+    def _start(self) -> tuple[float, bool]:
+        c = self.file
+        c.begin = c.at
+        if c.byte() != oasis.START:
+            raise c.fail("START is missing")
+        version = c.string()
+        if version != "1.0":
+            raise c.fail(f"OASIS version {version[:20]!r}, need '1.0'")
+        steps = c.real()
+        if not 1e-6 < steps < 1e9:
+            raise c.fail(f"{steps} grid steps in a micrometre")
+        offsets_here = c.unsigned() == 0
+        if offsets_here:
+            self._offsets(c)
+        return 1e3 / steps, offsets_here
+
+    def _offsets(self, c: Cursor) -> None:
+        for _ in range(6):
+            if c.unsigned() > 1:
+                raise c.fail("table offset with a flag beyond 1")
+            c.unsigned()
+
+    def _records(self, c: Cursor) -> None:
+        """All records at the cursor, up to its end or END."""
+        while c.left and self.end_at is None:
+            if self.cell is not None:
+                self.cell.plain_placements(c)
+                if not c.left:
+                    break
+            c.begin = c.at
+            self._record(c, c.byte())
+
+    def _record(self, c: Cursor, kind: int) -> None:
+        if kind in (oasis.CELL_REF, oasis.CELL):
+            self._begin_cell(
+                c.within(c.unsigned())
+                if kind == oasis.CELL_REF
+                else c.string(name=True)
+            )
+        elif kind == oasis.CBLOCK:
+            self._block(c)
+        elif kind in (oasis.PROPERTY, oasis.PROPERTY_REPEAT):
+            self._property(c, kind)
+        elif self.cell is not None and self.cell.record(c, kind):
+            return
+        elif kind in (oasis.CELLNAME, oasis.CELLNAME_REF):
+            self._cell_name(c, kind == oasis.CELLNAME_REF)
+        elif kind in (oasis.LAYERNAME, oasis.LAYERNAME_TEXT):
+            self._layer_name(c, kind)
+        elif oasis.TEXTSTRING <= kind <= oasis.PROPSTRING_REF:
+            self._other_name(c, kind)
+        elif kind in (oasis.XNAME, oasis.XNAME_REF):
+            c.unsigned()
+            self._other_name(c, kind)
+        elif kind == oasis.XELEMENT and self.cell is None:
+            c.unsigned()
+            c.string()
+        elif kind == oasis.END and c is self.file:
+            self.end_at = c.begin
+        elif kind != oasis.PAD:
+            raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
+
+    def _begin_cell(self, key: Child) -> None:
+        self.cells.append(OpenCell(key, held=Gathered(self.keep)))
+        self.cell = CellReader(self.cells[-1], self.budget)
+
+    def _block(self, c: Cursor) -> None:
+        if c is not self.file:
+            raise c.fail("a compressed block within another")
+        if c.unsigned() != 0:
+            raise c.fail("a compressed block of an unknown method, need deflate")
+        size, packed = c.unsigned(), c.unsigned()
+        if packed > c.left or size > packed * _LARGEST_RATIO + 64:
+            raise c.fail(
+                f"compressed block of {packed} bytes for {size}, with {c.left} left in the file"
+            )
+        if size > _BYTES_EACH * self.budget.limit:
+            most = _BYTES_EACH * self.budget.limit
+            raise c.fail(
+                f"compressed block of {size:,} bytes, at most {most:,} are unpacked"
+            )
+        try:
+            engine = zlib.decompressobj(-15)
+            raw = engine.decompress(c.take(packed), size + 1)
+        except zlib.error as error:
+            raise c.fail(
+                f"compressed block that cannot be unpacked ({error})"
+            ) from None
+        if len(raw) != size or not engine.eof or engine.unused_data:
+            raise c.fail(
+                f"compressed block of {len(raw)} bytes where {size} are announced"
+            )
+        self._records(Cursor(c.path, np.frombuffer(raw, np.uint8), block=c.begin))
+
+    def _cell_name(self, c: Cursor, explicit: bool) -> None:
+        name = c.string(name=True)
+        self.explicit.add(explicit)
+        number = c.within(c.unsigned()) if explicit else len(self.names)
+        if len(self.explicit) > 1 or number in self.names:
+            raise c.fail(
+                f"cell name {name!r}: number {number} is taken, or two ways of numbering are mixed"
+            )
+        self.names[number] = name
+        self.cell = None
+
+    def _layer_name(self, c: Cursor, kind: int) -> None:
+        name = c.string(name=True)
+        first = [self._interval(c) for _ in range(2)]
+        if kind == oasis.LAYERNAME and None not in first:
+            self.layer_names[first[0] or 0, first[1] or 0] = name
+        self.cell = None
+
+    def _interval(self, c: Cursor) -> int | None:
+        """The single number of an interval; None for any other interval."""
+        form = c.unsigned()
+        if form > 4:
+            raise c.fail(f"interval of type {form}, need 0 to 4")
+        numbers = [c.unsigned() for _ in range((0, 1, 1, 1, 2)[form])]
+        return numbers[0] if form == 3 else None
+
+    def _other_name(self, c: Cursor, kind: int) -> None:
+        c.string()
+        if kind in _NUMBERED_NAMES:
+            c.unsigned()
+        self.cell = None
+
+    def _property(self, c: Cursor, kind: int) -> None:
+        """Properties are passed over."""
+        if kind == oasis.PROPERTY_REPEAT:
+            return
+        info = c.byte()
+        if info & 4:
+            _ = c.unsigned() if info & 2 else c.string()
+        if info & 8:
+            return
+        count = info >> 4 if info >> 4 < 15 else c.unsigned()
+        for _ in range(count):
+            self._property_value(c)
+
+    def _property_value(self, c: Cursor) -> None:
+        form = c.byte()
+        if form <= 7:
+            c.at -= 1
+            c.real()
+        elif form in (8, 13, 14, 15):
+            c.unsigned()
+        elif form == 9:
+            c.signed()
+        elif form in (10, 11, 12):
+            c.string()
+        else:
+            raise c.fail(f"property value of type {form}, need 0 to 15")
+
+    def _check_end(self, offsets_before: bool) -> None:
+        c = self.file
+        c.begin = self.end_at or 0
+        if c.end - c.begin != oasis.END_SIZE:
+            raise c.fail(
+                f"END of {c.end - c.begin} bytes to the end of the file, need {oasis.END_SIZE}"
+            )
+        if not offsets_before:
+            self._offsets(c)
+        c.string()
+        scheme = c.unsigned()
+        if scheme not in (0, 1, 2) or c.left != (4 if scheme else 0):
+            raise c.fail(f"validation scheme {scheme} with {c.left} bytes left")
+        if scheme == 1:
+            found, wanted = (
+                zlib.crc32(c.data[: c.at].data),
+                struct.unpack("<I", c.take(4))[0],
+            )
+            if found != wanted:
+                raise c.fail(
+                    f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged"
+                )
+
+    def _contents(self) -> dict[str, CellContent]:
+        made: dict[str, CellContent] = {}
+        for cell in self.cells:
+            try:
+                name = cell.key if isinstance(cell.key, str) else self.names[cell.key]
+                content = cell.close(name, self.names)
+            except KeyError as error:
+                raise self.file.fail(f"cell number {error} has no name") from None
+            if name in made:
+                raise self.file.fail(f"cell {name!r} comes twice")
+            made[name] = content
+        made.pop(CONTEXT_CELL, None)
+        return made

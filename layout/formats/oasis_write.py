@@ -1,0 +1,208 @@
+"""OASIS writer: pillars as placements in tiles, arrays of copies as repetitions.
+
+Strict name tables, layer names, CRC-32. Memory is a block of rows. Bytes are the same
+for the same mask.
+"""
+
+import itertools
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from layout.formats import oasis_records as oasis
+from layout.formats import oasis_tiles as tiles
+from layout.formats.assembly import Assembly, Copies, library_of
+from layout.formats.content import QUARTERS, CellContent, Placed, Turn
+from layout.mask import Lattice, MaskPlan
+from layout.process import LayerNumber
+from metalens.ground import store
+from metalens.ground.arrays import Array
+
+_LEVEL, _FAST_LEVEL = 6, 2  # of deflate
+_LARGE = 10**8  # sites from which a lattice takes the fast level: half the time
+_AT_ONCE = 1 << 16  # placements of a compressed block
+_REPEATED = 8  # bit of a placement that says that a repetition follows
+_THREADS = 2
+
+
+def write(mask: MaskPlan | Assembly, path: str | Path, *, fold: bool = True) -> None:
+    """Write a mask as OASIS; the file appears whole or not at all.
+
+    Args:
+        mask: plan of a die, or cells.
+        path: of the file.
+        fold: store a lens of a plan that is symmetric under the square as an eighth.
+
+    Raises:
+        OSError: the target cannot be written; what was there before stays.
+    """
+    library = library_of(mask, fold=fold) if isinstance(mask, MaskPlan) else mask
+    number = {name: k for k, name in enumerate(library.cells)}
+    head = oasis.start(library.unit_nm)
+    layers = b"".join(
+        layer_name(layer, name) for layer, name in sorted(library.layer_names.items())
+    )
+    checksum, written = 0, 0
+    with store.replacing(path) as part, open(part, "wb", buffering=1 << 16) as file:
+        for piece in itertools.chain((head, layers), _cells(library, number)):
+            file.write(piece)
+            checksum, written = zlib.crc32(piece, checksum), written + len(piece)
+        table = b"".join(cell_name(k, name) for name, k in number.items())
+        file.write(table)
+        offsets = (written, 0, 0, 0, len(head) if layers else 0, 0)
+        file.write(oasis.end(offsets, zlib.crc32(table, checksum)))
+
+
+def cell_name(number: int, name: str) -> bytes:
+    """Record of a cell's name."""
+    return bytes([oasis.CELLNAME_REF]) + oasis.string(name) + oasis.unsigned(number)
+
+
+def layer_name(layer: LayerNumber, name: str) -> bytes:
+    """Record of the name of a layer and datatype."""
+    exactly = b"\x03"
+    numbers = b"".join(exactly + oasis.unsigned(n) for n in layer)
+    return bytes([oasis.LAYERNAME]) + oasis.string(name) + numbers
+
+
+def _cells(library: Assembly, number: dict[str, int]) -> Iterator[bytes]:
+    for name, cell in library.cells.items():
+        yield bytes([oasis.CELL_REF]) + oasis.unsigned(number[name])
+        for layer, polygons in cell.polygons.items():
+            shapes = b"".join(polygon(layer, points) for points in polygons)
+            yield oasis.compressed(shapes, _LEVEL)
+        for layer, circles in cell.circles.items():
+            yield b"".join(_circle(layer, *one) for one in circles)
+        copies = library.copies.get(name, ())
+        yield b"".join(_copies(one, number[one.child]) for one in copies)
+        yield from _placements(cell, number)
+        if name in library.sites:
+            yield from _pillars(library.sites[name].numbered(number))
+
+
+def polygon(layer: LayerNumber, points: Array) -> bytes:
+    """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last
+    one implied.
+    """
+    steps = np.diff(points.astype(np.int64), axis=0).tolist()
+    x, y = (oasis.signed(int(v)) for v in points[0])
+    return b"".join(
+        [
+            bytes([oasis.POLYGON, 0b00111011]),
+            oasis.unsigned(layer[0]) + oasis.unsigned(layer[1]),
+            b"\x04" + oasis.unsigned(len(steps)),
+            *(vector(dx, dy) for dx, dy in steps),
+            x + y,
+        ]
+    )
+
+
+def vector(dx: int, dy: int) -> bytes:
+    """A g-delta of any direction."""
+    return oasis.unsigned(abs(dx) << 2 | (dx < 0) << 1 | 1) + oasis.signed(dy)
+
+
+def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
+    numbers = b"".join(oasis.unsigned(n) for n in (*layer, radius))
+    place = oasis.signed(x) + oasis.signed(y)
+    return bytes([oasis.CIRCLE, 0b00111011]) + numbers + place
+
+
+def _copies(one: Copies, number: int) -> bytes:
+    """A placement, repeated where it stands for an array."""
+    repeated = one.count > 1
+    placed = _placement(number, one.turn, one.x, one.y, repeated=repeated)
+    if not repeated:
+        return placed
+    if min(one.columns, one.rows) > 1:
+        sizes = oasis.unsigned(one.columns - 2) + oasis.unsigned(one.rows - 2)
+        steps = vector(*one.across) + vector(*one.up)
+        return placed + oasis.unsigned(8) + sizes + steps
+    along = one.across if one.rows == 1 else one.up
+    return placed + oasis.unsigned(9) + oasis.unsigned(one.count - 2) + vector(*along)
+
+
+def _placement(
+    number: int, turn: Turn, x: int, y: int, *, repeated: bool = False
+) -> bytes:
+    """A placement at an absolute place, in any orientation."""
+    info = 0xF0 | (_REPEATED if repeated else 0)
+    place = oasis.signed(x) + oasis.signed(y)
+    if turn in QUARTERS:
+        k = QUARTERS.index(turn)
+        head = bytes([oasis.PLACEMENT, info | (k & 3) << 1 | k >> 2])
+        return head + oasis.unsigned(number) + place
+    head = bytes([oasis.PLACEMENT_ANY, info | 6 | turn.mirrored])
+    double = struct.Struct("<Bd")
+    size = double.pack(7, turn.scale) + double.pack(7, turn.angle_deg)
+    return head + oasis.unsigned(number) + size + place
+
+
+def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
+    """Placements of a cell: those of quarter turns relative to each other."""
+    placed = cell.kept()
+    own = np.array([number[name] for name in placed.children], np.int64)
+    quarter = placed.turn < len(QUARTERS)
+    yield b"".join(
+        _placement(
+            int(own[placed.child[n]]),
+            placed.turns[int(placed.turn[n])],
+            int(placed.x[n]),
+            int(placed.y[n]),
+        )
+        for n in np.flatnonzero(~quarter).tolist()
+    )
+    where = slice(None) if quarter.all() else np.flatnonzero(quarter)
+    yield from _listed(own, placed, where)
+
+
+def _listed(own: Array, placed: Placed, where: slice | Array) -> Iterator[bytes]:
+    columns = placed.child, placed.x, placed.y, placed.turn
+    child, x, y, turn = (column[where] for column in columns)
+    out = np.empty(min(len(x), _AT_ONCE) * tiles.LARGEST_RECORD + 2, np.uint8)
+    for first in range(0, len(x), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        px, py, way = (column[some].astype(np.int64) for column in (x, y, turn))
+        used = tiles.encode_list(own[child[some]], px, py, way, out)
+        yield oasis.compressed(out[:used].tobytes(), _LEVEL)
+
+
+def _pillars(lattice: Lattice) -> Iterator[bytes]:
+    """Placements, tile by tile, of the cells that a lattice numbers from 1 on."""
+
+    def jobs() -> Iterator[Callable[[], bytes]]:
+        steps = lattice.pitch, lattice.down
+        is_large = lattice.rows * lattice.columns >= _LARGE
+        level = _FAST_LEVEL if is_large else _LEVEL
+        for first, block in lattice.blocks(tiles.TILE_ROWS):
+            y = lattice.y0 - first * lattice.down
+            for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
+                tile = block[:, left : left + tiles.TILE_COLUMNS]
+                x = lattice.x0 + left * lattice.pitch
+                yield partial(_tile, tile, steps, x, y, level)
+
+    yield from _in_order(jobs())
+
+
+def _tile(tile: Array, steps: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
+    out = np.empty(tile.size * tiles.LARGEST_RECORD, np.uint8)
+    used = tiles.encode_tile(tile, *steps, x0, y0, out)
+    return oasis.compressed(out[:used].data, level) if used else b""
+
+
+def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[bytes]:
+    """Results of the jobs in their order, a few of them worked on at once."""
+    waiting: deque[Future[bytes]] = deque()
+    with ThreadPoolExecutor(_THREADS, thread_name_prefix="mask") as pool:
+        for job in jobs:
+            waiting.append(pool.submit(job))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

@@ -1,0 +1,249 @@
+"""Cells put together: arrays found again hold every copy once, and both formats hold
+them, read by KLayout too.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from layout.formats import (
+    QUARTERS,
+    Assembly,
+    CellContent,
+    Copies,
+    Placed,
+    Turn,
+    arrays,
+    gdsii_read,
+    gdsii_write,
+    oasis_read,
+    oasis_write,
+)
+from metalens.ground.errors import ProcessError
+
+WRITERS = {
+    ".gds": (gdsii_write.write, gdsii_read.read),
+    ".oas": (oasis_write.write, oasis_read.read),
+}
+BAR = np.array([[0, 0], [10, 0], [10, 23], [0, 23]])
+ELL = np.array([[0, 0], [90, 0], [90, 40], [31, 40], [31, 70], [0, 70]])
+
+
+def listed(placed):
+    """Every placement as (child, turn, x, y)."""
+    rows = zip(
+        placed.child.tolist(),
+        placed.turn.tolist(),
+        placed.x.tolist(),
+        placed.y.tolist(),
+        strict=True,
+    )
+    return [(placed.children[c], placed.turns[t], x, y) for c, t, x, y in rows]
+
+
+def expanded(made):
+    """Every copy of arrays as (child, turn, x, y)."""
+    return [
+        (
+            one.child,
+            one.turn,
+            one.x + i * one.across[0] + j * one.up[0],
+            one.y + i * one.across[1] + j * one.up[1],
+        )
+        for one in made
+        for i in range(one.columns)
+        for j in range(one.rows)
+    ]
+
+
+def placements(child, x, y, turn):
+    return Placed(
+        ("A", "B"),
+        *(np.asarray(v, np.int32) for v in (child, x, y)),
+        np.asarray(turn, np.uint8),
+    )
+
+
+def sort_key(row):
+    child, turn, x, y = row
+    return child, turn.angle_deg, turn.mirrored, turn.scale, x, y
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize(("child", "turn"), [(0, 1), (0, 0), (1, 2)])
+def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
+    suffix, child, turn, tmp_path
+):
+    """Three of one kind alone: as the first cell unturned, by its second turn, or of a
+    later cell.
+    """
+    write, read = WRITERS[suffix]
+    placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
+    cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in placed.children}
+    write(
+        Assembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}),
+        tmp_path / f"a{suffix}",
+    )
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    assert sorted(listed(found), key=sort_key) == sorted(listed(placed), key=sort_key)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_path):
+    """Beyond the eight quarter turns 300 angles, more than a byte numbers."""
+    write, read = WRITERS[suffix]
+    turns = (*QUARTERS, *(Turn(0.5 + n / 4) for n in range(300)))
+    x = 7 * np.arange(308, dtype=np.int32)
+    placed = Placed(
+        ("A",),
+        np.zeros(308, np.int32),
+        x,
+        x[::-1].copy(),
+        np.arange(308, dtype=np.int32),
+        turns,
+    )
+    cells = {
+        "A": CellContent("A", {(1, 0): [BAR]}),
+        "TOP": CellContent("TOP", placed=placed),
+    }
+    write(Assembly("TOP", cells, {}), tmp_path / f"a{suffix}")
+    found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
+    for got, want in zip(
+        sorted(listed(found), key=sort_key),
+        sorted(listed(placed), key=sort_key),
+        strict=True,
+    ):
+        assert got[2:] == want[2:]
+        assert got[1].mirrored == want[1].mirrored
+        assert got[1].angle_deg == pytest.approx(want[1].angle_deg, abs=1e-9)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    shape=st.tuples(st.integers(1, 6), st.integers(1, 5)),
+    loose=st.integers(0, 30),
+)
+def test_arrays_and_what_is_left_are_all_copies_and_none_twice(seed, shape, loose):
+    rng = np.random.default_rng(seed)
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(shape[0]), np.arange(shape[1])))
+    x, y = (
+        np.r_[3 + 31 * i, rng.integers(-60, 60, loose)],
+        np.r_[-7 + 43 * j, rng.integers(-9, 9, loose)],
+    )
+    child, turn = (np.r_[np.full(len(i), k), rng.integers(0, 2, loose)] for k in (1, 0))
+    order = rng.permutation(len(x))
+    placed = placements(child[order], x[order], y[order], turn[order])
+    made, left = arrays(placed)
+    assert sorted(expanded(made) + listed(left), key=sort_key) == sorted(
+        listed(placed), key=sort_key
+    )
+    assert all(one.count >= 4 for one in made)
+
+
+def test_a_raster_becomes_one_array_however_it_was_listed():
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(7), np.arange(5)))
+    order = np.random.default_rng(2).permutation(35)
+    made, left = arrays(
+        placements(
+            np.ones(35), (11 - 31 * i)[order], (5 + 43 * j)[order], np.full(35, 6)
+        )
+    )
+    assert made == (Copies("B", 11 - 31 * 6, 5, QUARTERS[6], 7, 5, (31, 0), (0, 43)),)
+    assert not len(left.child)
+
+
+def assembly():
+    turns = (*QUARTERS, Turn(33.5, True, 1.5), Turn(211.25))
+    loose = Placed(
+        ("A", "B"),
+        np.array([0, 1, 0, 1, 1], np.int32),
+        np.array([5, -700, 5, 2**30, 12], np.int32),
+        np.array([-6, 41, 900, -(2**30), 13], np.int32),
+        np.array([0, 7, 9, 3, 8], np.uint8),
+        turns,
+    )
+    cells = {
+        "A": CellContent("A", {(1, 0): [BAR], (1, 7): [ELL - 3]}),
+        "B": CellContent("B", {(2, 3): [ELL]}, {(4, 0): [(1, -2, 3000)]}),
+        "TOP": CellContent("TOP", placed=loose),
+    }
+    copies = (
+        Copies("A", 5, -6, QUARTERS[5], 3, 4, (0, 1000), (-700, 30)),
+        Copies("B", 60_000, -8, Turn(17.0), 1, 9, (0, 0), (0, -4100)),
+        Copies("B", -60_000, 1),
+    )
+    return Assembly("TOP", cells, {"TOP": copies}, layer_names={(1, 0): "pillar"})
+
+
+@pytest.mark.parametrize("end", [".gds", ".oas"])
+def test_every_copy_comes_back(tmp_path, end):
+    made, (write, read) = assembly(), WRITERS[end]
+    write(made, tmp_path / f"m{end}")
+    content = read(tmp_path / f"m{end}")
+    assert content.tops == ["TOP"]
+    planned = expanded(made.copies["TOP"]) + listed(made.cells["TOP"].placed)
+    there = listed(content.cells["TOP"].placed)
+    assert sorted(there, key=sort_key) == sorted(planned, key=sort_key)
+    for name in ("A", "B"):
+        for layer, shapes in made.cells[name].polygons.items():
+            assert [p.tolist() for p in content.cells[name].polygons[layer]] == [
+                p.tolist() for p in shapes
+            ]
+    if end == ".oas":
+        assert content.cells["B"].circles == made.cells["B"].circles
+        assert content.layer_names == {(1, 0): "pillar"}
+
+
+@pytest.mark.parametrize("end", [".gds", ".oas"])
+def test_an_independent_reader_finds_every_shape(tmp_path, end):
+    db = pytest.importorskip("klayout.db")
+    made, (write, _) = assembly(), WRITERS[end]
+    write(made, tmp_path / f"m{end}")
+    there = db.Layout()
+    there.read(str(tmp_path / f"m{end}"))
+    top = there.top_cell()
+    planned = expanded(made.copies["TOP"]) + listed(made.cells["TOP"].placed)
+    for layer, child, shape in (((1, 0), "A", BAR), ((2, 3), "B", ELL)):
+        found = db.Region(top.begin_shapes_rec(there.layer(*layer)))
+        found.merged_semantics = False
+        wanted = db.Region()
+        polygon = db.Polygon([db.Point(*map(int, p)) for p in shape])
+        for name, turn, x, y in planned:
+            if name == child:
+                wanted.insert(
+                    polygon.transformed(
+                        db.ICplxTrans(turn.scale, turn.angle_deg, turn.mirrored, x, y)
+                    )
+                )
+        wanted.merged_semantics = False
+        assert (
+            found.count()
+            == wanted.count()
+            == sum(name == child for name, *_ in planned)
+        )
+        assert sorted(str(p) for p in found.each()) == sorted(
+            str(p) for p in wanted.each()
+        )
+
+
+def test_files_do_not_grow_with_copies(tmp_path):
+    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
+    for end, (write, _) in WRITERS.items():
+        sizes = []
+        for side in (3, 300):
+            many = Copies("A", 7, -3, QUARTERS[2], side, side + 1, (100, 0), (0, 130))
+            write(Assembly("TOP", cells, {"TOP": (many,)}), tmp_path / f"{side}{end}")
+            sizes.append((tmp_path / f"{side}{end}").stat().st_size)
+        assert sizes[1] - sizes[0] <= 4  # a few digits of two numbers
+
+
+def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
+    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
+    long = Assembly(
+        "TOP", cells, {"TOP": (Copies("A", 0, 0, columns=32768, across=(30, 0)),)}
+    )
+    with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
+        gdsii_write.write(long, tmp_path / "m.gds")
+    oasis_write.write(long, tmp_path / "m.oas")
+    assert len(oasis_read.read(tmp_path / "m.oas").cells["TOP"].placed.x) == 32768

@@ -1,0 +1,444 @@
+"""GDSII and OASIS: what is written reads back the same, here and in KLayout; limits of
+the formats are refused.
+"""
+
+import dataclasses
+import errno
+import hashlib
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+import layout
+from layout.formats import gdsii_write, oasis_write
+from layout.formats import oasis_records as oasis_bytes
+from layout.mask import symmetry
+from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
+from metalens.ground.errors import MaskFileError, ProcessError
+
+FORMS = [("gds", {}), ("oas", {}), ("oas", {"fold": False})]
+READ = {"gds": layout.read_gdsii, "oas": layout.read_oasis}
+
+
+def write(plan, path, options):
+    (layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis)(
+        plan, path, **options
+    )
+    return path
+
+
+def klayout_sites(path, plan):
+    """{cell: sorted (x, y)} of all placements of pillar cells below the top, as KLayout
+    reads them.
+    """
+    db = pytest.importorskip("klayout.db")
+    read = db.Layout()
+    read.read(str(path))
+    assert [cell.name for cell in read.top_cells()] == [plan.name]
+    assert read.dbu == pytest.approx(plan.unit_nm * 1e-3, rel=1e-12)
+    found = {}
+    walk = read.top_cell().begin_instances_rec()
+    pillars = {made.name for made in plan.classes}
+    while not walk.at_end():
+        name = read.cell(walk.inst_cell().cell_index()).name
+        if name in pillars:
+            for step in each_copy(walk.current_inst_element()):
+                move = walk.trans() * step
+                found.setdefault(name, []).append(
+                    (round(move.disp.x), round(move.disp.y))
+                )
+        walk.next()
+    return {name: sorted(places) for name, places in found.items()}, read
+
+
+def each_copy(element):
+    yield element.specific_cplx_trans()
+
+
+def planned_sites(plan):
+    found = {}
+    for lattice in plan.lattices:
+        for row, column in np.argwhere(lattice.whole() > 0):
+            name = plan.classes[lattice.whole()[row, column] - 1].name
+            place = (
+                lattice.x0 + int(column) * lattice.pitch,
+                lattice.y0 - int(row) * lattice.pitch,
+            )
+            found.setdefault(name, []).append(place)
+    return {name: sorted(places) for name, places in found.items()}
+
+
+@pytest.mark.parametrize(("suffix", "options"), FORMS)
+def test_a_mask_reads_back_as_planned_and_klayout_agrees(
+    plan, tmp_path, suffix, options
+):
+    path = write(plan, tmp_path / f"m.{suffix}", options)
+    content = READ[suffix](path)
+    outcome = layout.compare(plan, content)
+    assert outcome.ok, outcome.differences
+    assert outcome.pillars == np.count_nonzero(plan.lattices[0].whole())
+    own = {
+        k: sorted(zip(x.tolist(), y.tolist(), strict=True))
+        for k, (x, y) in content.sites("LENS").items()
+    }
+    assert own == planned_sites(plan)
+    seen, read = klayout_sites(path, plan)
+    assert seen == planned_sites(plan)
+    db = pytest.importorskip("klayout.db")
+    for made in plan.classes:
+        region = db.Region(read.cell(made.name).begin_shapes_rec(read.layer(1, 0)))
+        assert region.area() == pytest.approx(np.pi * made.diameter_nm**2 / 4, rel=3e-3)
+
+
+@settings(max_examples=40)
+@given(
+    classes=arrays.arrays(
+        np.uint8,
+        st.tuples(st.integers(1, 9), st.integers(1, 9)),
+        elements=st.integers(0, 3),
+    ),
+    form=st.sampled_from(FORMS),
+)
+def test_any_small_map_survives_the_round_trip(make_plan, tmp_path, classes, form):
+    plan = make_plan(classes, kinds=3)
+    path = write(plan, tmp_path / f"m.{form[0]}", form[1])
+    if classes.any():
+        assert layout.compare(plan, READ[form[0]](path)).ok
+    assert READ[form[0]](path).counts("LENS") == {
+        k: len(v) for k, v in planned_sites(plan).items()
+    }
+
+
+@pytest.mark.parametrize("size", [4, 5, 8, 9, 40, 41])
+def test_a_symmetric_lens_is_stored_as_an_eighth_and_klayout_sees_it_whole(
+    make_plan, tmp_path, size
+):
+    axis = np.arange(size) - (size - 1) / 2
+    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(
+        np.uint8
+    )
+    classes[axis**2 + axis[:, None] ** 2 > (size / 2) ** 2] = 0
+    plan = make_plan(classes)
+    half = (size - 1) * 200
+    lattice = dataclasses.replace(plan.lattices[0], x0=-half, y0=half)
+    plan = plan.replace(lattices=(lattice,))
+    path = write(plan, tmp_path / "m.oas", {})
+    content = layout.read_oasis(path)
+    stored = sum(
+        len(content.cells[name].placed.child)
+        for name in content.cells
+        if name.startswith("LENS_")
+    )
+    assert stored < np.count_nonzero(classes) * (0.55 if size < 10 else 0.2)
+    assert layout.compare(plan, content).ok
+    assert klayout_sites(path, plan)[0] == planned_sites(plan)
+
+
+@pytest.mark.parametrize("size", [40, 41])
+def test_an_eighth_too_large_to_keep_is_compared_by_its_sums(make_plan, tmp_path, size):
+    axis = np.arange(size) - (size - 1) / 2
+    half = (size - 1) * 200
+
+    def planned(classes):
+        plan = make_plan(classes)
+        return plan.replace(
+            lattices=(dataclasses.replace(plan.lattices[0], x0=-half, y0=half),)
+        )
+
+    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(
+        np.uint8
+    )
+    path = write(planned(classes), tmp_path / "m.oas", {})
+    content = layout.read_oasis(path, keep=30)
+    assert content.cells["LENS_8"].sums is not None  # about 170 pillars
+    outcome = layout.compare(planned(classes), content)
+    assert (outcome.differences, outcome.pillars) == ((), size**2)
+    other = classes.copy()
+    for turn in range(4):  # two sites and their six images: still symmetric
+        for a in (np.rot90(other, turn), np.rot90(other, turn).T):
+            a[3, 9] = 1 + a[3, 9] % 5
+    wrong = layout.compare(planned(other), content).differences
+    assert any("cell LENS_8: " in text for text in wrong), wrong
+    moved = dataclasses.replace(
+        content.cells["LENS"].placed, turn=content.cells["LENS"].placed.turn * 0
+    )
+    cells = content.cells | {
+        "LENS": dataclasses.replace(content.cells["LENS"], placed=moved)
+    }
+    assert not layout.compare(
+        planned(classes), dataclasses.replace(content, cells=cells)
+    ).ok
+
+
+def test_one_broken_symmetry_is_not_folded(make_plan):
+    classes = np.ones((8, 8), np.uint8)
+    plan = make_plan(classes)
+    lattice = dataclasses.replace(plan.lattices[0], x0=-1400, y0=1400)
+    assert symmetry.is_square_symmetric(lattice)
+    classes[1, 6] = 2
+    assert not symmetry.is_square_symmetric(lattice)
+
+
+@pytest.mark.parametrize(("suffix", "options"), FORMS)
+def test_same_plan_gives_same_bytes(plan, tmp_path, suffix, options):
+    first, second = (
+        write(plan, tmp_path / f"{n}.{suffix}", options).read_bytes() for n in "ab"
+    )
+    assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
+
+
+@pytest.mark.parametrize(("suffix", "options"), FORMS)
+def test_row_blocks_give_the_same_file_as_the_whole_map(
+    make_plan, tmp_path, suffix, options
+):
+    classes = np.random.default_rng(1).integers(0, 8, (1100, 130)).astype(np.uint8)
+    plan = make_plan(classes)
+    whole = plan.lattices[0]
+    calls = []
+
+    def rows(first, end):
+        calls.append((first, end))
+        return classes[first:end].copy()
+
+    streamed = Lattice(
+        whole.name, whole.rows, whole.columns, whole.pitch, whole.x0, whole.y0, rows
+    )
+    one = write(plan, tmp_path / f"a.{suffix}", options).read_bytes()
+    two = write(
+        plan.replace(lattices=(streamed,)), tmp_path / f"b.{suffix}", options
+    ).read_bytes()
+    assert one == two
+    assert calls
+
+
+def test_one_pillar(make_plan, tmp_path):
+    for suffix, options in FORMS:
+        plan = make_plan(np.ones((1, 1), np.uint8))
+        assert (
+            layout.compare(
+                plan, READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))
+            ).pillars
+            == 1
+        )
+
+
+def test_all_pillars_alike(make_plan, tmp_path):
+    plan = make_plan(np.full((50, 70), 3, np.uint8))
+    for suffix, options in FORMS:
+        content = READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))
+        assert content.counts("LENS") == {plan.classes[2].name: 3500}
+
+
+@pytest.mark.parametrize("count", [3000, pytest.param(65535, marks=pytest.mark.slow)])
+def test_thousands_of_classes(tmp_path, count):
+    outline = np.array(
+        [
+            [40, -20],
+            [40, 20],
+            [20, 40],
+            [-20, 40],
+            [-40, 20],
+            [-40, -20],
+            [-20, -40],
+            [20, -40],
+        ]
+    )
+    made = tuple(
+        PillarClass(f"C{n:05}", 80.0, 80, (1, 0), outline) for n in range(count)
+    )
+    classes = np.arange(1, count + 1, dtype=np.uint16).reshape(15, -1)
+    plan = MaskPlan("TOP", made, (Lattice.of("LENS", classes, pitch=400, x0=0, y0=0),))
+    for suffix in ("gds", "oas"):
+        content = READ[suffix](write(plan, tmp_path / f"m.{suffix}", {}))
+        assert layout.compare(plan, content).ok
+
+
+def test_65536_classes_are_refused(plan):
+    with pytest.raises(ProcessError, match="65536 pillar classes"):
+        plan.replace(classes=plan.classes[:1] * 65536)
+
+
+def test_coordinates_beyond_32_bit_are_refused():
+    with pytest.raises(ProcessError, match="beyond 32 bits"):
+        Lattice.of("LENS", np.ones((2, 3), np.uint8), pitch=400, x0=2**31 - 500, y0=0)
+    with pytest.raises(ProcessError, match="beyond 32 bits"):
+        Figure("F", {(1, 0): (np.array([[0, 0], [2**31, 0], [0, 5]]),)})
+
+
+def test_polygons_beyond_8190_points_are_refused_by_gdsii_and_the_old_file_stays(
+    plan, tmp_path
+):
+    angle = np.arange(8190) * 2 * np.pi / 8190
+    ring = np.rint(1e6 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(
+        np.int64
+    )
+    path = tmp_path / "m.gds"
+    path.write_bytes(b"old")
+    with pytest.raises(ProcessError, match="8190 vertices"):
+        layout.write_gdsii(
+            plan.replace(figures=(Figure("BIG", {(2, 0): (ring,)}),)), path
+        )
+    assert path.read_bytes() == b"old"
+    layout.write_gdsii(
+        plan.replace(figures=(Figure("BIG", {(2, 0): (ring[:-1],)}),)), path
+    )
+    assert len(layout.read_gdsii(path).cells["BIG"].polygons[2, 0][0]) == 8189
+
+
+def test_layers_beyond_gdsii_are_refused(plan, tmp_path):
+    far = tuple(dataclasses.replace(made, layer=(40000, 0)) for made in plan.classes)
+    with pytest.raises(ProcessError, match="32767"):
+        layout.write_gdsii(plan.replace(classes=far), tmp_path / "m.gds")
+    layout.write_oasis(plan.replace(classes=far), tmp_path / "m.oas")
+    assert (40000, 0) in layout.read_oasis(tmp_path / "m.oas").cells[
+        far[0].name
+    ].polygons
+
+
+@pytest.mark.parametrize("name", ["", "A B", "é", "x" * 33, "A/B", "a\nb"])
+def test_illegal_names_are_refused_with_a_legal_one(plan, name):
+    with pytest.raises(ProcessError, match="for example"):
+        plan.replace(name=name)
+
+
+def test_two_cells_of_one_name_are_refused(plan):
+    with pytest.raises(ProcessError, match="two cells"):
+        plan.replace(name=plan.classes[0].name)
+
+
+@pytest.mark.parametrize(("suffix", "options"), FORMS)
+def test_a_full_disk_leaves_the_old_file_and_no_part(
+    plan, tmp_path, monkeypatch, suffix, options
+):
+    path = tmp_path / f"m.{suffix}"
+    path.write_bytes(b"old")
+    target = gdsii_write if suffix == "gds" else oasis_write
+
+    class Full:
+        """A file on a disk that fills up after some bytes."""
+
+        def __init__(self, name, *_, **__):
+            self.file, self.room = io.FileIO(name, "w"), 300
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            self.file.close()
+
+        def write(self, data):
+            self.room -= len(data)
+            if self.room < 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return self.file.write(data)
+
+    monkeypatch.setattr(target, "open", Full, raising=False)
+    with pytest.raises(OSError, match="No space left"):
+        write(plan, path, options)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert path.read_bytes() == b"old"
+
+
+def test_an_unwritable_target_is_an_os_error(plan, tmp_path):
+    for suffix in ("gds", "oas"):
+        with pytest.raises(OSError, match="nowhere"):
+            write(plan, tmp_path / "nowhere" / f"m.{suffix}", {})
+
+
+@pytest.mark.parametrize("suffix", ["gds", "oas"])
+def test_a_file_cut_at_any_byte_is_refused_with_the_offset(make_plan, tmp_path, suffix):
+    data = write(
+        make_plan(np.ones((3, 4), np.uint8), kinds=2), tmp_path / f"m.{suffix}", {}
+    ).read_bytes()
+    cut = tmp_path / f"cut.{suffix}"
+    for length in range(len(data)):
+        cut.write_bytes(data[:length])
+        with pytest.raises(MaskFileError, match=r"byte \d+"):
+            READ[suffix](cut)
+
+
+def test_a_wrong_checksum_is_found(plan, tmp_path):
+    path = write(plan, tmp_path / "m.oas", {})
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(MaskFileError, match="checksum"):
+        layout.read_oasis(path)
+
+
+def test_a_moved_pillar_and_another_diameter_are_found(make_plan, tmp_path):
+    plan = make_plan()
+    path = write(plan, tmp_path / "m.gds", {})
+    classes = plan.lattices[0].whole().copy()
+    row, column = np.argwhere(classes == 1)[5]
+    classes[row, column] = 2
+    other = plan.replace(
+        lattices=(Lattice.of("LENS", classes, pitch=400, x0=-6000, y0=4400),)
+    )
+    place = f"at ({-6000 + 400 * column}, {4400 - 400 * row})"
+    wrong = layout.compare(other, layout.read_gdsii(path)).differences
+    assert [place in text for text in wrong] == [True, True]  # one class more, one less
+    shifted = plan.replace(lattices=(dataclasses.replace(plan.lattices[0], x0=-5999),))
+    assert (
+        "not all at their places"
+        in layout.compare(shifted, layout.read_gdsii(path)).differences[0]
+    )
+
+
+@pytest.mark.parametrize("fold", [True, False])
+def test_klayout_reads_our_oasis_in_strict_mode(plan, tmp_path, fold):
+    db = pytest.importorskip("klayout.db")
+    path = write(plan, tmp_path / "m.oas", {"fold": fold})
+    options = db.LoadLayoutOptions()
+    options.oasis_expect_strict_mode = 1
+    read = db.Layout()
+    read.read(str(path), options)
+    assert {read.get_info(i).name for i in read.layer_indexes()} == {"pillar", "marks"}
+
+
+def test_masks_of_klayout_are_read(tmp_path):
+    db = pytest.importorskip("klayout.db")
+    made = db.Layout()
+    top, pillar = made.create_cell("TOP"), made.create_cell("PILLAR")
+    layer = made.layer(7, 3)
+    pillar.shapes(layer).insert(db.Box(-50, -40, 60, 70))
+    pillar.shapes(layer).insert(
+        db.Polygon([db.Point(0, 0), db.Point(10, 30), db.Point(40, 5)])
+    )
+    array = db.CellInstArray(
+        pillar.cell_index(),
+        db.Trans(1, False, 100, 200),
+        db.Vector(400, 0),
+        db.Vector(0, 500),
+        3,
+        2,
+    )
+    top.insert(array)
+    top.shapes(layer).insert(db.Text("note", 5, 6))
+    for suffix in ("gds", "oas"):
+        made.write(str(tmp_path / f"k.{suffix}"))
+        content = READ[suffix](tmp_path / f"k.{suffix}")
+        assert content.tops == ["TOP"]
+        assert len(content.cells["PILLAR"].polygons[7, 3]) == 2
+        x, y = content.sites("TOP")["PILLAR"]
+        assert sorted(zip(x.tolist(), y.tolist(), strict=True)) == [
+            (100 + 400 * i, 200 + 500 * j) for i in range(3) for j in range(2)
+        ]
+        assert content.cells["TOP"].texts == 1
+
+
+def test_reals_and_integers_of_oasis_follow_the_standard():
+    assert oasis_bytes.unsigned(0) == b"\0"
+    assert oasis_bytes.unsigned(300) == b"\xac\x02"
+    assert oasis_bytes.signed(-1) == b"\x03"
+    assert oasis_bytes.real(1000.0) == b"\x00\xe8\x07"
+    assert oasis_bytes.real(0.25) == b"\x02\x04"
+    assert (
+        len(oasis_bytes.end((0, 0, 0, 0, 0, 0), 0))
+        == len(oasis_bytes.end((2**40,) * 6, 0))
+        == 256
+    )

@@ -1,0 +1,194 @@
+"""Broken mask files: a typed error that names the byte, or a clean read; never a crash,
+a hang, or another error.
+"""
+
+import json
+import signal
+
+import numpy as np
+import pytest
+
+import layout
+from layout.commands.validate import validate
+from layout.formats import Assembly, CellContent, gdsii_read, oasis_read
+from layout.formats import gdsii_write as assemble
+from metalens import cli
+from metalens.ground.errors import MaskFileError
+
+LIMIT = 200_000  # placements: a mutated array count must not fill the memory
+READ = {"gds": gdsii_read.read, "oas": oasis_read.read}
+PARSE = {"gds": gdsii_read.parse, "oas": oasis_read.parse}
+FORMS = [
+    ("gds", {}),
+    ("oas", {}),
+    ("oas", {"fold": False}),
+]
+
+
+@pytest.fixture
+def masks(make_plan, tmp_path):
+    """The bytes of small masks in all forms, compressed and not."""
+    classes = np.random.default_rng(3).integers(0, 5, (6, 7)).astype(np.uint8)
+    made = []
+    for n, (suffix, options) in enumerate(FORMS):
+        for kind, sites in enumerate((classes, np.ones((40, 40), np.uint8))):
+            path = tmp_path / f"{n}{kind}.{suffix}"
+            plan = make_plan(sites, kinds=4)
+            (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
+                plan, path, **options
+            )
+            made.append((suffix, path.read_bytes()))
+    return made
+
+
+def mutated(data, rng):
+    """Some bytes changed, removed, doubled or moved."""
+    out = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at, kind = int(rng.integers(len(out))), rng.integers(5)
+        if kind == 0:
+            out[at] = int(rng.integers(256))
+        elif kind == 1:
+            out[at] ^= 1 << int(rng.integers(8))
+        elif kind == 2:
+            del out[at : at + int(rng.integers(1, 9))]
+        elif kind == 3:
+            out[at:at] = out[at : at + int(rng.integers(1, 9))]
+        else:
+            out[at : at + 1] = bytes(
+                rng.choice([0, 127, 128, 255], int(rng.integers(1, 12))).astype(
+                    np.uint8
+                )
+            )
+        if not out:
+            break
+    return bytes(out)
+
+
+def fuzz(masks, count, seed):
+    rng, refused = np.random.default_rng(seed), 0
+
+    def too_long(*_):
+        raise TimeoutError("a reader hangs")
+
+    before = signal.signal(signal.SIGALRM, too_long)
+    try:
+        for n in range(count):
+            suffix, data = masks[n % len(masks)]
+            broken = np.frombuffer(mutated(data, rng), np.uint8)
+            signal.alarm(20)
+            try:
+                content = PARSE[suffix](broken, limit=LIMIT)
+                for top in content.tops[:3]:
+                    content.counts(top)
+            except MaskFileError as error:
+                refused += "byte" in str(error) or "cell" in str(error)
+            finally:
+                signal.alarm(0)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    return refused
+
+
+def test_three_thousand_mutations_neither_crash_nor_hang(masks):
+    assert fuzz(masks, 3000, 0) > 1500
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_mutations_neither_crash_nor_hang(masks):
+    assert fuzz(masks, 100_000, 1) > 50_000
+
+
+def test_random_bytes_are_refused(tmp_path):
+    rng = np.random.default_rng(5)
+    for n in range(200):
+        data = rng.integers(0, 256, rng.integers(1, 400)).astype(np.uint8).tobytes()
+        for suffix in READ:
+            path = tmp_path / f"r.{suffix}"
+            path.write_bytes(
+                (
+                    b"%SEMI-OASIS\r\n\x01\x031.0\x00\xe8\x07\x01"
+                    if n % 2 and suffix == "oas"
+                    else b""
+                )
+                + data
+            )
+            with pytest.raises(MaskFileError, match="byte"):
+                READ[suffix](path)
+
+
+def test_an_empty_file_is_refused(tmp_path):
+    (tmp_path / "e").write_bytes(b"")
+    for read in READ.values():
+        with pytest.raises(MaskFileError, match="byte 0: empty"):
+            read(tmp_path / "e")
+
+
+def test_a_bomb_of_copies_is_refused(tmp_path):
+    from layout.formats import oasis_records as oasis
+
+    matrix = b"\x01" + oasis.unsigned(2**40) + oasis.unsigned(2**40) + b"\x01\x01"
+    body = (
+        bytes([oasis.CELL])
+        + oasis.string("T")
+        + bytes([oasis.PLACEMENT, 0xB8])
+        + oasis.string("U")
+        + b"\0\0"
+        + matrix
+    )
+    (tmp_path / "b.oas").write_bytes(oasis.start(1.0) + body + oasis.end((0,) * 6, 0))
+    with pytest.raises(MaskFileError, match=r"copies, at most 16,777,216 more"):
+        layout.read_oasis(tmp_path / "b.oas")
+
+
+def test_a_bomb_of_zeros_is_refused(tmp_path):
+    from layout.formats import oasis_records as oasis
+
+    block = (
+        bytes([oasis.CBLOCK, 0]) + oasis.unsigned(2**45) + oasis.unsigned(3) + b"abc"
+    )
+    (tmp_path / "z.oas").write_bytes(oasis.start(1.0) + block + oasis.end((0,) * 6, 0))
+    with pytest.raises(MaskFileError, match="compressed block of 3 bytes"):
+        layout.read_oasis(tmp_path / "z.oas")
+
+
+@pytest.mark.parametrize(("suffix", "options"), FORMS)
+def test_own_masks_pass_the_validator(plan, tmp_path, suffix, options):
+    path = tmp_path / f"m.{suffix}"
+    (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
+        plan, path, **options
+    )
+    assert validate(path) == []
+
+
+def test_the_validator_says_what_is_wrong(plan, tmp_path):
+    path = tmp_path / "m.oas"
+    layout.write_oasis(plan, path)
+    data = path.read_bytes()
+    path.write_bytes(data[:-300])
+    (finding,) = validate(path)
+    assert finding.byte >= 0
+    db = pytest.importorskip("klayout.db")
+    other = db.Layout()
+    for name in ("ONE", "TWO", "odd name"):
+        other.create_cell(name)
+    other.write(str(tmp_path / "k.gds"))
+    texts = [finding.text for finding in validate(tmp_path / "k.gds")]
+    assert any("top cells" in text for text in texts)
+
+
+def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
+    path = tmp_path / "m.oas"
+    layout.write_oasis(plan, path)
+    words = ["check", str(path), "--strict", "--json"]
+    first = cli.main(words)
+    values = json.loads(capsys.readouterr().out)
+    assert values["form"] == []
+    assert first == (0 if values["ok"] else 1)
+    square = np.array([[0, 0], [900, 0], [900, 900], [0, 900]])
+    both = {name: CellContent(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
+    assemble.write(Assembly("LIB", both, {}), tmp_path / "m.gds")
+    assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
+    told = capsys.readouterr().out
+    assert "keeps the design rules" in told.splitlines()[0]
+    assert "  FAILED: form: 2 top cells (ONE, TWO), need one" in told.splitlines()
