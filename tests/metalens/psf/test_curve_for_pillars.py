@@ -87,7 +87,7 @@ def test_the_error_of_the_curve_is_stated(phase, aperture_um, sensor_um, terms):
         **made.diameters.grid._asdict(),
     )
     truth = psf.psf_stack(
-        phase_of(d), np.where(d > 0, level_of(d), 0.0), **about, **view.seen
+        phase_of(d), np.where(d > 0, level_of(d), 0.0), **about, **view.arguments
     )
     error = np.linalg.norm(stack.intensity - truth.intensity) / np.linalg.norm(
         truth.intensity
@@ -116,7 +116,7 @@ def test_pillars_whose_own_answers_are_wrong_are_in_the_error():
         **made.diameters.grid._asdict(),
     )
     truth = psf.psf_stack(
-        np.angle(t), np.where(d > 0, np.abs(t), 0.0), **about, **view.seen
+        np.angle(t), np.where(d > 0, np.abs(t), 0.0), **about, **view.arguments
     )
     error = np.linalg.norm(stack.intensity - truth.intensity) / np.linalg.norm(
         truth.intensity
