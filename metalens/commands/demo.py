@@ -142,6 +142,12 @@ def _done(
             yield tuple(words), (int(status), dict(values), float(seconds))
 
 
+def _share(design: dict[str, Any]) -> str:
+    """Focusing efficiency of a design, or that it has none."""
+    found = design.get("efficiency")
+    return "not known" if found is None else f"{found:.1%}"
+
+
 def _write(folder: Path, outcomes: list[Outcome]) -> None:
     total = sum(o.seconds for o in outcomes)
     made = {_name(o.stage): o.values for o in outcomes}
@@ -150,9 +156,7 @@ def _write(folder: Path, outcomes: list[Outcome]) -> None:
         report.KeyFigure(
             "numerical aperture", f"{made['design'].get('numerical_aperture', 0):.3f}"
         ),
-        report.KeyFigure(
-            "focusing efficiency", f"{made['design'].get('efficiency', 0):.1%}"
-        ),
+        report.KeyFigure("focusing efficiency", _share(made["design"])),
         report.KeyFigure(
             "every stage passed its check",
             _verdict(outcomes),

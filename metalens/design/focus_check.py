@@ -148,14 +148,13 @@ def focus_figures(lens: Lens) -> FocusMetrics:
     meet: films, stop, losses of the pillars and solved neighbours are in it. Spots wider
     than the window of 8 wavelength / NA get one of four times the width.
     """
-    radius, wave = lens.diameters.radius_um, lens.wavelength_um
     meets = lens_meeting_um(lens)
     offset = (0.0, 0.0) if meets is None else (meets[0], meets[1])
-    airy = wave / (2 * psf.aperture(lens, (0.0, 0.0)))
+    airy = lens.wavelength_um / (2 * psf.aperture(lens, (0.0, 0.0)))
     for width, samples in ((16, 128), (64, 512)):
         view = psf.View(
             (lens.source_distance_um,),
-            window_um=min(width * airy, 8 * radius),
+            window_um=width * airy,
             samples=samples,
             offset_um=offset,
         )

@@ -262,3 +262,13 @@ def test_depths_that_are_left_out_hold_the_focus(saved, capsys):
     assert focus["depth_um"] == pytest.approx(1100.0)
     assert focus["strehl"] == pytest.approx(1, abs=5e-3)
     assert "z_scan" not in said
+
+
+def test_a_lens_of_a_tenth_of_a_fresnel_zone_has_its_figures_too():
+    """20 um for 2 mm, R²/(wavelength d) = 0.06: its spot, 1.029 wavelength d / 2R, is
+    four times as wide as the lens.
+    """
+    made = replace(flat_lens(n=54), sensor_distance_um=2000.0)
+    found = design.focus_figures(made)
+    assert found.fwhm_um == pytest.approx(1.029 * WAVE * 2000 / (54 * PITCH), rel=0.03)
+    assert 0 < found.efficiency < LEVEL**2
