@@ -14,7 +14,6 @@ from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
 from metalens.field import (
     Grid,
-    Imager,
     Layers,
     Optics,
     PillarWave,
@@ -49,7 +48,7 @@ def rows() -> Iterator[Row]:
             seconds = fastest(lambda made=made, seen=seen: made(seen)) / FRAMES  # type: ignore[misc]
         yield Row(
             "image 128² of 9 um, ±20°, 30 nm",
-            f"{len(made.patches)} patches, {_ranks(made)} kernels",
+            f"{len(made.light.kernels)} kernels",
             seconds,
             made.error,
             "estimate; held to every point's own PSF by tests",
@@ -197,8 +196,3 @@ def frames() -> Frames:
     return Frames(
         cover * fine.clamp_min(0), cover, depth.expand(FRAMES, 2, n, n).contiguous()
     )
-
-
-def _ranks(made: Imager) -> str:
-    ranks = [len(patch.mix) for patch in made.patches]
-    return f"{min(ranks)}-{max(ranks)}"

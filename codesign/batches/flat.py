@@ -120,7 +120,9 @@ def irradiance(
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the
     kernels of ``optics``.
     """
-    device = optics.transfer[0].device
+    device = (
+        optics.stack.device if isinstance(optics, Imager) else optics.transfer.device
+    )
     if isinstance(optics, Imager):
         if isinstance(frames, Frames):
             return optics(frames.to(device))

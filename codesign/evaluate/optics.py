@@ -143,7 +143,7 @@ class Scenes:
     pixels: int = 120
     window_um: float = 288.0
     image: Literal["true", "uniform"] = "true"
-    image_tolerance: float = field(default=0.1, metadata={"above": 0})
+    image_tolerance: float = field(default=0.015, metadata={"above": 0})
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= 100_000:

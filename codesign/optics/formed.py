@@ -26,14 +26,13 @@ from metalens.field import (
     Layers,
     Optics,
     SmoothWave,
-    blurred,
     normalised,
     surrogate,
-    trial,
+    textured_frames,
     with_psfs,
 )
 from metalens.ground.errors import PropagationError, SceneError, TrainingError
-from metalens.image import Frames, Grid, Imager, UniformImager, scene
+from metalens.image import Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
 from metalens.psf import Source
 
@@ -155,12 +154,7 @@ def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
         distance_um=plane.distance_um,
         device=device,
     )
-    if settings.passed == 1:
-        return whole
-    dimmer = [
-        replace(patch, energy=patch.energy * settings.passed) for patch in whole.patches
-    ]
-    return replace(whole, energy=whole.energy * settings.passed, patches=dimmer)
+    return whole if settings.passed == 1 else whole.scaled(settings.passed)
 
 
 def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
@@ -263,18 +257,9 @@ def difference(one: UniformImager, true: Imager) -> float:
 
     Of the texture's contrast; both images of frames of one size, with the same margin.
     """
-    seen, grid = trial(true.grid), true.grid
-    edge = grid.margin + grid.spare
-    inside = slice(edge, edge + grid.samples[0])
-    want = blurred(seen, true)[..., inside, inside]
-    part = slice(grid.spare, grid.spare + grid.samples[0] + 2 * grid.margin)
-    few = Frames(
-        *(
-            getattr(seen, name)[..., part, part].contiguous()
-            for name in Frames.__slots__
-        )
-    )
-    got = scene.image(few, one, margin=grid.margin)
+    frames, margin = textured_frames(true.grid), true.grid.margin
+    want = replace(true, stray=None)(frames)
+    got = scene.image(frames, one, margin=margin)
     return float((got - want).norm() / (want - want.mean()).norm())
 
 

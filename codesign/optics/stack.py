@@ -104,7 +104,7 @@ class OpticsConfig:
     image: Literal["true", "uniform"] = "true"
     fwhm_nm: float = 0.0
     filter_nm: float = 0.0
-    image_tolerance: float = 0.1
+    image_tolerance: float = 0.015
     family: Family = "free"
     parts: int = 1
     apart_um: float = 0.0

@@ -2,7 +2,7 @@
 changed or left out.
 
 All images of a device share one plan of field points, depths and wavelengths and one
-set of patches, so that two of
+set of kernels, so that two of
 them differ by the cause and not by how either was approximated.
 """
 

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from metalens.field.engine import imager as imager
     from metalens.field.engine import node_psfs as node_psfs
     from metalens.field.engine import normalised as normalised
-    from metalens.field.engine import trial as trial
+    from metalens.field.engine import textured_frames as textured_frames
     from metalens.field.forming import Imager as Imager
-    from metalens.field.forming import blurred as blurred
+    from metalens.field.forming import image_direct as image_direct
     from metalens.field.forming import with_psfs as with_psfs
     from metalens.field.plan import Grid as Grid
     from metalens.field.plan import Plan as Plan
@@ -41,9 +41,9 @@ __getattr__, __dir__, __all__ = attach(
         "SmoothWave": "waves",
         "Wave": "waves",
         "Window": "points",
-        "blurred": "forming",
         "cell_um": "waves",
         "drawn": "slopes",
+        "image_direct": "forming",
         "imager": "engine",
         "node_light": "slopes",
         "node_psfs": "engine",
@@ -51,7 +51,7 @@ __getattr__, __dir__, __all__ = attach(
         "psfs": "points",
         "surrogate": "slopes",
         "term": "slopes",
-        "trial": "engine",
+        "textured_frames": "engine",
         "with_psfs": "forming",
     },
 )

@@ -1,6 +1,4 @@
-"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth``
-times the frames in one pass), the
-light on the nodes of a pupil, and pillars gathered over cells."""
+"""Compiled loops: light on the nodes of a pupil, and pillars averaged over cells."""
 
 import numba
 import numpy as np
@@ -17,99 +15,6 @@ PART, put = (
     answers.PART,
     answers.answers,
 )  # compiled loops know names of their own module
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
-def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-untyped-def]
-    """Sheets weighted for kernels: ``patches.lagrange`` between the depths, one depth
-    node after the other, so that all
-    pixels of a patch are one loop.
-
-    Args:
-        content, place: (frames, sheets, y, x) light or coverage, and depth in units of
-            the depth nodes, float32.
-        held: (few, 2) frame and sheet that are wanted. lit: whether the relative
-            illumination weighs too.
-        tables: (depths, rank, y * x) weights and (depths, y * x) illumination, float32.
-            first: of the kernels.
-        out: (y, kernels, few, x).
-    """
-    high, few, _, wide = out.shape
-    weights, energy = tables
-    depths = len(energy)
-    value, at, start, a, b, c, d, share, level = np.empty((9, high * wide), np.float32)
-    total = np.empty((few, high * wide), np.float32)
-    for job in range(len(held)):
-        f, s = held[job]
-        _reached(content[f, s], place[f, s], depths, value, (at, start, a, b, c, d))
-        total[:], level[:] = 0, 0
-        for z in range(int(start.min()), int(start.max()) + min(4, depths)):
-            for x in range(len(share)):
-                k = np.float32(z) - start[x]
-                near = np.float32(k == 0) * a[x] + np.float32(k == 1) * b[x]
-                share[x] = near + np.float32(k == 2) * c[x] + np.float32(k == 3) * d[x]
-            if lit:
-                table = energy[z]
-                for x in range(len(share)):
-                    level[x] += share[x] * table[x]
-            for r in range(few):
-                table, sums = weights[z, first + r], total[r]
-                for x in range(len(share)):
-                    sums[x] += share[x] * table[x]
-        if lit:
-            for x in range(len(value)):
-                value[x] *= level[x]
-        for r in range(few):
-            given = total[r]
-            for y in range(high):
-                row = out[y, r, job]
-                for x in range(wide):
-                    row[x] = value[y * wide + x] * given[y * wide + x]
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
-def _reached(content, place, depths, value, between):  # type: ignore[no-untyped-def]
-    """Content of a sheet; of every pixel the depth, the first node that it reaches, and
-    :func:`_taps` from there.
-    """
-    at, start, a, b, c, d = between
-    wide, n = content.shape[1], min(4, depths)
-    for y in range(len(content)):
-        row, deep = content[y], place[y]
-        for x in range(wide):
-            value[y * wide + x] = row[x]
-            at[y * wide + x] = deep[x] if row[x] != 0 else np.float32(0)
-    before, top = np.float32(n // 2 - 1), np.float32(depths - n)
-    for x in range(len(at)):
-        start[x] = min(max(np.floor(at[x]) - before, np.float32(0)), top)
-    if n == 4:  # known when compiled: several pixels at once
-        for x in range(len(at)):
-            a[x], b[x], c[x], d[x] = _taps(at[x] - start[x], 4)
-    else:
-        for x in range(len(at)):
-            a[x], b[x], c[x], d[x] = _taps(at[x] - start[x], n)
-
-
-@numba.njit(inline="always")
-def _taps(t, n):  # type: ignore[no-untyped-def]
-    """Weights of ``patches.lagrange`` at t from the first of n nodes; nodes that are
-    not there have 0.
-    """
-    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
-    u, v, w = t - one, t - np.float32(2), t - np.float32(3)
-    if n == 4:
-        sixth = np.float32(1 / 6)
-        return (
-            -u * v * w * sixth,
-            t * v * w * half,
-            -t * u * w * half,
-            t * u * v * sixth,
-        )
-    if n == 3:
-        return u * v * half, -t * v, t * u * half, none
-    if n == 2:
-        return -u, t, none, none
-    return one, none, none, none
 
 
 def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:

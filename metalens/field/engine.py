@@ -11,21 +11,13 @@ import torch
 from torch import Tensor
 
 from metalens.field import left_out
-from metalens.field import patches as cutting
-from metalens.field.forming import (
-    Imager,
-    between_nodes,
-    blurred,
-    even_light,
-    evened,
-    returned,
-    vergence,
-    with_psfs,
-)
-from metalens.field.patches import dense
-from metalens.field.plan import SHARES, Grid, Plan, depth_nodes, planned, spectral
+from metalens.field.forming import Imager, build_imager
+from metalens.field.low_rank import PsfField, frame_maps, plane_images, psf_nodes
+from metalens.field.plan import Grid, Plan, depth_nodes, planned, spectral
 from metalens.field.points import SPARE, Optics, Window, sampling
+from metalens.field.splines import spline_matrix
 from metalens.field.stray import stray_of
+from metalens.field.texture import CONTRAST, scene_error
 from metalens.field.through import through
 from metalens.field.waves import PillarWave, SmoothWave, Wave, wave_of
 from metalens.ground.errors import SceneError
@@ -34,15 +26,6 @@ from metalens.lens import Layers, Lens
 from metalens.psf import Nodes, Polarisation, Source, blur_um
 from metalens.psf import spectrum as spectra
 
-# samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
-PATCH = 28
-# tolerances tried for the worst PSF of a patch; below 1 where what is returned is
-# darker than the frame
-LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0, 0.5, 0.25, 0.12)
-OVERLAP = 4  # samples that two patches share
-# tolerance of coverage per tolerance of light: it matters at the borders of sheets
-# alone
-COARSE = 4.0
 # pixels of the frame at which the PSFs that are used are compared with true ones
 HELD_OUT = 16
 NEGLECTED = (
@@ -52,9 +35,8 @@ ALL = 2  # of them at which pillars taken together are
 # field points along an axis that tell how deep an image lies in the shadow of a stop
 SHADED = 6
 # by how much an image may be dimmer than its frame and still be prepared to its own
-# light: what a
+# light: what a shadow's ripples leave out is more than the rest there
 DEEPEST = 8.0
-# shadow's ripples leave out is more than the rest there
 
 
 def imager(
@@ -80,14 +62,15 @@ def imager(
         layers: films around the lens; by default those of the lens file with the cover
             of its cell (none for a wave).
         field: (x, y) angle in rad of the middle of the grid.
-        tolerance: of the image of a 1/f texture, relative L2.
+        tolerance: relative L2 error of the image of a scene of mean 1 with a 1/f
+            texture of standard deviation 0.3.
         distance_um: lens to sensor, by default the design's.
         polarisation: ``flux`` (of unpolarised light through the sensor's plane, which a
             pixel counts), ``scalar``,
             ``auto``: one scalar where its error, ``parts["polarisation"]``, is below
             the tolerance, else the flux, or
             ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
-        device: where PSFs and patches are computed and frames will be; a few PSFs are
+        device: where PSFs and kernels are computed and frames will be; a few PSFs are
             judged on the processor.
 
     Raises:
@@ -121,9 +104,10 @@ def imager(
     given = optics, scene_grid, source, middle
     found = _planned(given, tolerance, shaded, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, found.plan, device)
-    whole = patched(scene_grid, found.plan, stack, energy, tolerance=found.tolerance)
-    made = evened(thinned(whole, tolerance=tolerance))
-    parts = {**made.parts, **_held_out(optics, whole)}
+    about = scene_grid, found.plan, stack, energy
+    with torch.no_grad():
+        made = build_imager(*about, tolerance=found.tolerance)
+        parts = {**fitted(made), **_held_out(optics, made)}
     if isinstance(wave, PillarWave):
         parts["unknown"] = spectra.unknown(source, wave.lens.proxy.wavelengths_um)
     stray = stray_of(
@@ -190,9 +174,8 @@ def _shaded(
     )
     with torch.no_grad():
         stack, energy = node_psfs(optics, coarse)
-    return min(
-        _dimmer(Imager(grid, coarse, stack.nan_to_num(), energy, [], [], {})), DEEPEST
-    )
+    field = PsfField(stack.nan_to_num(), energy, coarse.depths_um)
+    return min(_dimmer(field, grid), DEEPEST)
 
 
 def node_psfs(
@@ -257,75 +240,52 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     return out
 
 
-def patched(
-    grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float
-) -> Imager:
-    """Cut the field into patches with all their kernels; differentiable in the PSFs and
-    their illumination.
+def fitted(made: Imager) -> dict[str, float]:
+    """Errors of the kernels beside the interpolated PSFs of the nodes.
+
+    Of a textured scene, at places drawn at random, and of planes that are evenly lit,
+    root mean square at the worst depth; depths are the nodes and those half-way.
     """
-    count = max(1, round(min(grid.frame) / PATCH))
-    between = between_nodes(grid, plan)
-    most = tolerance * SHARES["kernels"] / 4
-    made = cutting.cut(
-        stack, energy, between, patches=count, overlap=OVERLAP, tolerance=most
-    )
-    return with_psfs(
-        Imager(grid, plan, stack, energy, made, [], {"kernels": most}), stack, energy
-    )
+    near, far = made.light.vergence
+    count = 2 * len(made.plan.depths_um) - 1
+    depths = 1 / torch.linspace(near, far, count, dtype=torch.float64)
+    pixels = _pixels(made, HELD_OUT)
+    used = psfs_used(made, pixels, depths)
+    kernels = scene_error(used, psfs_between(made, pixels, depths))
+    field = made.field
+    deep = spline_matrix(torch.linspace(0, 1, count), len(made.plan.depths_um))
+    light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
+    even = PsfField(light, torch.ones_like(light[..., 0, 0]), depths)
+    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
+    wanted = returned(plane_images(even, maps), made.grid)
+    one = torch.ones(1, *made.grid.frame).to(field.psf)
+    found = [
+        returned(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
+        for depth in depths.tolist()
+    ]
+    wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
+    level = wanted.square().mean((1, 2)).max().clamp_min(1e-30)
+    return {"kernels": kernels, "planes": float(torch.sqrt(wrong / level))}
 
 
-def thinned(whole: Imager, *, tolerance: float) -> Imager:
-    """As few kernels as image a texture of two sheets (:func:`trial`) within their
-    share of the tolerance.
-
-    What a patch lacks differs from pixel to pixel, and adds up to less than the worst
-    PSF says. The error is of the
-    kernels alone: that even light is put right afterwards is not counted, since points
-    gain nothing by it; of the frame
-    or of what is returned of it, where that is the darker part.
-    """
-    share = tolerance * SHARES["kernels"]
-    seen = trial(whole.grid).to(whole.stack.device)
-    with torch.no_grad():
-        want = blurred(seen, whole)
-        for looser in LOOSER:
-            few = trimmed(whole, share * looser)
-            missed = blurred(seen, few) - want
-            pairs = (
-                (missed, want),
-                (returned(missed, whole.grid), returned(want, whole.grid)),
-            )
-            error = max(
-                float(part.norm() / light.norm().clamp_min(1e-30))
-                for part, light in pairs
-            )
-            if error <= share * 0.97:
-                break
-    few = trimmed(whole, share * looser)
-    return replace(few, parts={"kernels": math.hypot(error, whole.parts["kernels"])})
+def _pixels(made: Imager, count: int) -> Tensor:
+    """(count, [row, column]) samples of the frame, drawn at random."""
+    draw = np.random.default_rng(7)
+    place = np.floor(draw.random((count, 2)) * made.grid.frame)
+    return torch.from_numpy(place).long()
 
 
-def trimmed(optics: Imager, tolerance: float) -> Imager:
-    """The first kernels of every patch, as many as its own account of the tolerance
-    needs.
-    """
-    made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]
-    transfer = [t[: len(p.mix)] for t, p in zip(optics.transfer, made, strict=True)]
-    return replace(optics, patches=made, transfer=transfer)
-
-
-def trial(grid: Grid) -> Frames:
-    """One frame of two sheets over all depths with 1/f texture of mean 1 and contrast
-    about 0.3.
+def textured_frames(grid: Grid) -> Frames:
+    """One frame of two sheets over all depths, of mean 1 with a 1/f texture of standard
+    deviation 0.3.
     """
     draw = torch.Generator().manual_seed(11)
-    y, x = grid.frame
+    y, x = (n + 2 * grid.margin for n in grid.samples)
     fy, fx = torch.fft.fftfreq(y)[:, None], torch.fft.rfftfreq(x)
     white = torch.fft.rfft2(torch.randn(2, y, x, generator=draw))
-    rough = torch.fft.irfft2(
-        white / torch.sqrt(fy**2 + fx**2 + (0.5 / max(x, y)) ** 2), s=(y, x)
-    )
-    texture = (1 + 0.3 * (rough - rough.mean()) / rough.std()).clamp_min(0)
+    lowest = 0.5 / max(x, y)
+    rough = torch.fft.irfft2(white / torch.sqrt(fy**2 + fx**2 + lowest**2), s=(y, x))
+    texture = (1 + CONTRAST * (rough - rough.mean()) / rough.std()).clamp_min(0)
     down = torch.linspace(-1, 1, y)[:, None].expand(y, x)
     across = torch.linspace(-1, 1, x).expand(y, x)
     near = torch.sigmoid((-down - 0.25 + 0.2 * across) * y / 4)
@@ -350,10 +310,7 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     an image that is dimmer than it.
     """
     plan = made.plan
-    draw = np.random.default_rng(7)
-    pixels = torch.from_numpy(
-        np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)
-    ).long()
+    pixels = _pixels(made, HELD_OUT)
     rows, columns = (
         torch.linspace(float(nodes[0]), float(nodes[-1]), n, dtype=torch.float64)
         for n, nodes in zip(made.grid.frame, (plan.y_um, plan.x_um), strict=True)
@@ -372,11 +329,9 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[
         ..., None, None
     ]
-    with torch.no_grad():
-        used, lit = psfs_used(made, pixels, depths), lights_used(made, pixels, depths)
-        got = (used * lit[..., None, None]).cpu()
-    dimmer = _dimmer(made)
-    nodes = cutting.together(got, true * level) * dimmer
+    got = psfs_between(made, pixels, depths).cpu()
+    dimmer = _dimmer(made.field, made.grid)
+    nodes = scene_error(got, (true * level).to(got)) * dimmer
     few = at[:NEGLECTED], depths
     # of the brightest of few places in the image
     share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
@@ -406,16 +361,21 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
 
 
-def _dimmer(made: Imager) -> float:
+def _dimmer(field: PsfField, grid: Grid) -> float:
     """By how much an image of even light is dimmer than the whole frame's, 1 at least:
-    margins may be in the light
-    where an image lies in the shadow of a stop."""
-    with torch.no_grad():
-        lit = even_light(made)
-        whole, image = (
-            float(part.square().mean().sqrt())
-            for part in (lit, returned(lit, made.grid))
-        )
+    margins may be in the light where an image lies in the shadow of a stop.
+    """
+    maps = frame_maps(grid.frame, psf_nodes(field), field.psf)
+    middle = slice(field.psf.shape[2] // 2, field.psf.shape[2] // 2 + 1)
+    some = PsfField(
+        field.psf[:, :, middle].detach(),
+        field.illumination[:, :, middle].detach(),
+        field.depths_um[middle],
+    )
+    plane = plane_images(some, maps)[0]
+    whole, image = (
+        float(part.square().mean().sqrt()) for part in (plane, returned(plane, grid))
+    )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
 
@@ -449,42 +409,31 @@ def _ripples(
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row,
-    column]) of the frame.
-    """
-    flat, position = (
-        optics.stack.flatten(0, 2),
-        vergence(depths_um, optics.plan.depths_um),
-    )
-    deep = dense(
-        position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)
-    ).to(flat)
-    out = flat.new_zeros(len(pixels), len(depths_um), *flat.shape[1:])
-    for patch in optics.patches:
-        (top, below), (left, right) = patch.rows, patch.columns
-        for i, (row, column) in enumerate(pixels.tolist()):
-            if top <= row < below and left <= column < right:
-                weights = (
-                    deep @ patch.weights[(row - top) * (right - left) + column - left]
-                )
-                out[i] += (
-                    weights @ (patch.mix @ flat[patch.nodes].flatten(1))
-                ).view_as(out[i])
-    return out
+    """(n, depths, h, w) light that the kernels give sources at (n, [row, column])."""
+    high, wide = optics.grid.frame
+    where = (pixels[:, 0] * wide + pixels[:, 1]).to(optics.stack.device)
+    out = []
+    for depth in depths_um.tolist():
+        deep = torch.full((high, wide), depth).to(optics.stack)
+        weights = optics.light.interpolate(deep, where)
+        out.append(torch.einsum("rn,rhw->nhw", weights, optics.light.kernels))
+    return torch.stack(out, 1)
 
 
-def lights_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths) E of sources at (n, [row, column]) of the frame."""
-    depths, energy = optics.plan.depths_um, optics.energy
-    position = vergence(depths_um, depths)
-    deep = dense(position, torch.arange(len(depths), dtype=position.dtype))
-    ends = [
-        part[at]
-        for part, at in zip(
-            between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True
-        )
-    ]
-    light: Tensor = torch.einsum(
-        "na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy
-    )
-    return light
+def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
+    """(n, depths, h, w) light that the splines through the nodes' PSFs give there."""
+    field = optics.field
+    maps = frame_maps(optics.grid.frame, psf_nodes(field), field.psf)
+    rows, columns = (m[p] for m, p in zip(maps, pixels.unbind(1), strict=True))
+    near, far = optics.light.vergence
+    unit = (near - 1 / depths_um) / max(near - far, 1e-30)
+    deep = spline_matrix(unit.clamp(0, 1), field.psf.shape[2]).to(field.psf)
+    light = torch.einsum("cz,abzhw->abchw", deep, field.light)
+    return torch.einsum("na,nb,abchw->nchw", rows, columns, light)
+
+
+def returned(whole: Tensor, grid: Grid) -> Tensor:
+    """(…, y, x) samples of an image of the whole frame, without margin and spare."""
+    edge = grid.margin + grid.spare
+    y, x = (slice(edge, edge + n) for n in grid.samples)
+    return whole[..., y, x]

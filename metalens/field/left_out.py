@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from metalens import propagate
-from metalens.field.patches import in_light, relative
 from metalens.field.points import Optics, Window, psfs, sampling
+from metalens.field.texture import texture_error, weigh_by_light
 from metalens.field.waves import Pillars
 from metalens.psf import Nodes, Polarisation, psf_stack
 
@@ -65,8 +65,9 @@ def neglected(judged: Judged) -> float:
     themselves."""
     light = judged.shown.sum((-1, -2))
     wide = width(judged.shown / light[..., None, None]) * judged.window.step_um
-    return in_light(
-        relative(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown), light
+    return weigh_by_light(
+        texture_error(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown),
+        light,
     )
 
 
@@ -75,7 +76,7 @@ def folded(judged: Judged) -> float:
     their light, against those of twice
     the period."""
     want = judged.lit(period=2 * judged.window.period)
-    return in_light(relative(judged.shown, want), want.sum((-1, -2)))
+    return weigh_by_light(texture_error(judged.shown, want), want.sum((-1, -2)))
 
 
 def polarised(
@@ -110,8 +111,10 @@ def unpolarised(judged: Judged, whole: Tensor | None = None) -> float:
         return 0.0
     whole = judged.lit(components=window.whole) if whole is None else whole
     few, light = judged.shown, whole.sum((-1, -2))
-    return in_light(
-        relative(few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]),
+    return weigh_by_light(
+        texture_error(
+            few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]
+        ),
         light,
     )
 
@@ -170,13 +173,13 @@ def missing(
                 window=window,
             )[0, :, few, few]
             errors.append(
-                relative(
+                texture_error(
                     got / got.sum((-1, -2), keepdim=True),
                     want / want.sum((-1, -2), keepdim=True),
                 )
             )
             lights.append(got.sum((-1, -2)))
-    return in_light(torch.stack(errors), torch.stack(lights))
+    return weigh_by_light(torch.stack(errors), torch.stack(lights))
 
 
 def _triangles(count: int, finer: int) -> Tensor:

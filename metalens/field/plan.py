@@ -2,7 +2,6 @@
 the field, cheapest first.
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,29 +12,20 @@ from torch import Tensor
 
 from metalens.field import compiled
 from metalens.field.left_out import Judged, folded, neglected, polarised
-from metalens.field.patches import dense, relative, together
 from metalens.field.points import Optics, Window, psfs
+from metalens.field.splines import TAPS, spline_matrix
+from metalens.field.texture import scene_error, texture_error
 from metalens.field.waves import PillarWave
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
 from metalens.psf import Nodes, Polarisation, Source
 from metalens.psf import spectrum as spectra
 
-STEPS = (
-    24,
-    16,
-    12,
-    8,
-    6,
-    4,
-)  # between depths that are tried, in 96ths of the range of 1/z
-FINE = 96
-ALONG = 192  # steps of an axis of the field, on which its nodes lie
-MOST = 57  # nodes along an axis
-DENSER = (
-    0.0,
-    2.0,
-)  # by how much more the nodes lie at the rim of the field than on the axis
+DEPTH_NODES = (5, 7, 9, 13, 17, 25)  # numbers that are tried
+MOST = 57  # nodes along an axis of the field
+# Largest errors of interpolation, and of light folded back, whatever the tolerance:
+# evenly lit planes are then even to half a percent between the nodes.
+NODES_MOST, FOLDED_MOST = 0.005, 0.001
 LONGEST = 4.0  # period of the nodes, in windows, from which on none is longer
 LONGER = 2**0.25  # by which one is than the next; nodes grow with its square
 OFF_AXIS = (
@@ -52,16 +42,15 @@ STREWN = tuple(
         strict=True,
     )
 )
-# power of their distance by which the error falls; more would need PSFs without edges
-ORDER = 2.5
-SHARES = {  # of the tolerance; together all of it
-    "kernels": 0.6,
-    "field": 0.4,
-    "depth": 0.3,
-    "spectrum": 0.4,
-    "transform": 0.36,
-    "polarisation": 0.2,
-    "folded": 0.24,
+ORDER = 2.5  # of the error in the distance of nodes; more needs PSFs without edges
+SHARES = {  # of the tolerance; in quadrature all of it
+    "kernels": 0.8,
+    "field": 0.3,
+    "depth": 0.2,
+    "spectrum": 0.3,
+    "transform": 0.25,
+    "polarisation": 0.15,
+    "folded": 0.2,
 }
 
 
@@ -174,38 +163,27 @@ def planned(
         coarse,
         window,
         (_places(STREWN, middle_um, half), ends),
-        tolerance * SHARES["folded"],
+        min(tolerance * SHARES["folded"], FOLDED_MOST),
     )
 
-    def across(places: Tensor) -> Tensor:
-        at = torch.stack(
-            [
-                (2 * places / ALONG - 1) * half[1],
-                torch.full_like(places, 0.6 * half[0]),
-            ],
-            -1,
-        )
-        return spectral(
-            optics,
-            at + torch.tensor(middle_um, dtype=torch.float64),
-            ends,
-            coarse,
-            window,
-        )
+    def across(unit: Tensor) -> Tensor:
+        x = (2 * unit - 1) * half[1]
+        at = torch.stack([x, torch.full_like(x, 0.6 * half[0])], -1)
+        at = at + torch.tensor(middle_um, dtype=torch.float64)
+        return spectral(optics, at, ends, coarse, window)
 
-    def deep(places: Tensor) -> Tensor:
+    def deep(unit: Tensor) -> Tensor:
         at = _places(((0.0, 0.0), (0.7, -0.4)), middle_um, half)
         near, far = (1 / d for d in grid.depths_um)
-        return spectral(
-            optics, at, 1 / (near + (far - near) * places / FINE), coarse, window
-        ).transpose(0, 1)
+        depths = 1 / (near + (far - near) * unit)
+        return spectral(optics, at, depths, coarse, window).transpose(0, 1)
 
-    count, denser = _line(across, (middle_um[0], half[1]), tolerance * SHARES["field"])
-    depths = (
-        1
-        if grid.depths_um[0] == grid.depths_um[1]
-        else _fewest(deep, tolerance * SHARES["depth"], "depths")
+    count = _field_nodes(
+        across, grid.frame[1], min(tolerance * SHARES["field"], NODES_MOST)
     )
+    one = grid.depths_um[0] == grid.depths_um[1]
+    most = min(tolerance * SHARES["depth"], NODES_MOST)
+    depths = 1 if one else _depth_count(deep, most)
     aside = _places(OFF_AXIS, middle_um, half), ends
     if (
         neglected(Judged(optics, coarse, window, aside))
@@ -218,14 +196,7 @@ def planned(
         Judged(optics, coarse, window, some), polarisation, within=(tolerance, most)
     )
     y, x = (
-        m
-        + (
-            2
-            * placed(max(2, math.ceil((count - 1) * h / half[1]) + 1), denser, (m, h))
-            / ALONG
-            - 1
-        )
-        * h
+        m + h * torch.linspace(-1, 1, _along(count, h / half[1]), dtype=torch.float64)
         for m, h in zip(middle_um[::-1], half, strict=True)
     )
     return Plan(
@@ -329,7 +300,7 @@ def waves_of(
         found = spectral(optics, at, ends, made, window)
         light = found.sum((-1, -2))
         error = float(
-            (relative(last, found) * light / light.amax(0)).max()
+            (texture_error(last, found) * light / light.amax(0)).max()
         )  # of the image, where that is dark too
         if error + beside <= tolerance:  # of the rule before; this one is finer
             return replace(_coarse(optics, source, count - 1), error=error + beside)
@@ -347,25 +318,11 @@ def _coarse(optics: Optics, source: Source | spectra.Measured, count: int) -> No
     return spectra.known(made, source, optics.wave.lens.proxy.wavelengths_um)
 
 
-def placed(count: int, denser: float, span: tuple[float, float]) -> Tensor:
-    """(nodes,) places 0 … ALONG of an axis, whole numbers: so many, denser with their
-    distance X from the lens axis.
-
-    The density is 1 + denser |X| / largest |X|: astigmatism moves the edges of a PSF by X², coma by X.
-
-    Args:
-        span: middle and half length of the axis in um.
-    """
-    x = span[0] + np.linspace(-1, 1, 8 * ALONG + 1) * span[1]
-    rim = max(np.abs(x).max(), 1e-9)
-    passed = x / rim + denser / 2 * (x / rim) * np.abs(x / rim)
-    even = np.linspace(passed[0], passed[-1], min(count, ALONG + 1))
-    place = (
-        np.rint((np.interp(even, passed, x) - span[0]) / span[1] * (ALONG / 2))
-        if span[1]
-        else np.zeros(1)
-    )
-    return torch.from_numpy(np.unique(place) + ALONG / 2)
+def _along(count: int, length: float) -> int:
+    """Nodes of an axis so many times as long as one of ``count`` nodes; one of none."""
+    if count == 1 or length == 0:
+        return 1
+    return max(TAPS, math.ceil((count - 1) * length) + 1)
 
 
 DARK = (
@@ -375,63 +332,49 @@ DARK = (
 
 
 class _Known:
-    """PSFs at whole places of a line, of sum 1, and their light, each computed once."""
+    """Light of PSFs at places 0 … 1 of a line, each computed once."""
 
     def __init__(self, at: Callable[[Tensor], Tensor]) -> None:
-        self.at, self.kept = at, dict[int, tuple[Tensor, Tensor]]()
+        self.at, self.kept = at, dict[float, Tensor]()
 
-    def error(self, nodes: list[int]) -> float:
-        """Of the image of even radiance, by interpolation half-way between the nodes,
-        at the worst depth.
+    def between(self, count: int) -> tuple[Tensor, Tensor]:
+        """(count - 1, depths, h, w) light half-way between so many nodes, interpolated
+        and true.
         """
-        between = sorted(
-            {(a + b) // 2 for a, b in itertools.pairwise(nodes)} - set(nodes)
-        )
-        (want, bright), given = self.psfs(between), self.psfs(nodes)
-        weights = dense(
-            *(torch.tensor(places, dtype=torch.float64) for places in (between, nodes))
-        ).to(want)
-        got, light = (torch.tensordot(weights, part, 1) for part in given)
-        return together(got * light[..., None, None], want * bright[..., None, None])
+        nodes = torch.linspace(0, 1, count, dtype=torch.float64)
+        middle = (nodes[1:] + nodes[:-1]) / 2
+        true, given = self.light(middle), self.light(nodes)
+        matrix = spline_matrix(middle, count).to(given)
+        return torch.tensordot(matrix, given, 1), true
 
-    def psfs(self, places: list[int]) -> tuple[Tensor, Tensor]:
-        """(places, depths, h, w) and (places, depths)."""
-        missing = [i for i in places if i not in self.kept]
+    def light(self, unit: Tensor) -> Tensor:
+        """(places, depths, h, w)."""
+        keys = [round(place, 9) for place in unit.tolist()]
+        missing = [key for key in keys if key not in self.kept]
         if missing:
             found = self.at(torch.tensor(missing, dtype=torch.float64))
-            light = found.sum((-1, -2))
-            if not bool((light > 0).all()):
+            if not bool((found.sum((-1, -2)) > 0).all()):
                 raise SceneError(DARK)
-            self.kept.update(
-                zip(
-                    missing,
-                    zip(found / light[..., None, None], light, strict=True),
-                    strict=True,
-                )
-            )
-        psfs, lights = zip(*(self.kept[i] for i in places), strict=True)
-        return torch.stack(psfs), torch.stack(lights)
+            self.kept.update(zip(missing, found, strict=True))
+        return torch.stack([self.kept[key] for key in keys])
 
 
-def _line(
-    at: Callable[[Tensor], Tensor], span: tuple[float, float], tolerance: float
-) -> tuple[int, float]:
-    """Number and density of the nodes that a line of PSFs needs; ``at`` gives PSFs at
-    places 0 … ALONG.
+def _field_nodes(at: Callable[[Tensor], Tensor], samples: int, tolerance: float) -> int:
+    """Number of nodes that a line of PSFs needs, at equal steps.
+
+    Half-way between them a textured scene is to err by no more than the tolerance.
+
+    Args:
+        at: gives light at places 0 … 1 of the line. samples: along it.
     """
+    if samples == 1:
+        return 1
     known, count = _Known(at), 5
     while count <= MOST:
-        tried = [
-            (known.error(placed(count, d, span).int().tolist()), d) for d in DENSER
-        ]
-        error, denser = min(tried)
+        error = scene_error(*known.between(count))
         if error <= tolerance:
-            return count, denser
-        most = (
-            count - 1
-            if error > 0.3
-            else (count - 1) * (error / tolerance) ** (1 / ORDER)
-        )
+            return count
+        most = (count - 1) * (error / tolerance) ** (1 / ORDER)
         count = max(count + 2, 1 + 2 * math.ceil(0.45 * min(most, 2 * (count - 1))))
     raise SceneError(
         f"{count - 2} field points along an axis leave {error:.2g} of the image, above {tolerance:.2g}: "
@@ -439,16 +382,14 @@ def _line(
     )
 
 
-def _fewest(at: Callable[[Tensor], Tensor], tolerance: float, what: str) -> int:
-    """Nodes needed at even steps of a line of PSFs; ``at`` gives PSFs at places 0 …
-    FINE.
-    """
+def _depth_count(at: Callable[[Tensor], Tensor], tolerance: float) -> int:
+    """Number of depth nodes that a scene needs; ``at`` gives light at 0 … 1 of 1/z."""
     known = _Known(at)
-    for step in STEPS:
-        error = known.error(list(range(0, FINE + 1, step)))
+    for count in DEPTH_NODES:
+        error = scene_error(*known.between(count))
         if error <= tolerance:
-            return FINE // step + 1
+            return count
     raise SceneError(
-        f"{FINE // step + 1} {what} leave {error:.2g} of the image, above {tolerance:.2g}: "
-        "raise the tolerance or the sample, or narrow the field"
+        f"{count} depths leave {error:.2g} of the image, above {tolerance:.2g}: "
+        "raise the tolerance or the sample, or narrow the range of depths"
     )

@@ -1,23 +1,18 @@
-"""Gradients of an image's loss: exact in the PSFs of the nodes, and from few of them
-and of the wavelengths, unbiased.
+"""Gradients of an image's loss by the PSFs at the nodes: exact, and by few of them.
 
 Few kernels show the PSFs of a field, and not how they change: through them the
-derivative of an image of 1 % by a coma
-is off by half. So an image is formed through kernels, and its derivative is that of the
-sum over all nodes
+derivative of an image of 1 % by a coma or by the depth of a point is off by half. So
+an image is formed through kernels, and its derivative is that of the sum over all nodes
 
-    image(X) = Σ_nodes Σ_x to_node(x) source(x) P_node(X - x)
-    d loss / d P_node(k) = Σ_x to_node(x) source(x) G(x + k)
+    image(X) = Σ_nodes Σ_x s_node(x, z) source(x) E_node P_node(X - x)
+    d loss / d P_node(k) = Σ_x s_node(x, z) source(x) E_node G(x + k)
 
-with G = d loss / d image: correlations of the source near a node with G, one a node, by
-transforms. The derivative by
-the depth of a source is that of the same sum, through the weights of the depth nodes
-(4-point polynomials in 1/z).
+with the splines s of :mod:`metalens.field.splines` and G = d loss / d image:
+correlations of the source with G, one a node, by transforms.
 
 The image is linear in the light of the nodes. So a step goes in two halves: with the
-light of all nodes as a leaf
-(no graph through the pupils), the loss gives G' = d loss / d light; then for any set of
-(point, wavelength) drawn with
+light of all nodes as a leaf (no graph through the pupils), the loss gives
+G' = d loss / d light; then for any set of (point, wavelength) drawn with
 probabilities q,
 
     E[ Σ_drawn  w_λ <G'_point, light_point,λ(phase)> / (n q) ]  has the gradient
@@ -29,39 +24,36 @@ the gradient of the loss itself. Wavelengths are drawn by their weights, points 
 from collections.abc import Set
 from typing import Any
 
-import scipy.fft
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from metalens.field.low_rank import PsfField, fast_shape, frame_maps
 from metalens.field.plan import Plan, spectral
 from metalens.field.points import Optics, psfs
+from metalens.field.splines import TAPS, spline_coefficients, spline_taps
 
 
 def by_nodes(
-    stack: Tensor,
-    sources: list[Tensor],
-    deep: tuple[Tensor, Tensor],
-    between: list[Tensor],
+    field: PsfField,
+    content: Tensor,
+    depth_um: Tensor,
+    *,
+    lit: bool = True,
     asked: Set[int] | None = None,
 ) -> Tensor:
-    """Zeros as large as an image of sources (frames, kinds, sheets, y, x) and half a
-    window at each side, whose
-    derivatives by the PSFs of the nodes, by the sources and by the weights of the
-    depths are those of the image through
-    all nodes.
+    """Zeros (frames, *sheets, y, x) whose derivatives by PSFs and depths are those of
+    the image through all nodes.
 
     Args:
-        stack: (rows, columns, depths, h, w) of the nodes. sources: (frames, sheets, y,
-            x) of each kind.
-        deep: first depth node and weights (…, taps) of the nodes at the depth of every
-            source.
-        between: (pixel rows, node rows) and (pixel columns, node columns).
+        content, depth_um: (frames, *sheets, y, x) light or coverage, and depth.
+        lit: whether the content is light, which the illumination weighs.
         asked: numbers of the nodes whose derivatives are wanted, the others' being 0;
             None for all.
     """
-    first, taps = deep
-    zeros: Tensor = _ByNodes.apply(stack, taps, first, between, asked, *sources)  # type: ignore[no-untyped-call]
+    shares = depth_shares(depth_um, field.depths_um)
+    about = field.illumination.detach(), lit, asked
+    zeros: Tensor = _ByNodes.apply(field.psf, shares, content, about)  # type: ignore[no-untyped-call]
     return zeros
 
 
@@ -70,118 +62,62 @@ class _ByNodes(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        stack: Tensor,
-        taps: Tensor,
-        first: Tensor,
-        between: list[Tensor],
-        asked: Set[int] | None,
-        *sources: Tensor,
+        ctx: Any, psf: Tensor, shares: Tensor, content: Tensor, about: Any
     ) -> Tensor:
-        ctx.save_for_backward(stack, taps, first, *between, *sources)
-        ctx.asked = asked
-        one, size = sources[0], stack.shape[-1] - 1
-        shape = (
-            len(one),
-            len(sources),
-            *one.shape[1:-2],
-            one.shape[-2] + size,
-            one.shape[-1] + size,
-        )
-        return one.new_zeros(shape)
+        ctx.save_for_backward(psf, shares, content)
+        ctx.about = about
+        return torch.zeros_like(content)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        stack, taps, first, rows, columns, *sources = tuple[Tensor, ...](
-            ctx.saved_tensors
-        )
-        of_stack, of_taps, *_ = ctx.needs_input_grad
-        of_sources = of_taps or any(ctx.needs_input_grad[5:])
-        light, (high, wide) = torch.stack(sources, 1), stack.shape[-2:]
-        out = gradient.new_zeros(stack.shape)
-        back = torch.zeros_like(light), torch.zeros_like(taps)
-        every = range(stack.shape[0] * stack.shape[1])
-        for node in every if of_sources or ctx.asked is None else ctx.asked:
-            place = divmod(node, stack.shape[1])
-            to_row, to_column = (
-                part[:, i].to(light)
-                for part, i in zip((rows, columns), place, strict=True)
-            )
-            y, x = _reach(to_row), _reach(to_column)
-            to = to_row[y, None] * to_column[x]
-            near, deep = light[..., y, x] * to, (first[..., y, x], taps[..., y, x, :])
-            seen = gradient[
-                ..., y.start : y.stop + high - 1, x.start : x.stop + wide - 1
-            ]
-            if of_stack and (ctx.asked is None or node in ctx.asked):
-                out[place] = _correlated(near, deep, seen, stack.shape[2:])
-            if of_sources:
-                by_light, by_taps = _returned(stack[place], near, deep, seen)
-                back[0][..., y, x] += by_light * to
-                back[1][..., y, x, :] += by_taps
-        return (
-            out if of_stack else None,
-            back[1] if of_taps else None,
-            None,
-            None,
-            None,
-            *back[0].unbind(1),
-        )
+        psf, shares, content = tuple[Tensor, ...](ctx.saved_tensors)
+        illumination, lit, asked = ctx.about
+        of_psf, of_depth, *_ = ctx.needs_input_grad
+        rows, columns, depths, h, w = psf.shape
+        level = illumination[..., None, None] if lit else torch.ones(1)
+        deep = spline_coefficients(depths).to(content)
+        frame = content.shape[-2:]
+        maps = frame_maps((frame[0], frame[1]), (rows, columns), content)
+        shape = fast_shape((frame[0] + h - 1, frame[1] + w - 1))
+        # image samples half a window beyond the frame are not part of it
+        seen = torch.nn.functional.pad(gradient, (w // 2, w // 2, h // 2, h // 2))
+        spectrum = torch.fft.rfft2(seen, s=shape)
+        out, back = torch.zeros_like(psf), torch.zeros_like(shares)
+        every = range(rows * columns) if of_depth or asked is None else asked
+        for node in every:
+            a, b = divmod(node, columns)
+            near = content * (maps[0][:, a, None] * maps[1][:, b])
+            if of_psf and (asked is None or node in asked):
+                found = []
+                for share in shares:
+                    part = torch.fft.rfft2(near * share, s=shape).conj() * spectrum
+                    whole = torch.fft.irfft2(part.flatten(0, -3).sum(0), s=shape)
+                    found.append(whole[:h, :w])
+                out[a, b] = torch.einsum("cz,cyx->zyx", deep, torch.stack(found))
+            if of_depth:
+                light = (psf[a, b] * level[a, b] if lit else psf[a, b]).to(content)
+                for k, psf_k in enumerate(torch.einsum("cz,zyx->cyx", deep, light)):
+                    part = torch.fft.rfft2(psf_k, s=shape).conj() * spectrum
+                    whole = torch.fft.irfft2(part, s=shape)
+                    back[k] += near * whole[..., : frame[0], : frame[1]]
+        if lit:
+            out *= level.to(out)
+        return out if of_psf else None, back if of_depth else None, None, None
 
 
-def _reach(weights: Tensor) -> slice:
-    """From the first weight that is not zero to the last."""
-    there = torch.nonzero(weights)[:, 0]
-    return slice(int(there[0]), int(there[-1]) + 1)
-
-
-def _correlated(
-    light: Tensor, deep: tuple[Tensor, Tensor], gradient: Tensor, of: tuple[int, ...]
-) -> Tensor:
-    """(depths, h, w) Σ_x light(x) gradient(x + k) over frames, kinds, sheets and
-    places, k in the window: of the share
-    of the light that each depth node has."""
-    depths, *window = of
-    shape = [int(scipy.fft.next_fast_len(n, real=True)) for n in gradient.shape[-2:]]
-    spectrum = torch.fft.rfft2(gradient, s=shape)
-    first, taps = deep
-    total = []
-    for depth in range(depths):
-        share = (
-            taps
-            * (
-                first[..., None] + torch.arange(taps.shape[-1], device=first.device)
-                == depth
-            )
-        ).sum(-1)
-        part = torch.fft.rfft2(light * share[:, None], s=shape)
-        found = torch.fft.irfft2((part.conj() * spectrum).sum((0, 1, 2)), s=shape)
-        total.append(found[: window[0], : window[1]])
-    return torch.stack(total)
-
-
-def _returned(
-    psfs: Tensor, light: Tensor, deep: tuple[Tensor, Tensor], gradient: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Derivatives by the light near a node (before its share of it) and by the weights
-    of the depths: of each depth's
-    PSF, Σ_k P(k) gradient(x + k) at the places of the light."""
-    shape = [int(scipy.fft.next_fast_len(n, real=True)) for n in gradient.shape[-2:]]
-    spectrum, (high, wide) = torch.fft.rfft2(gradient, s=shape), light.shape[-2:]
-    first, taps = deep
-    by_light, by_taps = torch.zeros_like(light), torch.zeros_like(taps)
-    for depth, psf in enumerate(psfs.to(gradient)):
-        at = (
-            first[..., None] + torch.arange(taps.shape[-1], device=first.device)
-            == depth
-        )
-        seen = torch.fft.irfft2(
-            torch.fft.rfft2(psf, s=shape).conj() * spectrum, s=shape
-        )[..., :high, :wide]
-        by_light += (taps * at).sum(-1)[:, None] * seen
-        by_taps += at * (light * seen).sum(1)[..., None]
-    return by_light, by_taps
+def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
+    """(coefficients, …) B-spline of every depth coefficient at these depths."""
+    near, far = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
+    unit = ((near - 1 / depth_um) / max(near - far, 1e-30)).clamp(0, 1)
+    nodes = len(depths_um)
+    first, taps = spline_taps(unit, nodes)
+    number = first[..., None] + torch.arange(TAPS, device=first.device)
+    shares = [
+        (taps * (number == coefficient)).sum(-1)
+        for coefficient in range(max(nodes + 2, TAPS))
+    ]
+    return torch.stack(shares)
 
 
 def node_light(optics: Optics, plan: Plan) -> Tensor:

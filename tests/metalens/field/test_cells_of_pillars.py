@@ -22,7 +22,7 @@ from metalens.field import (
     left_out,
     psfs,
 )
-from metalens.field.patches import relative
+from metalens.field.texture import texture_error
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 
@@ -118,7 +118,7 @@ def missing(made, cell_um=2.5, period=1.06):
     errors = []
     for one, depth in zip(got, DEPTHS, strict=True):
         want = plane_waves(made, PLACE, depth, 1536)
-        errors.append(float(relative(one / one.sum(), want / want.sum())))
+        errors.append(float(texture_error(one / one.sum(), want / want.sum())))
     return left_out.missing(optics, WAVELENGTH, window, at), math.hypot(
         *errors
     ) / math.sqrt(2)

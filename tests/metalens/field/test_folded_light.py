@@ -10,8 +10,8 @@ import torch
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, plan
 from metalens.field.left_out import Judged, folded
-from metalens.field.patches import relative
 from metalens.field.points import SPARE, psfs
+from metalens.field.texture import texture_error
 from metalens.ground.errors import PropagationError
 from metalens.psf import Nodes
 from tests.referees.true_image import Referee
@@ -61,9 +61,9 @@ def test_psfs_of_an_oblique_camera_hold_their_own_light_alone(true, aside):
     at such an angle (paths of the second order about the field point)."""
     window = aside.plan.window
     assert window.period > SPARE
-    assert float(relative(_psf(window), true)) < 0.025
+    assert float(texture_error(_psf(window), true)) < 0.025
     assert float(_psf(window).sum() / true.sum()) == pytest.approx(1.0, abs=0.02)
-    assert float(relative(_psf(Window(SAMPLES, STEP_UM)), true)) > 0.2
+    assert float(texture_error(_psf(Window(SAMPLES, STEP_UM)), true)) > 0.2
 
 
 def test_what_is_folded_back_is_the_error_that_plane_waves_find(true):
@@ -72,7 +72,7 @@ def test_what_is_folded_back_is_the_error_that_plane_waves_find(true):
     waves = Nodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0)
     told, error = (
         folded(Judged(OPTICS, waves, window, at)),
-        float(relative(_psf(window), true)),
+        float(texture_error(_psf(window), true)),
     )
     assert told == pytest.approx(error, abs=0.03)
 
@@ -107,8 +107,8 @@ def test_the_rim_of_a_wide_field_is_looked_at_too():
     light = torch.from_numpy(
         referee.sampled(referee.intensity(place, DEPTH_UM, 0.85), STEP_UM, SAMPLES)
     )[None]
-    assert float(relative(_psf(window, place), light)) < 0.06
-    assert float(relative(_psf(Window(SAMPLES, STEP_UM), place), light)) > 0.2
+    assert float(texture_error(_psf(window, place), light)) < 0.06
+    assert float(texture_error(_psf(Window(SAMPLES, STEP_UM), place), light)) > 0.2
 
 
 def test_on_the_axis_the_period_stays_the_least():

@@ -20,7 +20,6 @@ from metalens.field import (
     surrogate,
     with_psfs,
 )
-from metalens.field.forming import between_nodes, blur
 from metalens.field.slopes import term
 from metalens.image import Frames
 from metalens.psf import Nodes
@@ -105,64 +104,3 @@ def test_a_draw_is_one_of_the_terms(case):
         for w in range(2)
     ]
     assert min(abs(got - one) for one in every) <= 1e-5 * max(map(abs, every))
-
-
-def test_derivatives_by_depths_and_psfs_are_those_of_the_sum_over_all_nodes(case):
-    """Light and coverage of two sheets: weights of the image against the sum over every
-    node and depth, written out.
-    """
-    made, _ = case
-    draw, (high, wide) = np.random.default_rng(6), made.grid.frame
-    light, cover = (torch.from_numpy(draw.random((1, 2, high, wide))) for _ in range(2))
-    turns = torch.from_numpy(
-        draw.uniform(0.05, 0.95, light.shape)
-    )  # of the range of 1/z
-    near, far = (1 / float(made.plan.depths_um[i]) for i in (0, -1))
-    weight = torch.from_numpy(draw.standard_normal((1, 2, 2, high, wide)))
-    place, stack = turns.clone().requires_grad_(), made.stack.clone().requires_grad_()
-    whole = with_psfs(made, stack, made.energy)
-    (
-        weight
-        * whole.even
-        * blur(Frames(light, cover, 1 / (near + (far - near) * place)), whole)
-    ).sum().backward()
-    plain, nodes = turns.clone().requires_grad_(), made.stack.double().requires_grad_()
-    count, half = nodes.shape[2], nodes.shape[-1] // 2
-    to_y, to_x = between_nodes(made.grid, made.plan)
-    deep = _between(plain.flatten() * (count - 1), count).view(*plain.shape, count)
-    lit = (torch.einsum("ya,xb,abz->yxz", to_y, to_x, made.energy.double()) * deep).sum(
-        -1
-    )
-    psfs = torch.einsum("ya,xb,fsyxz,abzhw->fsyxhw", to_y, to_x, deep, nodes)
-    padded = torch.nn.functional.pad(weight, (half,) * 4)
-    seen = padded.unfold(-2, nodes.shape[-2], 1).unfold(
-        -2, nodes.shape[-1], 1
-    )  # (…, y, x, h, w)
-    total = sum(
-        (seen[:, kind] * psfs * source[..., None, None]).sum()
-        for kind, source in enumerate((light * lit, cover))
-    )
-    total.backward()
-    for got, want in ((place.grad, plain.grad), (stack.grad, nodes.grad)):
-        assert (
-            float((got - want).norm() / want.norm()) < 1e-5
-        )  # the energy and the kernels are of single precision
-
-
-def _between(place, count):
-    """(n, nodes) weights of polynomials through up to four nodes, typed in: of the
-    place's own neighbours.
-    """
-    taps = min(4, count)
-    first = (place.detach().floor() - (taps // 2 - 1)).clamp(0, count - taps)
-    columns = []
-    for node in range(count):
-        inside = (node >= first) & (node < first + taps)
-        product = torch.ones_like(place)
-        for j in range(count):
-            near = (j >= first) & (j < first + taps) & (j != node)
-            product = torch.where(
-                near, product * (place - j) / (node - j if j != node else 1), product
-            )
-        columns.append(torch.where(inside, product, torch.zeros_like(place)))
-    return torch.stack(columns, -1)

@@ -11,7 +11,7 @@ import torch
 from metalens.design import Focus
 from metalens.field import Layers, Optics, SmoothWave, Window, psfs
 from metalens.field.left_out import Judged, folded, polarised, unpolarised
-from metalens.field.patches import relative
+from metalens.field.texture import texture_error
 from metalens.psf import Nodes
 
 WAVE, DISTANCE = 0.85, 33.0
@@ -40,7 +40,7 @@ def image_error(got, want, light):
     """Of PSFs (places, depths), each as bright as its light, over the brightest place
     of each depth, rms.
     """
-    each = relative(got, want).numpy() * light.numpy() / light.numpy().max(0)
+    each = texture_error(got, want).numpy() * light.numpy() / light.numpy().max(0)
     return np.sqrt(np.mean(each**2))
 
 

@@ -2,15 +2,10 @@
 the same code.
 """
 
-import dataclasses
-import functools
 import math
-from types import SimpleNamespace
 
 import pytest
-import scipy.fft
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
@@ -19,11 +14,8 @@ from metalens.field import (
     Layers,
     SmoothWave,
     drawn,
-    forming,
     imager,
-    patches,
     surrogate,
-    together,
 )
 from metalens.field.points import Optics
 from metalens.image import Frames, basis, image, uniform_imager
@@ -74,9 +66,7 @@ def both():
 def test_psfs_and_images_are_those_of_the_processor(both):
     here, there = both
     with elsewhere() as done:
-        assert (
-            there.stack.device == there.transfer[0].device == there.even.device == AWAY
-        )
+        assert there.stack.device == there.light.transfer.device == AWAY
         psfs = there.stack.cpu()
         frames = _frames(GRID)
         seen = there(frames.to(AWAY))
@@ -93,142 +83,13 @@ def test_psfs_and_images_are_those_of_the_processor(both):
         assert there.parts[name] == pytest.approx(value, abs=1e-4), name
 
 
-@pytest.mark.parametrize("kinds", [1, 2])
-def test_patches_taken_together_are_those_one_by_one(both, kinds):
-    """Of unlike sizes and numbers of kernels, a few at a time; light, coverage, and the
-    slopes of their transforms.
-    """
-    here, frames = both[0], _frames(GRID, seed=6)
-    about = {"patches": 3, "overlap": 3, "tolerance": 0.02}
-    cut = patches.cut(
-        here.stack, here.energy, forming.between_nodes(GRID, here.plan), **about
-    )
-    made = [patch.trimmed(0.2, 0.4) if i % 3 else patch for i, patch in enumerate(cut)]
-    assert len({len(patch.mix) for patch in made}) > 1
-    assert len({patch.coverage for patch in made}) > 1
-    made = forming.with_psfs(
-        dataclasses.replace(here, patches=made, transfer=[], even=None),
-        here.stack,
-        here.energy,
-    )
-    given = (
-        frames.radiance,
-        frames.coverage,
-        forming.vergence(frames.depth_um, here.plan.depths_um),
-    )
-    sides = [(b - a for a, b in (patch.rows, patch.columns)) for patch in made.patches]
-    shapes = [
-        tuple(scipy.fft.next_fast_len(n + GRID.window - 1, real=True) for n in pair)
-        for pair in sides
-    ]
-    few = functools.partial(
-        together.through, held_bytes=3 * 6 * 8 * made.transfer[0].numel()
-    )
-    found = []
-    for way in (few, _one_by_one):
-        transfer = [part.clone().requires_grad_() for part in made.transfer]
-        out = torch.zeros(
-            3, kinds, 2, *(n + 2 * (GRID.window // 2) for n in GRID.frame)
-        )
-        way(given, made.patches, transfer, shapes, out)
-        (out.square() * torch.linspace(0.2, 1.7, out.shape[-1])).sum().backward()
-        found.append((out.detach(), [part.grad for part in transfer]))
-    (seen, slopes), (want, steep) = found
-    assert torch.allclose(seen, want, rtol=0, atol=SINGLE * float(want.max()))
-    for one, other in zip(slopes, steep, strict=True):
-        assert torch.allclose(one, other, rtol=0, atol=1e-5 * float(other.abs().max()))
-
-
-class _Spectra(TorchDispatchMode):
-    """Bytes of every transform to frequencies that is asked for."""
-
-    def __init__(self):
-        super().__init__()
-        self.bytes = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        found = func(*args, **(kwargs or {}))
-        if func.overloadpacket.__name__ == "_fft_r2c":
-            self.bytes.append(found.numel() * found.element_size())
-        return found
-
-
-def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_where_there_are_patches():
-    """Seven patches of five kernels, 6 frames of two sheets: a patch's spectra are 0.63
-    GB, three at a time, the last
-    alone. Shapes without numbers."""
-    side, size, kernels, nothing = (
-        900,
-        1600,
-        5,
-        functools.partial(torch.empty, device=AWAY),
-    )
-    patch = patches.Patch(
-        (0, side),
-        (0, side),
-        nothing(side * side),
-        nothing(side * side, 2, kernels),
-        nothing(side * side, 2),
-        nothing(kernels, 4),
-        nothing(4),
-        nothing(kernels + 1),
-        kernels,
-    )
-    given = (
-        nothing(6, 2, side, side),
-        nothing(6, 2, side, side),
-        nothing(6, 2, side, side),
-    )
-    transfer = [nothing(kernels, size, size // 2 + 1, dtype=torch.complex64)] * 7
-    out = nothing(6, 1, 2, size, size)
-    with _Spectra() as seen:
-        together.through(given, [patch] * 7, transfer, [(size, size)] * 7, out)
-    each = 8 * 6 * 2 * kernels * size * (size // 2 + 1)
-    assert 3 * each < 2**31 < 4 * each
-    assert seen.bytes == [3 * each, 3 * each, each]
-
-
-@pytest.mark.parametrize(
-    ("device", "side", "sizes"),
-    [("cpu", 250, [8, 8, 8, 8, 2]), ("cpu", 20, [32, 2]), (AWAY, 20, [34])],
-)
-def test_a_processor_images_eight_frames_or_more_small_ones_and_a_gpu_a_hundred(
-    monkeypatch, device, side, sizes
-):
-    """A million samples of two sheets are 8 frames of 250 samples along a side, and far
-    more than 32 of 20.
-    """
-    seen = []
-    monkeypatch.setattr(
-        forming,
-        "blurred",
-        lambda few, optics: seen.append(len(few.radiance)) or few.radiance[:, 0],
-    )
-    monkeypatch.setattr(forming, "returned", lambda total, grid: total)
-    grid = dataclasses.replace(GRID, samples=(side, side), margin=0)
-    optics = SimpleNamespace(grid=grid, stack=torch.empty(1, device=device), stray=None)
-    many = torch.empty(34, 2, side, side, device=device)
-    forming.image(Frames(many, many, many), optics)
-    assert seen == sizes
-    if device == AWAY:
-        more = torch.empty(300, 2, side, side, device=device)
-        forming.image(Frames(more, more, more), optics)
-        assert seen[1:] == [128, 128, 44]
-
-
-def _one_by_one(given, patches, transfer, shapes, out):
-    for patch, kernels, shape in zip(patches, transfer, shapes, strict=True):
-        forming._add(patch, kernels, shape, given, out)
-
-
 def test_an_imager_moves_and_comes_back(both):
     here, frames = both[0], _frames(GRID, seed=5)
     with elsewhere():
         seen = here.to(AWAY)(frames.to(AWAY)).cpu()
         again = here.to(AWAY).to("cpu")
     assert torch.allclose(seen, here(frames), rtol=0, atol=1e-5 * float(seen.max()))
-    for one, other in zip(again.transfer, here.transfer, strict=True):
-        assert torch.equal(one, other)
+    assert torch.equal(again.light.table, here.light.table)
 
 
 def test_what_lies_on_two_devices_is_refused(both):

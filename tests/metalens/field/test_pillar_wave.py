@@ -23,7 +23,7 @@ from metalens.field import (
     left_out,
     psfs,
 )
-from metalens.field.patches import relative
+from metalens.field.texture import texture_error
 from metalens.ground.errors import SceneError
 from metalens.image import integrate
 from metalens.lens import DiameterMap, Lens, Neighbours
@@ -82,12 +82,12 @@ def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
         wavelength_um=0.85,
         window=Window(SAMPLES, STEP),
     )[0, 0]
-    assert float(relative(got.double(), want)) < 3e-2
+    assert float(texture_error(got.double(), want)) < 3e-2
     assert float(got.sum() / want.sum()) == pytest.approx(1, abs=2.5e-2)
     said = left_out.missing(
         optics, 0.85, Window(SAMPLES, STEP), (at, torch.tensor([4e3]))
     )
-    true = float(relative(got.double() / got.sum(), want / want.sum()))
+    true = float(texture_error(got.double() / got.sum(), want / want.sum()))
     assert (
         0.5 * true < said < 2 * true
     )  # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
@@ -224,13 +224,13 @@ def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
         pitch_um=STEP,
     )[2:-2, 2:-2]
     got = made.stack[middle[0], middle[1], 0].double()
-    assert float(relative(got, want / want.sum())) < 3e-2
+    assert float(texture_error(got, want / want.sum())) < 3e-2
     bare = (
         imager(glazed, grid, tolerance=0.1, layers=Layers())
         .stack[middle[0], middle[1], 0]
         .double()
     )
-    assert float(relative(bare, want / want.sum())) > 0.1
+    assert float(texture_error(bare, want / want.sum())) > 0.1
 
 
 def test_pillars_that_answer_x_and_y_apart_are_no_unpolarised_image(lens):

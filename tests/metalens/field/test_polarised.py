@@ -14,9 +14,9 @@ from scipy import special
 
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.field.patches import relative
 from metalens.field.polarised import factors
 from metalens.field.rays import Rays
+from metalens.field.texture import texture_error
 from metalens.ground.errors import PropagationError
 from metalens.image import Frames
 from metalens.psf import Mixed, of_flux, strongest, turned
@@ -75,14 +75,16 @@ def test_psfs_of_both_polarisations_are_those_of_plane_waves(place, depth, kind,
         for name in (kind, "polarised" if kind == "flux" else "flux")
     )
     got = _psf(OPTICS, place, depth, whole, flux=kind == "flux")
-    error = float(relative(got, want))
+    error = float(texture_error(got, want))
     assert error < 6e-3
     three = _psf(OPTICS, place, depth, 3, flux=kind == "flux")
-    assert float(relative(three, want)) < error + 1.5e-3  # what three components leave
-    scalar = float(relative(_psf(OPTICS, place, depth, 0, flux=True), want))
+    assert (
+        float(texture_error(three, want)) < error + 1.5e-3
+    )  # what three components leave
+    scalar = float(texture_error(_psf(OPTICS, place, depth, 0, flux=True), want))
     if kind == "flux":
         assert scalar < error + 1e-3  # the scalar is the flux to the fourth order in NA
-        assert float(relative(got, other)) > 1.8 * error
+        assert float(texture_error(got, other)) > 1.8 * error
     else:
         assert scalar > 1.8 * error
 

@@ -11,9 +11,9 @@ import torch
 from metalens.cell import Film, Index
 from metalens.design import Focus
 from metalens.field import Layers, Optics, SmoothWave, Window, compiled, points, psfs
-from metalens.field.patches import relative
 from metalens.field.plan import spectral
 from metalens.field.rays import rays, source_paths
+from metalens.field.texture import texture_error
 from metalens.lens import Stop
 from metalens.psf import Nodes
 
@@ -142,7 +142,7 @@ def test_what_wraps_round_in_a_transform_is_nothing_of_the_sharpest_image(monkey
             psfs(optics, at, depths_um=depth, wavelength_um=0.85, window=window)[0, 0]
         )
     assert sizes[0] < sizes[1]
-    assert 0 < float(relative(*found)) < 3e-4
+    assert 0 < float(texture_error(*found)) < 3e-4
 
 
 def test_a_sharp_rim_bends_light_beyond_the_window_by_its_aperture_and_the_window_s_width():

@@ -23,8 +23,7 @@ from metalens.field import (
     psfs,
     with_psfs,
 )
-from metalens.field.patches import dense, relative
-from metalens.field.plan import ALONG, placed
+from metalens.field.texture import texture_error
 from metalens.ground.errors import PropagationError, SceneError
 from metalens.image import Frames
 from metalens.psf import Nodes
@@ -144,11 +143,11 @@ def test_films_behind_the_lens_are_in_the_image():
         glass.sampled(glass.intensity(place, depth, 0.85), STEP, WINDOW).copy()
     )
     scaled = got.double() * (want.sum() / got.sum())
-    assert float(relative(scaled, want)) < 6e-3  # rim and fold, as in air
+    assert float(texture_error(scaled, want)) < 6e-3  # rim and fold, as in air
     assert float(got.sum() / want.sum()) == pytest.approx(
         0.96, abs=4e-3
     )  # 4 % of one face at normal incidence
-    assert float(relative(bare.double(), want)) > 0.02
+    assert float(texture_error(bare.double(), want)) > 0.02
 
 
 def test_a_slow_lens_whose_blur_is_many_samples_wide():
@@ -189,7 +188,7 @@ def test_a_slow_lens_whose_blur_is_many_samples_wide():
             * STEP
         )
     )
-    assert float(relative(got * (want.sum() / got.sum()), want)) < beyond
+    assert float(texture_error(got * (want.sum() / got.sum()), want)) < beyond
 
 
 def test_wide_psfs_to_second_order_of_their_width():
@@ -226,36 +225,9 @@ def test_wide_psfs_to_second_order_of_their_width():
             wavelength_um=0.85,
             window=window,
         )[0, 0].double()
-        errors.append(float(relative(got * (want.sum() / got.sum()), want)))
+        errors.append(float(texture_error(got * (want.sum() / got.sum()), want)))
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < 4e-3
-
-
-def test_lines_of_nodes_at_any_distance_interpolate_cubics():
-    """The four-point rule is exact for cubics wherever the nodes lie, ends included."""
-    nodes = torch.tensor([-3.1, -2.0, -1.7, 0.4, 1.9, 2.2, 4.0], dtype=torch.float64)
-    at = torch.linspace(-3.1, 4.0, 23, dtype=torch.float64)
-
-    def cubic(x):
-        return 0.3 * x**3 - 1.7 * x**2 + 0.9 * x - 4.1
-
-    assert torch.allclose(
-        dense(at, nodes) @ cubic(nodes), cubic(at), rtol=1e-12, atol=1e-11
-    )
-
-
-def test_nodes_of_an_axis_are_denser_off_the_lens_axis():
-    """Density 1 + 2 |X| / largest: the step at the rim is a third of that on the axis,
-    wherever the lens axis is.
-    """
-    steps = placed(21, 2.0, (0.0, 500.0)).diff()
-    assert float(steps[0] / steps.max()) == pytest.approx(
-        0.4, abs=0.12
-    )  # whole places, steps of 6 to 17 of them
-    aside = placed(21, 2.0, (700.0, 300.0))
-    assert aside[0] == 0
-    assert aside[-1] == ALONG
-    assert float(aside.diff()[:5].mean()) > float(aside.diff()[-5:].mean())
 
 
 def test_films_thicker_than_the_gap_are_refused():

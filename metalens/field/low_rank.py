@@ -1,0 +1,342 @@
+"""Field-varying PSFs as one low-rank sum over the whole field and all depths.
+
+    E(x, z) P(δ; x, z) ≈ Σ_r w_r(x, z) K_r(δ)
+    I(X)               = Σ_r K_r * [w_r(x, z) L(x)]
+
+The kernels are principal components of the PSFs at the nodes. The weights, which hold
+the relative illumination E, are cubic splines in x, y and 1/z: an evenly lit plane
+shows the derivative of the interpolated centroid, which is then continuous.
+"""
+
+from dataclasses import dataclass, replace
+
+import scipy.fft
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag, pad
+
+from metalens.field.splines import (
+    TAPS,
+    spline_coefficients,
+    spline_matrix,
+    spline_taps,
+)
+from metalens.field.texture import scene_spectrum
+
+SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
+MOST_KERNELS = 320
+FEWEST = 12  # kernels: single points hold more fine detail than a textured scene
+ROUNDS = 2  # of the correction of planes: each squares what the last left of it
+FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
+EVEN = 0.01  # rms error of an evenly lit plane that kernels may leave to correct
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PsfField:
+    """PSFs at nodes: equal steps over a frame from corner to corner, and of 1/z.
+
+    psf: (rows, columns, depths, h, w), each of sum 1; h and w odd.
+    illumination: (rows, columns, depths) relative illumination, the light of each PSF.
+    depths_um: (depths,) ascending.
+    """
+
+    psf: Tensor
+    illumination: Tensor
+    depths_um: Tensor
+
+    @property
+    def light(self) -> Tensor:
+        """(rows, columns, depths, h, w) PSFs times their relative illumination."""
+        return self.psf * self.illumination[..., None, None]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KernelBasis:
+    """How kernels are mixed of the PSFs of a field, and what they weigh at its nodes.
+
+    mixture: (rank, sampled) of the PSFs of the nodes ``sampled`` (flat numbers).
+    weights: (nodes, rank) projections of all nodes' PSFs, of sum 1.
+    """
+
+    mixture: Tensor
+    sampled: Tensor
+    weights: Tensor
+
+    def kernels(self, psf: Tensor, rank: int) -> Tensor:
+        """(rank, h, w) leading kernels mixed of PSFs (rows, columns, depths, h, w)."""
+        some = psf.detach().flatten(0, 2)[self.sampled]
+        return torch.einsum("rn,nyx->ryx", self.mixture[:rank].to(some), some)
+
+    def to(self, device: torch.device | str) -> "KernelBasis":
+        """The same on a device."""
+        parts = (self.mixture, self.sampled, self.weights)
+        return KernelBasis(*(part.to(device) for part in parts))
+
+
+def principal_kernels(
+    field: PsfField, frame: tuple[int, int], *, tolerance: float
+) -> KernelBasis:
+    """Fewest principal components of PSFs that image a textured scene and planes.
+
+    The metric is the image of a scene of mean 1 with a 1/f texture, and that of an
+    evenly lit plane. Kernels are mixed of at most :data:`SAMPLED` of the nodes' PSFs,
+    since PSFs between nodes are mixtures of theirs.
+
+    Args:
+        frame: (y, x) samples over which the nodes reach.
+        tolerance: relative L2 error of the image of the scene, at the worst depth; a
+            plane errs by no more, and by :data:`EVEN` at most.
+    """
+    psf = field.psf.detach().flatten(0, 2)
+    light = field.illumination.detach().flatten().double()
+    # an error that differs from node to node has frequencies up to half their number
+    band = max((k - 1) / (2 * n) for k, n in zip(psf_nodes(field), frame, strict=True))
+    metric = max(tolerance / EVEN, 1.0), band
+    draw = torch.Generator().manual_seed(3)
+    order = torch.randperm(len(psf), generator=draw)[:SAMPLED].sort().values
+    sampled = order.to(psf.device)
+    features = scene_spectrum(psf[sampled].double(), *metric) * light[sampled, None]
+    power, vectors = torch.linalg.eigh(features @ features.mT)
+    power, vectors = power.flip(0), vectors.flip(1)
+    # below this is the rounding of single precision, in which the PSFs are given
+    rank = max(int((power > 1e-13 * power[0]).sum()), 1)
+    rank = min(rank, MOST_KERNELS)
+    scaled = vectors[:, :rank] / power[:rank].clamp_min(1e-300).sqrt()
+    axes = scaled.mT @ features
+    weights, whole = [], []
+    for some in psf.split(SAMPLED):
+        spectrum = scene_spectrum(some.double(), *metric)
+        weights.append(spectrum @ axes.mT)
+        whole.append(spectrum.square().sum(1, keepdim=True))
+    weight, depths = torch.cat(weights), len(field.depths_um)
+    in_light = light[:, None] ** 2
+    kept = (weight**2 * in_light).reshape(-1, depths, rank).mean(0)
+    total = (torch.cat(whole) * in_light).reshape(-1, depths, 1).mean(0)
+    brightest = in_light.reshape(-1, depths).mean(0).max()
+    left = (total - kept.cumsum(1)).clamp_min(0).amax(0)
+    missing = torch.sqrt(left / brightest)
+    rank = min(max(int((missing > tolerance).sum()) + 1, FEWEST), rank)
+    mixture = scaled.mT[:rank] * light[sampled]
+    return KernelBasis(mixture, sampled, weight[:, :rank].contiguous())
+
+
+def psf_nodes(field: PsfField) -> tuple[int, int]:
+    """(rows, columns) of nodes."""
+    return field.psf.shape[0], field.psf.shape[1]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LowRankPsfs:
+    """PSFs Σ_r w_r(x, z) K_r(δ) of the samples of a frame.
+
+    kernels: (rank, h, w).
+    transfer: (rank, Y, X // 2 + 1) their transforms, of size ``shape`` = (Y, X).
+    table: (y, x, depth coefficients, rank) B-spline coefficients in 1/z of the weights
+        of every sample.
+    vergence: (nearest, farthest) 1/z of the nodes.
+    """
+
+    kernels: Tensor
+    transfer: Tensor
+    shape: tuple[int, int]
+    table: Tensor
+    vergence: tuple[float, float]
+
+    def to(self, device: torch.device | str) -> "LowRankPsfs":
+        """The same on a device."""
+        parts = ("kernels", "transfer", "table")
+        return replace(self, **{name: getattr(self, name).to(device) for name in parts})
+
+    def weigh(self, content: Tensor, depth_um: Tensor) -> Tensor:
+        """(rank, *batch, y, x) sources times their weights.
+
+        Args:
+            content, depth_um: (*batch, y, x); depths beyond the nodes take the
+                outermost.
+        """
+        fixed = not (content.requires_grad and torch.is_grad_enabled())
+        where = torch.nonzero(content.flatten())[:, 0] if fixed else None
+        if where is None or 10 * len(where) > 9 * content.numel():
+            rows = self.interpolate(depth_um) * content.flatten()
+            return rows.reshape(-1, *content.shape)
+        rows = self.interpolate(depth_um, where) * content.flatten()[where]
+        out = rows.new_zeros(len(rows), content.numel())
+        out[:, where] = rows
+        return out.reshape(-1, *content.shape)
+
+    def interpolate(self, depth_um: Tensor, where: Tensor | None = None) -> Tensor:
+        """(rank, samples) weights at the depths of all samples or of some.
+
+        Args:
+            depth_um: (*batch, y, x). where: (samples,) flat numbers into it.
+        """
+        high, wide, coefficients, rank = self.table.shape
+        number = torch.arange(depth_um.numel(), device=depth_um.device)
+        depth = depth_um.flatten()
+        if where is not None:
+            number, depth = number[where], depth[where]
+        near, far = self.vergence
+        unit = ((near - 1 / depth) / max(near - far, 1e-30)).clamp(0, 1)
+        nodes = 1 if near == far else coefficients - 2
+        first, taps = spline_taps(unit, nodes)
+        index = (number % (high * wide)) * coefficients + first
+        each = index[:, None] + torch.arange(TAPS, device=depth.device)
+        rows = self.table.reshape(-1, rank).to(taps)
+        found = embedding_bag(each, rows, per_sample_weights=taps, mode="sum")
+        return found.mT.contiguous()
+
+    def convolve(self, sources: Tensor) -> Tensor:
+        """(*batch, y, x) Σ_r K_r * s_r of (rank, *batch, y, x).
+
+        Light that wraps around lands within half a window of the frame's border.
+        """
+        spectrum = torch.fft.rfft2(sources, s=self.shape)
+        total = spectrum[0] * self.transfer[0]
+        for part, kernel in zip(spectrum[1:], self.transfer[1:], strict=True):
+            total = torch.addcmul(total, part, kernel)
+        whole: Tensor = torch.fft.irfft2(total, s=self.shape)
+        return whole[..., : sources.shape[-2], : sources.shape[-1]]
+
+    def blur(self, content: Tensor, depth_um: Tensor) -> Tensor:
+        """(frames, *sheets, y, x) blurred content, few frames at a time."""
+        if content.device.type != "cpu":
+            return self.convolve(self.weigh(content, depth_um))
+        count = max(1, CACHED // (len(self.kernels) * content[0].numel()))
+        parts = zip(content.split(count), depth_um.split(count), strict=True)
+        return torch.cat([self.convolve(self.weigh(*part)) for part in parts])
+
+
+CACHED = 2**19  # samples, 2 MB: what of a core's cache the weighted sources may take
+
+
+def low_rank_psfs(
+    field: PsfField,
+    basis: KernelBasis,
+    frame: tuple[int, int],
+    *,
+    rank: int | None = None,
+    lit: bool = True,
+) -> LowRankPsfs:
+    """PSFs of the samples of a frame, from those of a field's nodes.
+
+    Sum and centroid of every node's PSF are exact, before what kernels lack of evenly
+    lit planes is spread over the relative illumination (:func:`correct_planes`).
+
+    Args:
+        field: differentiable in its illumination alone.
+        basis: of this field, or of a similar one on the same nodes.
+        frame: (y, x) samples.
+        rank: kernels that are used, by default all.
+        lit: whether the sources carry light; else the PSFs are of sum 1.
+    """
+    psf = field.psf.detach()
+    rank = len(basis.mixture) if rank is None else min(rank, len(basis.mixture))
+    kernels = basis.kernels(psf, rank)
+    weights = match_moments(basis.weights[:, :rank], kernels, psf.flatten(0, 2))
+    weights = weights.to(psf).reshape(*psf.shape[:3], rank)
+    if lit:
+        weights = weights * field.illumination[..., None]
+    maps = frame_maps(frame, psf_nodes(field), psf)
+    values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
+    if lit:
+        factor = correct_planes(field, maps, kernels, values.detach())
+        values = values * factor[..., None]
+    deep = spline_coefficients(values.shape[2]).to(values)
+    table = torch.einsum("cz,yxzr->yxcr", deep, values).contiguous()
+    vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
+    shape = fast_shape(frame)
+    transfer = transfer_functions(kernels, shape)
+    return LowRankPsfs(kernels, transfer, shape, table, vergence)
+
+
+def fast_shape(frame: tuple[int, int]) -> tuple[int, int]:
+    """(Y, X) size of quick transforms, at least that of the frame."""
+    y, x = (scipy.fft.next_fast_len(n, real=True) for n in frame)
+    return int(y), int(x)
+
+
+def frame_maps(
+    frame: tuple[int, int], nodes: tuple[int, ...], like: Tensor
+) -> list[Tensor]:
+    """(y, node rows) and (x, node columns) spline interpolation to a frame's samples."""
+    return [
+        spline_matrix(torch.linspace(0, 1, n, dtype=torch.float64), count).to(like)
+        for n, count in zip(frame, nodes, strict=True)
+    ]
+
+
+def correct_planes(
+    field: PsfField, maps: list[Tensor], kernels: Tensor, weights: Tensor
+) -> Tensor:
+    """(y, x, depths) factor of the light that images evenly lit planes rightly.
+
+    E ← E · (1 + h* · (wanted / found - 1)) at every depth node, where h is the mean PSF
+    of the depth: as Landweber's iteration it does not amplify frequencies whose
+    contrast defocus inverts, as van Cittert's would.
+
+    Args:
+        maps: :func:`frame_maps`. weights: (y, x, depths, rank), with their light.
+    """
+    factor = torch.ones_like(weights[..., 0])
+    size = factor.shape[:2]
+    h, w = kernels.shape[-2:]
+    shape = fast_shape((size[0] + h - 1, size[1] + w - 1))
+    transfer = transfer_functions(kernels, shape)
+    for z, plane in enumerate(plane_images(field, maps)):
+        faint = FAINT * plane.abs().max()
+        mean = weights[:, :, z].mean((0, 1)).to(transfer.dtype)
+        back = torch.einsum("r,ryx->yx", mean, transfer).conj()
+        back = back / back[0, 0].abs().clamp_min(1e-30)
+        for _ in range(ROUNDS):
+            sources = (weights[:, :, z] * factor[:, :, z, None]).movedim(-1, 0)
+            spectrum = (torch.fft.rfft2(sources, s=shape) * transfer).sum(0)
+            found = torch.fft.irfft2(spectrum, s=shape)[: size[0], : size[1]]
+            lack = found * (plane - found) / (found**2 + faint**2)
+            change = torch.fft.irfft2(torch.fft.rfft2(lack, s=shape) * back, s=shape)
+            factor[:, :, z] *= 1 + change[: size[0], : size[1]]
+    return factor
+
+
+def plane_images(field: PsfField, maps: list[Tensor]) -> Tensor:
+    """(depths, y, x) images of evenly lit planes at the depth nodes, dark beyond.
+
+    I(X) = Σ_ab Σ_x down(y, a) across(x, b) E_ab P_ab(X - x): both sums over x are
+    products of matrices.
+    """
+    light = field.light.detach()
+    spread = []
+    for matrix, size in zip(maps, light.shape[-2:], strict=True):
+        padded = pad(matrix.mT, (size // 2, size // 2))
+        spread.append(padded.unfold(1, size, 1).flip(-1))  # (nodes, samples, window)
+    planes = []
+    for z in range(light.shape[2]):
+        rows = torch.einsum("ayh,abhw->ybw", spread[0], light[:, :, z])
+        planes.append(torch.einsum("ybw,bxw->yx", rows, spread[1]))
+    return torch.stack(planes)
+
+
+def moments(psf: Tensor) -> Tensor:
+    """(n, 3) sum and first moments of PSFs (n, h, w), lengths in half windows."""
+    sides = (torch.linspace(-1, 1, n, dtype=psf.dtype) for n in psf.shape[-2:])
+    y, x = torch.meshgrid(*sides, indexing="ij")
+    terms = torch.stack([torch.ones_like(x), x, y]).to(psf.device)
+    return torch.einsum("nyx,kyx->nk", psf, terms)
+
+
+def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
+    """Least change of weights (n, rank) that gives PSFs (n, h, w) sum and centroid.
+
+    An evenly lit plane images as 1 - ∇·centroid + ½ ∇∇:(second moments) - …: its first
+    two terms are then exact.
+    """
+    own = moments(kernels.double())
+    lack = moments(psf.double()) - weights.double() @ own
+    return weights.double() + lack @ torch.linalg.pinv(own)
+
+
+def transfer_functions(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
+    """(rank, Y, X // 2 + 1) transforms of kernels (rank, h, w) about their middle."""
+    h, w = kernels.shape[-2:]
+    whole = pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
+    found: Tensor = torch.fft.rfft2(whole.roll((-(h // 2), -(w // 2)), (-2, -1)))
+    return found

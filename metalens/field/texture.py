@@ -1,0 +1,80 @@
+"""Errors of PSFs as the image of a natural texture shows them.
+
+Natural scenes have an amplitude spectrum near 1/f (Field, J. Opt. Soc. Am. A 4, 2379,
+1987). The scene that errors are stated for has mean 1 and such a texture of standard
+deviation :data:`CONTRAST`.
+"""
+
+import torch
+from torch import Tensor
+
+CONTRAST = 0.3  # standard deviation over mean of the scene that errors are stated for
+
+
+def texture_spectrum(psf: Tensor) -> Tensor:
+    """(…, features) Fourier transform of PSFs (…, h, w) times the 1/f amplitude.
+
+    Its L2 norm is that of the image of the texture. Frequencies below one period in
+    eight windows count as that one.
+    """
+    power, both, _ = _powers(psf)
+    return _weighed(psf, power * both)
+
+
+def scene_spectrum(psf: Tensor, plane: float, band: float) -> Tensor:
+    """(…, features) of PSFs (…, h, w): their L2 norm is that of the image of a scene.
+
+    That is a 1/f texture of standard deviation :data:`CONTRAST` and an evenly lit
+    plane, whose errors have spatial frequencies of about ``band`` (cycles a sample) and
+    count ``plane`` times as much.
+    """
+    power, both, frequency2 = _powers(psf)
+    seen = CONTRAST**2 * power / (power * both).sum()
+    if band > 0:
+        low = torch.exp(-frequency2 / band**2)
+        seen = seen + plane**2 * low / (low * both).sum()
+    return _weighed(psf, seen * both)
+
+
+def _powers(psf: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Power of the texture, times that each frequency stands for, and its square."""
+    h, w = psf.shape[-2:]
+    fy = torch.fft.fftfreq(2 * h, dtype=psf.dtype, device=psf.device)
+    fx = torch.fft.rfftfreq(2 * w, dtype=psf.dtype, device=psf.device)
+    frequency2 = fy[:, None] ** 2 + fx**2
+    both = torch.where((fx == 0) | (fx == 0.5), 1.0, 2.0).to(psf)
+    return 1 / (frequency2 + (1 / (8 * max(h, w))) ** 2), both, frequency2
+
+
+def _weighed(psf: Tensor, power: Tensor) -> Tensor:
+    h, w = psf.shape[-2:]
+    spectrum = torch.fft.rfft2(psf, s=(2 * h, 2 * w)) * power.sqrt()
+    return torch.view_as_real(spectrum).flatten(-3)
+
+
+def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
+    """(…) relative L2 error of the image of a texture through PSFs (…, h, w)."""
+    a, b = texture_spectrum(psf.double()), texture_spectrum(reference.double())
+    error: Tensor = (a - b).norm(dim=-1) / b.norm(dim=-1)
+    return error
+
+
+def scene_error(psf: Tensor, reference: Tensor) -> float:
+    """Relative L2 error of the image of a scene of mean 1 with its texture.
+
+    Over the whole field, at the worst depth, in units of the light of the brightest.
+
+    Args:
+        psf, reference: (places, depths, h, w), each times its relative illumination.
+    """
+    wrong = scene_spectrum((psf - reference).double(), 0.0, 0.0).square().sum(-1)
+    light = reference.double().sum((-1, -2)).square()
+    return float(torch.sqrt(wrong.mean(0).max() / light.mean(0).max().clamp_min(1e-30)))
+
+
+def weigh_by_light(errors: Tensor, light: Tensor) -> float:
+    """Root mean square of relative errors (places, depths), each times its light.
+
+    In units of the brightest place of its depth: what is dark shows little.
+    """
+    return float(((errors * light / light.amax(0)) ** 2).mean().sqrt())
