@@ -18,7 +18,8 @@ from codesign.network.blur import BlurBranch
 from codesign.optics import formed
 from codesign.optics.stack import OpticsConfig
 from codesign.train import Schedule
-from metalens.field.engine import normalised, patched
+from metalens.field.engine import normalised
+from metalens.field.forming import build_imager
 from metalens.field.plan import spectral
 from metalens.ground.errors import ConfigError
 from metalens.psf.spectrum import Nodes
@@ -48,7 +49,7 @@ def _psfs(whole, coefficients):
         plane, places, whole.plan.depths_um, whole.plan.waves, whole.plan.window
     )
     psfs, _ = normalised(light.reshape(whole.stack.shape), plane, whole.plan)
-    return patched(whole.grid, whole.plan, psfs, whole.energy, tolerance=1e-5)
+    return build_imager(whole.grid, whole.plan, psfs, whole.energy, tolerance=1e-5)
 
 
 @pytest.fixture(scope="module")
