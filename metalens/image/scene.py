@@ -9,6 +9,7 @@ coverage, and the far one is continued behind it. Weights are divided by their s
 constant radiance stays constant.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import scipy.fft
@@ -86,7 +87,9 @@ class PsfBasis:
     depths_um: (depths,) ascending.
     error: relative error (L2) to expect of the image of a texture, at the worst depth.
     bound: largest sum of |error| of a PSF, for PSFs of sum 1: no image of radiance 1 is
-    wrong by more.
+        wrong by more.
+    gradient_error: relative error (L2) to expect of the derivative of an image by what
+        changes the PSFs: that of the derivative by the depth of the texture.
     """
 
     kernels: Tensor
@@ -94,6 +97,7 @@ class PsfBasis:
     depths_um: Tensor
     error: float
     bound: float
+    gradient_error: float = math.nan
 
 
 def basis(
@@ -101,14 +105,15 @@ def basis(
     depths_um: Tensor,
     *,
     tolerance: float = 1e-3,
+    gradient_tolerance: float = 0.02,
     occupied_um: tuple[float, float] | None = None,
 ) -> PsfBasis:
     """Fewest kernels that keep the image of a texture within ``tolerance``;
     differentiable in the stack.
 
-    The gradient is that of the stack projected on the kept weights: changes of the PSFs
-    that vary with depth in a way
-    that the stack does not show yet need a smaller tolerance.
+    The gradient is that of the stack projected on the kept weights. Changes of the PSFs
+    vary with depth in ways that the stack shows weakly: a stack that requires a
+    gradient gets as many kernels more as keep the derivative of the image by depth.
 
     A singular value decomposition of the transfer functions, weighted by the 1/f
     amplitude of natural textures:
@@ -117,6 +122,8 @@ def basis(
     Args:
         stack: (depths, h, w), or (field rows, field columns, depths, h, w).
         depths_um: (depths,) ascending.
+        tolerance: relative L2 error of the image of a texture, at the worst depth.
+        gradient_tolerance: of ``gradient_error``, where the stack requires a gradient.
         occupied_um: least and largest depth that the scene holds; depths further out
             are left out.
 
@@ -137,14 +144,14 @@ def basis(
         )
         fields, depths_um = fields[:, :, low : high + 1], depths_um[low : high + 1]
     flat = fields.flatten(3).flatten(0, 2)
-    left, size, _ = torch.linalg.svd(
-        _seen(fields.detach().double()), full_matrices=False
-    )
+    features = _seen(fields.detach().double())
+    left, size, _ = torch.linalg.svd(features, full_matrices=False)
     share = (left * size) ** 2
-    missing = torch.sqrt(
-        share.flip(1).cumsum(1).flip(1) / share.sum(1, keepdim=True)
-    ).amax(0)
+    missing = torch.sqrt(_tails(share) / share.sum(1, keepdim=True)).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
+    lost = _derivative_lost(features, left, fields.shape[:3])
+    if stack.requires_grad:
+        rank = max(rank, int((lost > gradient_tolerance).sum()))
     weights = left[:, :rank].to(flat)
     kernels = weights.mT @ flat
     residual = flat.detach() - weights @ kernels.detach()
@@ -157,6 +164,33 @@ def basis(
         depths_um,
         error,
         bound,
+        float(lost[rank]) if rank < len(lost) else 0.0,
+    )
+
+
+def _tails(power: Tensor) -> Tensor:
+    """(…, n) sum of the n-th and all later powers."""
+    return power.flip(-1).cumsum(-1).flip(-1)
+
+
+def _derivative_lost(
+    features: Tensor, left: Tensor, shape: tuple[int, ...] | torch.Size
+) -> Tensor:
+    """(components,) relative L2 error of the derivative by depth through so many.
+
+    Of differences of neighbouring depths, projected on the left singular vectors.
+
+    Args:
+        features: (PSFs, frequencies). shape: (rows, columns, depths) of the PSFs.
+    """
+    if shape[2] < 2:
+        return torch.zeros(left.shape[1], dtype=left.dtype, device=left.device)
+    (change,) = torch.gradient(features.reshape(*shape, -1), dim=2)
+    power = (left.mT @ change.flatten(0, 2)).square().sum(1)
+    left_out = change.square().sum() - power.sum()  # beyond all components
+    return torch.sqrt(
+        (_tails(power) + left_out.clamp_min(0))
+        / change.square().sum().clamp_min(1e-300)
     )
 
 

@@ -197,7 +197,7 @@ def test_an_image_of_pillars_says_what_their_cells_leave_out():
     made = imager(lens(levels=8), grid, tolerance=5e-2)
     assert made.parts["pillars"] < wide.parts["pillars"] / 4
     assert (
-        f"above the 0.01 asked for (kernels: {wide.parts['kernels']:.2g})"
+        f"above the 0.01 asked for (pillars: {wide.parts['pillars']:.2g})"
         in wide.above(1e-2)
     )
     assert wide.above(1.1 * wide.error) == ""  # outside, 0.4 of the light, is no error
