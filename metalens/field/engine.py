@@ -424,7 +424,9 @@ def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
     """(n, depths, h, w) light that the splines through the nodes' PSFs give there."""
     field = optics.field
     maps = frame_maps(optics.grid.frame, psf_nodes(field), field.psf)
-    rows, columns = (m[p] for m, p in zip(maps, pixels.unbind(1), strict=True))
+    rows, columns = (
+        m[p.to(m.device)] for m, p in zip(maps, pixels.unbind(1), strict=True)
+    )
     near, far = optics.light.vergence
     unit = (near - 1 / depths_um) / max(near - far, 1e-30)
     deep = spline_matrix(unit.clamp(0, 1), field.psf.shape[2]).to(field.psf)

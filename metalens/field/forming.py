@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from metalens.field.low_rank import (
-    FEWEST,
     KernelBasis,
     LowRankPsfs,
     PsfField,
@@ -36,8 +35,9 @@ from metalens.image import Frames
 from metalens.image.scene import fixed
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
-# Kernels of coverage to those of light: it matters at the borders of sheets alone.
-COVER_SHARE = 0.3
+# Kernels of coverage, of those of light and at least: it matters at the borders of
+# sheets alone.
+COVER_SHARE, COVER_FEWEST = 0.3, 12
 LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 
 
@@ -216,7 +216,7 @@ def _assembled(
     basis: KernelBasis,
     parts: Mapping[str, float],
 ) -> Imager:
-    few = max(round(COVER_SHARE * len(basis.mixture)), FEWEST)
+    few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)
     light = low_rank_psfs(found, basis, grid.frame)
     cover = low_rank_psfs(found, basis, grid.frame, rank=few, lit=False)
     given = found.psf, found.illumination, basis, light, cover, parts

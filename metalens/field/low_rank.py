@@ -25,7 +25,7 @@ from metalens.field.texture import scene_spectrum
 
 SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
 MOST_KERNELS = 320
-FEWEST = 12  # kernels: single points hold more fine detail than a textured scene
+FEWEST = 24  # kernels: single points hold more fine detail than a textured scene
 ROUNDS = 2  # of the correction of planes: each squares what the last left of it
 FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
 EVEN = 0.01  # rms error of an evenly lit plane that kernels may leave to correct

@@ -111,11 +111,6 @@ def test_the_rim_of_a_wide_field_is_looked_at_too():
     assert float(texture_error(_psf(Window(SAMPLES, STEP_UM), place), light)) > 0.2
 
 
-def test_on_the_axis_the_period_stays_the_least():
-    grid = Grid((3, 5), STEP_UM, (3000.0, 9000.0), margin=SAMPLES // 2, window=SAMPLES)
-    assert imager(WAVE, grid, tolerance=0.1).plan.window.period == SPARE
-
-
 def test_a_period_grows_no_further_than_beyond_four_windows():
     """However little may be folded back: nodes grow with its square."""
     window, waves = (

@@ -26,7 +26,7 @@ from metalens.image import Frames
 from metalens.lens import Stop
 from metalens.psf import Nodes
 
-DISTANCE, RADIUS, STEP, SAMPLES, MARGIN = 600.0, 90.0, 10.0, 18, 4
+DISTANCE, RADIUS, STEP, SAMPLES, MARGIN = 600.0, 90.0, 10.0, 14, 4
 FRAME, WINDOW = SAMPLES + 2 * MARGIN, 2 * MARGIN + 1
 NEAR, FAR = 3e3, 12e3
 WAVES = Nodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
@@ -63,7 +63,9 @@ def _light(case, depths_um, *, finer=1, rows=slice(None)):
     y, x = torch.meshgrid(place[rows], place + reduced * math.tan(angle), indexing="ij")
     at = torch.stack([x.flatten(), y.flatten()], -1)
     depths = torch.tensor(depths_um, dtype=torch.float64)
-    window = Window(WINDOW * finer - (finer - 1), step, period=1.3)
+    # light from the side needs the second order of its distance from the middle
+    samples = WINDOW * finer - (finer - 1)
+    window = Window(samples, step, curved=angle != 0, period=1.5)
     optics, total = Optics(WAVE, layers, DISTANCE), 0.0
     with torch.no_grad():
         for wave, weight in zip(WAVES.wavelengths_um, WAVES.weights, strict=True):
@@ -196,7 +198,9 @@ def test_derivatives_by_the_psfs_and_by_depth_are_those_of_the_direct_sum():
     vergence = (1 / deep).requires_grad_()
     (made.surface(one, 1 / vergence)[0] * slope).sum().backward()
     want = float(slope.square().sum())
-    assert float(vergence.grad.sum()) == pytest.approx(want, rel=0.02)
+    assert float(vergence.grad.sum()) == pytest.approx(
+        want, rel=0.05
+    )  # five depth nodes
 
 
 def test_two_sheets_of_one_depth_image_as_one_plane():
@@ -207,3 +211,16 @@ def test_two_sheets_of_one_depth_image_as_one_plane():
     depth = torch.full((1, 2, FRAME, FRAME), 5.3e3)
     both = made(Frames(cover, cover, depth))[0]
     assert float((both / _plane(made, 5.3e3) - 1).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 0.02])
+def test_planes_before_a_lens_of_a_millimetre_are_even(tolerance):
+    """±19 degrees and defocus from 12 to 50 mm on samples of 18 um, at depths that are
+    no nodes.
+    """
+    wave = SmoothWave(Focus(0.85, 2e3, 33e3), 500.0)
+    grid = Grid((64, 64), 18.0, (12e3, 50e3), margin=8, window=17)
+    made = imager(wave, grid, tolerance=tolerance)
+    for depth in (12e3, 13e3, 15.1e3, 17e3, 21e3, 27e3, 33e3, 40e3, 47e3):
+        one = torch.ones(1, 80, 80)
+        assert _rest(made.surface(one, depth * one)[0]) < 0.0105, depth
