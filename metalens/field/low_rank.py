@@ -104,7 +104,7 @@ def principal_kernels(
     scaled = vectors[:, :rank] / power[:rank].clamp_min(1e-300).sqrt()
     axes = scaled.mT @ features
     weights, whole = [], []
-    for some in psf.split(SAMPLED):
+    for some in torch.split(psf, SAMPLED):
         spectrum = scene_spectrum(some.double(), *metric)
         weights.append(spectrum @ axes.mT)
         whole.append(spectrum.square().sum(1, keepdim=True))
@@ -202,7 +202,9 @@ class LowRankPsfs:
         if content.device.type != "cpu":
             return self.convolve(self.weigh(content, depth_um))
         count = max(1, CACHED // (len(self.kernels) * content[0].numel()))
-        parts = zip(content.split(count), depth_um.split(count), strict=True)
+        parts = zip(
+            torch.split(content, count), torch.split(depth_um, count), strict=True
+        )
         return torch.cat([self.convolve(self.weigh(*part)) for part in parts])
 
 
@@ -331,7 +333,8 @@ def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
     """
     own = moments(kernels.double())
     lack = moments(psf.double()) - weights.double() @ own
-    return weights.double() + lack @ torch.linalg.pinv(own)
+    least: Tensor = lack @ torch.linalg.pinv(own)
+    return weights.double() + least
 
 
 def transfer_functions(kernels: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -35,7 +35,8 @@ def spline_coefficients(nodes: int) -> Tensor:
     fourth_difference = torch.tensor([1.0, -4.0, 6.0, -4.0, 1.0])
     equations[nodes, :5] = fourth_difference
     equations[nodes + 1, -5:] = fourth_difference
-    return torch.linalg.inv(equations)[:, :nodes]
+    inverse: Tensor = torch.linalg.inv(equations)
+    return inverse[:, :nodes]
 
 
 def spline_matrix(unit: Tensor, nodes: int) -> Tensor:

@@ -151,11 +151,11 @@ def test_eye_like_frames_and_planes_err_by_no_more_than_is_stated(case, toleranc
     """The direct sum interpolates nothing: each source has the PSF of its depth."""
     made = _made(case, tolerance)
     radiance, depth = _eye(5)
-    steps = 1 / np.linspace(1 / FAR, 1 / NEAR, 25)[::-1]
+    steps = 1 / np.linspace(1 / FAR, 1 / NEAR, 13)[::-1]
     light = _light(case, tuple(steps))
-    # cubic in 1/z between 25 depths: three of four times as many as the imager has
-    place = (1 / NEAR - 1 / depth) / (1 / NEAR - 1 / FAR) * 24
-    first = (place.floor() - 1).clamp(0, 21).long()
+    # cubic in 1/z between 13 depths, two of three of which the imager does not have
+    place = (1 / NEAR - 1 / depth) / (1 / NEAR - 1 / FAR) * 12
+    first = (place.floor() - 1).clamp(0, 9).long()
     own = 0
     for k in range(4):
         weight = torch.ones_like(place)
@@ -167,7 +167,7 @@ def test_eye_like_frames_and_planes_err_by_no_more_than_is_stated(case, toleranc
     want = image_direct(radiance, own)
     got = made.surface(radiance[None].float(), depth[None].float())[0].double()
     assert float((got - want).norm() / want.norm()) < made.error
-    for number in (2, 11, 20):
+    for number in (1, 6, 10):
         want = image_direct(torch.ones_like(radiance), light[:, :, number])
         got = _plane(made, steps[number]).double()
         assert float((got - want).norm() / want.norm()) < made.error
