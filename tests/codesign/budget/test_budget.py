@@ -170,7 +170,7 @@ def test_the_whole_budget_of_a_small_lens(lens):
     assert set(found) == {
         "subject and calibration", "fixation", "reader", "sensor noise", "field", "radiometry", "spectrum", "glass",
         "polarisation", "pillar solver and proxy", "neighbours", "mask grid", "process spread", "propagation",
-        "depth sampling", "image kernels", TOTAL,
+        "depth sampling", "image kernels", "image tolerance", TOTAL,
     }  # fmt: skip
     assert math.isnan(found.pop("reader").gaze_rad)
     assert all(r.gaze_rad >= 0 and r.method for r in found.values())
