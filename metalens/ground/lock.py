@@ -35,7 +35,8 @@ def hold_lock(target: Path) -> Iterator[None]:
             os.close(handle)  # its last owner removed the file in between
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         os.ftruncate(handle, 0)
-        os.pwrite(handle, f"{os.getpid()} {COMMAND.get()}".encode(), 0)
+        words = f"{os.getpid()} {COMMAND.get()}"
+        os.pwrite(handle, words.encode("utf-8", "surrogateescape"), 0)
         try:
             yield
         finally:
@@ -53,7 +54,8 @@ def _is_locked(handle: int, path: Path, target: Path) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        process, _, command = os.pread(handle, 4096, 0).decode().partition(" ")
+        words = os.pread(handle, 4096, 0).decode("utf-8", "surrogateescape")
+        process, _, command = words.partition(" ")
         owner = f"process {process} (metalens {command})" if process else "another one"
         raise OutputError(
             f"{target} is being written by {owner}; wait for it or give another name"
