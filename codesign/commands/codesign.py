@@ -191,7 +191,8 @@ def _writer(folder: Path, step: int) -> Any:
         raise ConfigError(
             "--events needs tensorboard: pip install 'metalens-toolchain[events]'"
         ) from None
-    return SummaryWriter(str(folder), purge_step=step + 1 if step else None)  # type: ignore[no-untyped-call]
+    make: Any = SummaryWriter
+    return make(str(folder), purge_step=step + 1 if step else None)
 
 
 def _events(writer: Any, going: Run, record: Record) -> None:

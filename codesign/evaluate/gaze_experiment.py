@@ -211,8 +211,13 @@ def lighting(sources: Sequence[Source], config: ExperimentConfig) -> list[Sensor
     for sensor, area in zip(sensors, areas, strict=True):
         base = (sensor.base_pitch_um / dim.base_pitch_um) ** 2  # counts of a base pixel
         scale = base * area / areas[0]
-        light = {"exposure_e": dim.exposure_e, "ambient_e": dim.ambient_e}
-        found.append(replace(sensor, **{k: v * scale for k, v in light.items()}))
+        found.append(
+            replace(
+                sensor,
+                exposure_e=dim.exposure_e * scale,
+                ambient_e=dim.ambient_e * scale,
+            )
+        )
     return found
 
 

@@ -15,7 +15,7 @@ eigenvectors of their gradients learns what lies across that direction at once.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -139,11 +139,8 @@ def _reading_layers(net: nn.Module) -> list[nn.Parameter]:
         for m in room.modules()
         if isinstance(m, nn.Linear | nn.Conv2d)
     ]
-    return [
-        m.weight
-        for m in layers
-        if m.weight[0].numel() == m.weight.shape[1] and min(m.weight.shape[:2]) >= 8
-    ]
+    weights: list[nn.Parameter] = [cast("nn.Parameter", m.weight) for m in layers]
+    return [w for w in weights if w[0].numel() == w.shape[1] and min(w.shape[:2]) >= 8]
 
 
 class _Soap(SOAP):
