@@ -5,7 +5,7 @@ Names load when first used: ``import characterize; characterize.fit(capture, len
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from characterize.captures.capture import Capture as Capture
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from characterize.pupil.fit import fit_pupil as fit_pupil
     from characterize.pupil.record import PupilSpec as PupilSpec
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "AsBuilt": "characterize.inference.asbuilt",

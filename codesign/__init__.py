@@ -5,7 +5,7 @@ Names load when first used: ``import codesign; codesign.render(states)``.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.adapt.train import retrain as retrain
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from codesign.network.supernet import Supernet as Supernet
     from codesign.train.evolution import search as search
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Supernet": "codesign.network.supernet",

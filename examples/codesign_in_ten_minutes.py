@@ -20,13 +20,13 @@ from codesign.batches import pool
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
 from codesign.network import cost
-from codesign.network.architecture import Architecture, Space
-from codesign.network.supernet import recalibrate
+from codesign.network.architecture import Architecture, SearchSpace
+from codesign.network.supernet import recalibrate_batch_norm
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from codesign.train import assess, inner
 from codesign.train.depth_test import depth_response
-from codesign.train.inner import InnerConfig, Schedule, Trainer
+from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image.sensor import Sensor
 
 # %% [markdown]
@@ -39,7 +39,7 @@ settings = SceneConfig(
     pixels=96, margin=16, slip_mm=(0.5, 0.5, 3.5), gaze_deg=(6.0, 5.0)
 )
 scenes = EyeScenes(settings, 9.0, 2000.0, seed=0)
-frames = pool.fill(scenes, 768)
+frames = pool.render_pool(scenes, 768)
 batches = PoolScenes(frames, settings.margin, settings.scale, seed=0)
 figure, axes = plt.subplots(1, 5, figsize=(9, 2))
 for image, panel in zip(frames.light, axes, strict=False):
@@ -51,7 +51,7 @@ for image, panel in zip(frames.light, axes, strict=False):
 # Multiply-accumulates are a smooth function of the pixel pitch (Eq. 9), so the pitch can be trained too.
 
 # %%
-space = Space(
+space = SearchSpace(
     widths=(0.25, 0.5),
     depths=(2,),
     expansions=(3,),
@@ -77,15 +77,15 @@ def train(polynomials, steps=200):
     lens = OpticsConfig(
         focus_mm=33.0, polynomials=polynomials, depth_count=14, image="uniform"
     )
-    moving = Schedule(0.03 if polynomials else 0.0, 0.1, 0.8)
+    moving = LearningRateSchedule(0.03 if polynomials else 0.0, 0.1, 0.8)
     config = InnerConfig(
         steps=steps, batch=32, optics=moving, optics_weight=0.0, slip_weight=8.0
     )
-    made = inner.model(lens, pitch_um=9.0, seed=0, space=space)
+    made = inner.make_model(lens, pitch_um=9.0, seed=0, space=space)
     trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
     losses = [record.task for record in trainer.run()]
-    seen = assess.frames(trainer, batches, 6)
-    recalibrate(made.net, member, assess.parts(seen))
+    seen = assess.sensor_frames(trainer, batches, 6)
+    recalibrate_batch_norm(made.net, member, assess.batched_frames(seen))
     return trainer, losses
 
 
@@ -107,9 +107,9 @@ plt.legend()
 test = EyeScenes(settings, 9.0, 2000.0, seed=0, stream=TEST)
 for name, (trainer, _) in runs.items():
     net = trainer.model.net
-    seen = assess.frames(trainer, test, 6)
+    seen = assess.sensor_frames(trainer, test, 6)
     error = (
-        (assess.predict(net, member, seen, trainer.inner).slip_mm - seen.slip_mm)
+        (assess.predict_frames(net, member, seen, trainer.inner).slip_mm - seen.slip_mm)
         .abs()
         .mean(0)
     )
@@ -126,7 +126,7 @@ trainer = runs["joint"][0]
 found = trainer.model.coefficients_rad.detach()
 figure, axes = plt.subplots(2, 5, figsize=(9, 3.8))
 for row, phase in zip(axes, (0 * found, found), strict=True):
-    stack = optics.stack(trainer.optics, phase)
+    stack = optics.lens_psf_stack(trainer.optics, phase)
     for panel, index in zip(row, np.linspace(0, 13, 5).astype(int), strict=True):
         panel.imshow(stack.intensity[index].clamp_min(0).sqrt(), cmap="magma")
         panel.set_title(f"{float(stack.depths_um[index]) * 1e-3:.0f} mm", fontsize=8)

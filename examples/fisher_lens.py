@@ -17,16 +17,18 @@ import torch
 from metalens import fisher
 from metalens.design import Focus
 from metalens.design.free_form import search as design_fisher
-from metalens.design.free_form.search import Fisher
+from metalens.design.free_form.search import FisherSettings
 from metalens.image import pupil
 from metalens.image.pupil import Pupil
 
 optics = Pupil(nodes=160)
 aim = Focus(0.85, 2000.0, 20e3)
-asked = Fisher().about(aim, optics.radius_um)  # depths, window and samples of this lens
+asked = FisherSettings().about(
+    aim, optics.radius_um
+)  # depths, window and samples of this lens
 x, y = (a.numpy() for a in pupil.coordinates(optics))
 flat = torch.zeros(160, 160, dtype=torch.float64)
-helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
+helix = torch.from_numpy(design_fisher.vortex_phase(x, y, radius_um=500.0, zones=2))
 
 # %% [markdown]
 # ## A short design
@@ -34,8 +36,8 @@ helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
 # gives 1.44, 1.84 and 2.11 times the better tuned simple lens at 1 x 1, 2 x 2 and 3 x 3 pixels (docs/fisher).
 
 # %%
-made = design_fisher.optimise(
-    optics, Fisher(iterations=150, starts=1).about(aim, optics.radius_um)
+made = design_fisher.optimize_free_form(
+    optics, FisherSettings(iterations=150, starts=1).about(aim, optics.radius_um)
 )
 free = design_fisher.phase_on(optics, made)
 print(made.reason, "; information and least energy:", made.starts)
@@ -50,8 +52,10 @@ depths = torch.linspace(16, 26, 11)
 for binning, ax in zip((1, 2, 3), axes, strict=True):
     for name, phase in lenses.items():
         focus = made.focus_um if name == "free form" else 20e3
-        binned = Fisher(pixel_um=3.0 * binning).about(aim, optics.radius_um)
-        score = design_fisher.score(phase, optics, focus_um=focus, settings=binned)
+        binned = FisherSettings(pixel_um=3.0 * binning).about(aim, optics.radius_um)
+        score = design_fisher.score_phase(
+            phase, optics, focus_um=focus, settings=binned
+        )
         ax.semilogy(
             depths,
             score.information,
@@ -75,7 +79,7 @@ near, far = (
 claimed = fisher.pixel_information(
     near, far, step_um=200.0, sample_um=3.0, pixel_um=3.0, normalisation="l2"
 ).mean()
-honest = design_fisher.score(
+honest = design_fisher.score_phase(
     helix, optics, focus_um=20e3, settings=asked
 ).information.mean()
 print(f"claimed {float(claimed):.2f}, honest {float(honest):.2f} per mm²")

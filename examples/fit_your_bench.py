@@ -15,11 +15,11 @@
 import numpy as np
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures.capture import Capture
-from characterize.inference.estimate import Options, fit
-from characterize.model.parameters import Known
-from characterize.model.pillar_slopes import slopes
+from characterize.inference.estimate import FitOptions, fit
+from characterize.model.parameters import KnownValue
+from characterize.model.pillar_slopes import log_response_slopes
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.pillars.proxy import Proxy
@@ -53,13 +53,13 @@ hidden = {
     "crosstalk_px": 0.25,
     "background_e": 20.0,
 }
-truth = Truth(
+truth = HiddenLens(
     (380.0, 480.0, 600.0, 800.0, 1150.0),
     peak_e=6000.0,
-    parameter=tuple(Known(name, value) for name, value in hidden.items()),
-    camera=Camera(pixel_um=1.5, pixels=16),
+    parameter=tuple(KnownValue(name, value) for name, value in hidden.items()),
+    camera=BenchCamera(pixel_um=1.5, pixels=16),
 )
-shots = bench.shoot(lens, truth, slopes(lens))
+shots = bench.simulate_frames(lens, truth, log_response_slopes(lens))
 depths, angles = truth.stated
 unknown = np.full(len(depths), np.nan)
 names = tuple(f"frame {i}" for i in range(len(depths)))
@@ -80,8 +80,8 @@ captures = Capture(
 # The fit, with what an AFM and a spectrometer say as prior knowledge.
 
 # %%
-told = (Known("height_nm", 0.0, 3.0), Known("wavelength_nm", 0.0, 0.1))
-built = fit(captures, lens, Options(known=told, scan_um=60.0))
+told = (KnownValue("height_nm", 0.0, 3.0), KnownValue("wavelength_nm", 0.0, 0.1))
+built = fit(captures, lens, FitOptions(known=told, scan_um=60.0))
 for name, value, sigma in zip(built.names, built.value, built.sigma, strict=True):
     true = (
         "" if name == "log_gain" else f"true {hidden.get(name, 0.0):6.2f}"

@@ -74,7 +74,7 @@ plt.show()
 # report.)
 
 # %%
-made = build.prepare(lens, rules, with_doses=False)
+made = build.prepare_mask(lens, rules, with_doses=False)
 report = check_plan(made.plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())
@@ -131,8 +131,8 @@ plt.show()
 
 # %%
 small = process.Process(write_field=process.WriteField(size_um=100.0))
-plan = fields.split(written, small)
-stitched = stitching.stitching(lens, plan, small)
+plan = fields.split_write_fields(written, small)
+stitched = stitching.simulate_stitching(lens, plan, small)
 print(
     f"{plan.used} fields of {plan.size_um[0]:.1f} µm; borders left where they were would cut {plan.cut_before} pillars, now none"
 )
@@ -150,8 +150,8 @@ print(
 # differences of the solver. What all pillars share is only a common phase; what counts is how *differently* they answer.
 
 # %%
-answers = sensitivity.sensitivities(lens, count=9)
-study = tolerance.analyse(lens, rules, sens=answers, draws=60)
+answers = sensitivity.compute_sensitivities(lens, count=9)
+study = tolerance.analyse_tolerance(lens, rules, sens=answers, draws=60)
 print(
     f"t(D) under all causes lives in {study.rank} dimensions (error {study.error:.0e}); derivatives to {100 * answers.error:.0f} %"
 )

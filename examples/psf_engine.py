@@ -140,7 +140,7 @@ for tolerance in (1e-3, 1e-4, 1e-6):
         (seconds, error(stack.numpy().intensity))
     )
 
-case = propagate.case(phase.shape, **geometry, depths_um=DEPTHS)
+case = propagate.make_case(phase.shape, **geometry, depths_um=DEPTHS)
 hankel, seconds = timed(lambda: field_radial(lens, case, 1e-5))
 points["Hankel (radial lens)"] = [(seconds, error(normalised(hankel.field)))]
 
@@ -178,8 +178,10 @@ print("estimate / truth:", np.round(estimate / wrong, 2))
 
 # %%
 for shape, samples in (((8, 8), 4), ((500, 500), 24), ((2500, 2500), 64)):
-    picked = propagate.choose(
-        propagate.case(shape, **geometry | dict(samples=samples), depths_um=DEPTHS),
+    picked = propagate.choose_method(
+        propagate.make_case(
+            shape, **geometry | dict(samples=samples), depths_um=DEPTHS
+        ),
         1e-4,
     )
     print(

@@ -19,12 +19,12 @@ from pathlib import Path
 from IPython.display import Image, display
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures import capture as captures
 from characterize.commands import capture as command_capture
 from characterize.inference import asbuilt
-from characterize.inference.estimate import Options, fit
-from characterize.model.parameters import Known
+from characterize.inference.estimate import FitOptions, fit
+from characterize.model.parameters import KnownValue
 from codesign.adapt import correction
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
@@ -81,20 +81,20 @@ main(
 
 # %%
 hidden = {"bias_nm": 5.0, "bias_r_nm": 3.0, "coma_x_rad": 0.3, "distance_um": 12.0}
-truth = Truth(
+truth = HiddenLens(
     (2500.0, 3200.0, 4200.0, 6000.0, 10e3, 20e3),
-    parameter=tuple(Known(name, value) for name, value in hidden.items()),
-    camera=Camera(pixel_um=2.0, pixels=32),
+    parameter=tuple(KnownValue(name, value) for name, value in hidden.items()),
+    camera=BenchCamera(pixel_um=2.0, pixels=32),
 )
-shots = bench.shoot(design, truth, sensitivity(design))
-command_capture.write(work / "captures", shots, truth, design)
+shots = bench.simulate_frames(design, truth, sensitivity(design))
+command_capture.write_capture_folder(work / "captures", shots, truth, design)
 
 # %% [markdown]
 # ## 4. The lens as built
 # With intervals, and with what cannot be told apart.
 
 # %%
-made = fit(captures.load(work / "captures"), design, Options())
+made = fit(captures.load(work / "captures"), design, FitOptions())
 for name in hidden:
     low, high = made.interval(name)
     print(f"{name:<14} true {hidden[name]:6.2f}   fitted {low:7.2f} to {high:7.2f}")
@@ -116,22 +116,22 @@ for name, row in told.rows().items():
     print(
         f"{retrain_report.CASES[name]:<38} {row['slip_mm']:.3f} mm  [{row['slip_low_mm']:.3f}, {row['slip_high_mm']:.3f}]"
     )
-display(Image(retrain_report.bars(told)))
+display(Image(retrain_report.plot_error_bars(told)))
 
 # %% [markdown]
 # ## 6. The next mask
 # A new bias table and a corrected map, and what they would gain on the true lens.
 
 # %%
-optics = retraining.load(work / "run").settings.optics
+optics = retraining.load_finished_run(work / "run").settings.optics
 engine = built.MadeLens(design, optics)
-plan = correction.propose(
+plan = correction.propose_correction(
     design,
     made.parameters(),
     response=engine.response,
     old=correction.present_bias(process),
 )
-correction.write(work, plan)
+correction.write_correction(work, plan)
 print(tomllib.loads((work / "bias.toml").read_text())["bias"]["table_nm"][::4])
 goal = engine.stack()
 for state in correction.next_lenses(engine, plan, made.parameters(), truth.vector()):

@@ -7,7 +7,7 @@ process), path)``.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.drc.lattice import check_plan as check_plan
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from layout.process.process import Process as Process
     from layout.process.process import load as load_process
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Process": "layout.process.process",

@@ -12,13 +12,13 @@ import numpy as np
 from layout.process import Process
 from layout.shapes import region
 from metalens.cell import Cell
-from metalens.cell.shapes import Conic, Loop, Outline
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, ProcessError
-from metalens.ground.units import nm
+from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError, ProcessError
+from metalens.core.units import nm
 from metalens.lens import Lens
-from metalens.pillars.axes import sized
+from metalens.pillars.axes import cell_of_sizes
 
 # pillars that viewers and CAD kernels still open
 MAX_PILLARS = {"STEP": 10_000, "STL": 500_000}
@@ -30,7 +30,7 @@ _SUBSTRATE_COLOUR, _PILLAR_COLOUR = (0.75, 0.85, 0.95), (0.25, 0.35, 0.75)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Section:
+class SolidSection:
     """Outlines of a class of pillars at foot and top, with corresponding parts.
 
     name: label, by its size at half height in nm; "105_9" is 105.9.
@@ -47,7 +47,7 @@ class Section:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tile:
+class SolidTile:
     """Pillars of a part of a lens as fabricated: axis at (0, 0), feet on z = 0.
 
     sections: of each class.
@@ -58,7 +58,7 @@ class Tile:
     site_um2: area of the unit cell of one pillar.
     """
 
-    sections: tuple[Section, ...]
+    sections: tuple[SolidSection, ...]
     x_um: Array
     y_um: Array
     kind: Array
@@ -68,7 +68,7 @@ class Tile:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mesh:
+class TriangleMesh:
     """A closed surface.
 
     vertices_um: (n, 3) corners.
@@ -85,7 +85,7 @@ def cut_tile(
     *,
     side_um: float | None = None,
     centre_um: tuple[float, float] = (0.0, 0.0),
-) -> Tile:
+) -> SolidTile:
     """The pillars of a square of a lens as fabricated: bias, rounding, sidewalls.
 
     Args:
@@ -119,7 +119,7 @@ def cut_tile(
     is_disc = grid.plain and lens.cell.shape.kind == "circle"
     classify = _discs if is_disc else _shapes
     sections, kind = classify(lens, process, row, column)
-    return Tile(
+    return SolidTile(
         sections,
         grid.x_um[column],
         grid.y_um[row],
@@ -132,7 +132,7 @@ def cut_tile(
 
 def _discs(
     lens: Lens, process: Process, row: Array, column: Array
-) -> tuple[tuple[Section, ...], Array]:
+) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of round pillars at sites, and which of them each is."""
     step, height = process.rules.diameter_step_nm, lens.cell.height_um
     design_nm = lens.diameters.diameter_um[row, column] / nm
@@ -149,14 +149,14 @@ def _discs(
             f"{pitch_nm:.0f} nm; need above 0 and below the pitch"
         )
     sections = tuple(
-        Section(_label(middle), _circle(low * nm), _circle(high * nm))
+        SolidSection(_label(middle), _circle(low * nm), _circle(high * nm))
         for middle, low, high in zip((top + foot) / 2, foot, top, strict=True)
     )
     return sections, kind
 
 
 def _circle(diameter_um: float) -> Outline:
-    return Outline((Conic(diameter_um / 2, diameter_um / 2),))
+    return Outline((EllipseArc(diameter_um / 2, diameter_um / 2),))
 
 
 def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> str:
@@ -168,7 +168,7 @@ def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> st
 
 def _shapes(
     lens: Lens, process: Process, row: Array, column: Array
-) -> tuple[tuple[Section, ...], Array]:
+) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of pillars of any shape and rotation at sites, and which each is."""
     grid, step = lens.diameters, process.rules.diameter_step_nm
 
@@ -191,12 +191,12 @@ def _shapes(
 
 def _section(
     cell: Cell, process: Process, drawn_nm: int, length_nm: int, turn: int
-) -> Section:
+) -> SolidSection:
     """Section of a drawn size, length (0: set by the shape) and rotation (in steps)."""
     bias, angle = process.bias, turn * process.rules.angle_step_deg
     width = float(bias.made_nm(np.array(float(drawn_nm))))
     length = float(bias.made_nm(np.array(float(length_nm)))) if length_nm else 0.0
-    shape = sized(cell, width, length) if length else cell
+    shape = cell_of_sizes(cell, width, length) if length else cell
     lean_um = cell.height_um * math.tan(math.radians(process.etch.sidewall_deg))
     is_closed = True
     try:
@@ -217,10 +217,10 @@ def _section(
             f"{cell.shape.name} {width:.0f} nm wide on a pitch of "
             f"{cell.pitch_um / nm:.0f} nm"
         )
-    return Section(_label(width, length, angle), foot, top)
+    return SolidSection(_label(width, length, angle), foot, top)
 
 
-def check_count(pillars: Tile, form: str) -> None:
+def check_count(pillars: SolidTile, form: str) -> None:
     """Refuse more pillars than a file can hold.
 
     Args:
@@ -240,7 +240,9 @@ def check_count(pillars: Tile, form: str) -> None:
         )
 
 
-def mesh_section(section: Section, height_um: float, *, sides: int = 8) -> Mesh:
+def mesh_section(
+    section: SolidSection, height_um: float, *, sides: int = 8
+) -> TriangleMesh:
     """Triangulated surface of a pillar; volume between sections is linear in z.
 
     Args:
@@ -261,16 +263,16 @@ def mesh_section(section: Section, height_um: float, *, sides: int = 8) -> Mesh:
         faces.append(np.stack([here, after + total, here + total], -1))
         start += len(low)
     for end, order in ((0, -1), (1, 1)):
-        filled = region.triangles([pair[end] / nm for pair in contours])
+        filled = region.triangulate([pair[end] / nm for pair in contours])
         faces.append(filled[:, ::order] + end * total)
     rings = [
         np.column_stack([ring, np.full(total, z)])
         for ring, z in ((foot, 0.0), (top, height_um))
     ]
-    return Mesh(np.concatenate(rings), np.concatenate(faces))
+    return TriangleMesh(np.concatenate(rings), np.concatenate(faces))
 
 
-def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
+def write_stl(path: str | Path, pillars: SolidTile, *, sides: int = 8) -> int:
     """Write binary STL in um, one closed surface a pillar.
 
     Args:
@@ -293,7 +295,7 @@ def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
     total = facets.shape[1] * len(pillars.kind)
     head = b"tapered pillars, um, metalens-toolchain".ljust(80)
     places = np.column_stack([pillars.x_um, pillars.y_um]).astype(np.float32)
-    with store.replacing(path) as part, open(part, "wb") as file:
+    with store.replace_atomically(path) as part, open(part, "wb") as file:
         file.write(head + struct.pack("<I", total))
         for start in range(0, len(places), _PILLARS_PER_BLOCK):
             block = slice(start, start + _PILLARS_PER_BLOCK)
@@ -303,7 +305,7 @@ def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
     return int(total)
 
 
-def _facets(mesh: Mesh) -> Array:
+def _facets(mesh: TriangleMesh) -> Array:
     corners = mesh.vertices_um[mesh.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facets = np.zeros(len(corners), _FACET)
@@ -312,7 +314,7 @@ def _facets(mesh: Mesh) -> Array:
     return facets
 
 
-def write_step(path: str | Path, pillars: Tile) -> None:
+def write_step(path: str | Path, pillars: SolidTile) -> None:
     """Write STEP (AP214): an assembly of tapered pillars on a slab of substrate.
 
     Each class of pillars is stored once and placed. Modelled in um, where the tolerance
@@ -353,7 +355,7 @@ def write_step(path: str | Path, pillars: Tile) -> None:
     for part in parts:
         _add_part(shapes, colours, root, *part)
     shapes.UpdateAssemblies()
-    with store.replacing(path) as file:
+    with store.replace_atomically(path) as file:
         if not _write_document(document, file):
             raise ProcessError(
                 f"{path}: the CAD kernel could not write the STEP file; is the disk full?"
@@ -385,7 +387,7 @@ def _add_part(
         shapes.AddComponent(root, stored, TopLoc_Location(move))
 
 
-def _body(section: Section, height_um: float) -> Any:
+def _body(section: SolidSection, height_um: float) -> Any:
     """Solid of a pillar: each part of its section, the holes cut out of the first."""
     pairs = zip(section.foot.parts, section.top.parts, strict=True)
     whole, *holes = (
@@ -398,11 +400,15 @@ def _body(section: Section, height_um: float) -> Any:
 
 
 def _loft(
-    foot: Conic | Loop, top: Conic | Loop, height_um: float, *, is_upright: bool
+    foot: EllipseArc | PolygonLoop,
+    top: EllipseArc | PolygonLoop,
+    height_um: float,
+    *,
+    is_upright: bool,
 ) -> Any:
     from build123d import Face, Solid
 
-    if isinstance(foot, Conic) and isinstance(top, Conic):
+    if isinstance(foot, EllipseArc) and isinstance(top, EllipseArc):
         radii = foot.half_x_um, top.half_x_um
         if foot.half_x_um == foot.half_y_um and is_upright:
             return Solid.make_cylinder(radii[0], height_um)
@@ -413,10 +419,10 @@ def _loft(
     return Solid.make_loft([_wire(foot, 0.0), _wire(top, height_um)], ruled=True)
 
 
-def _wire(part: Conic | Loop, z_um: float) -> Any:
+def _wire(part: EllipseArc | PolygonLoop, z_um: float) -> Any:
     from build123d import Location, Wire
 
-    if isinstance(part, Conic):
+    if isinstance(part, EllipseArc):
         ellipse = Wire.make_ellipse(part.half_x_um, part.half_y_um)
         turn = (0, 0, math.degrees(part.angle_rad))
         return ellipse.moved(Location((0, 0, z_um), turn))

@@ -6,7 +6,7 @@ Submodules load when first used: ``import metalens; metalens.psf.psf_stack(...)`
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 __version__ = "0.1.0"
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from metalens import psf as psf
     from metalens import rcwa as rcwa
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "cell": "",

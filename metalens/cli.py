@@ -25,13 +25,13 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.ground import console, lock
-from metalens.ground.errors import (
+from metalens.core import console, lock
+from metalens.core.errors import (
     ConfigError,
     FitRefused,
     MetalensError,
     missing_extra,
-    nearest,
+    nearest_name_hint,
 )
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -126,16 +126,16 @@ OBJECTIVES["process"] = "layout.process.limits"
 PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}
 # what ``metalens view`` shows of a kind: "module:function" with its panels
 VIEWS = {
-    "mask": "layout.commands.view:panels",
-    "capture": "characterize.commands.view:capture",
-    "asbuilt": "characterize.commands.view:asbuilt",
-    "pupil": "characterize.commands.view:pupil",
-    "run": "codesign.commands.view:panels",
-    "scene": "codesign.commands.view:scene",
-    "layers": "codesign.commands.view:layers",
-    "image": "codesign.commands.view:image",
-    "answers": "codesign.commands.view:answers",
-    "budget": "codesign.commands.view:budget",
+    "mask": "layout.commands.view:mask_panels",
+    "capture": "characterize.commands.view:capture_panels",
+    "asbuilt": "characterize.commands.view:asbuilt_panels",
+    "pupil": "characterize.commands.view:pupil_panels",
+    "run": "codesign.commands.view:run_panels",
+    "scene": "codesign.commands.view:scene_panels",
+    "layers": "codesign.commands.view:layer_panels",
+    "image": "codesign.commands.view:image_panels",
+    "answers": "codesign.commands.view:prediction_panels",
+    "budget": "codesign.commands.view:budget_panels",
 }
 # and what ``metalens info`` says of files that are none of the core's: module with
 # ``told`` and ``text``
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # before the verb began
         status = _refuse("interrupted before the work began", INTERRUPTED)
     try:
-        console.flush()
+        console.flush_output()
     except MetalensError as error:
         status = _refuse(str(error))
     return status
@@ -197,15 +197,17 @@ def _main(arguments: Sequence[str] | None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a locale of ASCII alone
     if not words or words[0] in ("-h", "--help"):
-        console.flush(_help(VERBS) + _INTERRUPTED)
+        console.flush_output(_help(VERBS) + _INTERRUPTED)
         return SUCCESS if words else BAD_INPUT
     if words[0] == "--version":
         from metalens import __version__
 
-        console.flush(f"metalens {__version__}\n")
+        console.flush_output(f"metalens {__version__}\n")
         return SUCCESS
     if words[0] not in VERBS:
-        return _refuse(f"unknown command {words[0]!r}{nearest(words[0], VERBS)}")
+        return _refuse(
+            f"unknown command {words[0]!r}{nearest_name_hint(words[0], VERBS)}"
+        )
     try:
         os.getcwd()
     except OSError:  # libraries end the process there
@@ -235,11 +237,11 @@ def _prepare() -> None:
 
 def _guarded(words: list[str], *, debug: bool) -> int:
     """Run the command; its exit status, with one line for whatever stopped it."""
-    from metalens.ground import reading
+    from metalens.core import reading
 
     told = lock.COMMAND.set(" ".join(words))
     try:
-        with reading.remembered():
+        with reading.remember_inputs():
             return _shown(words) if debug else _dispatch(words[0], words[1:])
     except FitRefused as error:
         return _refuse(_said(error), FAILED_CHECK)
@@ -325,12 +327,12 @@ def _dispatch(verb: str, words: list[str]) -> int:
     parts: dict[str, tuple[str, str]] = getattr(module, "PARTS", {})
     if parts:
         if not words or words[0] in ("-h", "--help"):
-            console.flush(_help(parts, f"metalens {verb}"))
+            console.flush_output(_help(parts, f"metalens {verb}"))
             return SUCCESS if words else BAD_INPUT
         meant = words[0] if words[0] in parts else module.part_of(words[0])
         if meant is None:
             return _refuse(
-                f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}"
+                f"unknown command {verb} {words[0]!r}{nearest_name_hint(words[0], parts)}"
             )
         module = importlib.import_module(parts[meant][0])
         verb, words = f"{verb} {meant}", words[words[0] in parts :]
@@ -350,7 +352,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
             description=module.__doc__,
         )
     except BrokenPipeError:  # whoever was shown the help went away
-        console.silence()
+        console.silence_output()
         return SUCCESS
     except SystemExit as end:
         if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):
@@ -369,7 +371,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
 
 
 def _refuse_beyond_reach(options: Any) -> None:
-    """The rule of settings files (:func:`metalens.ground.config.load`) for the numbers
+    """The rule of settings files (:func:`metalens.core.config.load`) for the numbers
     among options.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.image.information import Normalisation as Normalisation
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from metalens.image.information import texture_information as texture_information
     from metalens.image.information import without_nuisance as without_nuisance
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Normalisation": "metalens.image.information",

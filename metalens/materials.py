@@ -2,17 +2,17 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.cell.materials import NAMES as NAMES
     from metalens.cell.materials import Material as Material
+    from metalens.cell.materials import find_material as find_material
     from metalens.cell.materials import index as index
-    from metalens.cell.materials import material as material
+    from metalens.cell.materials import index_dispersion as index_dispersion
     from metalens.cell.materials import read_csv as read_csv
-    from metalens.cell.materials import slope as slope
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Material": "metalens.cell.materials",

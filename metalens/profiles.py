@@ -2,19 +2,19 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
+    from metalens.core.paths import path_difference as path_difference
     from metalens.design.profiles import Cubic as Cubic
     from metalens.design.profiles import DoubleHelix as DoubleHelix
     from metalens.design.profiles import Focus as Focus
     from metalens.design.profiles import PhaseMap as PhaseMap
-    from metalens.design.profiles import cubic as cubic
-    from metalens.design.profiles import double_helix as double_helix
-    from metalens.design.profiles import hyperbolic as hyperbolic
-    from metalens.ground.paths import path_difference as path_difference
+    from metalens.design.profiles import cubic_phase as cubic_phase
+    from metalens.design.profiles import double_helix_phase as double_helix_phase
+    from metalens.design.profiles import hyperbolic_phase as hyperbolic_phase
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Cubic": "metalens.design.profiles",
@@ -24,6 +24,6 @@ __getattr__, __dir__, __all__ = attach(
         "cubic": "metalens.design.profiles",
         "double_helix": "metalens.design.profiles",
         "hyperbolic": "metalens.design.profiles",
-        "path_difference": "metalens.ground.paths",
+        "path_difference": "metalens.core.paths",
     },
 )

@@ -4,18 +4,18 @@ Eq. 2).
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
-    from metalens.pillars.fit import Wanted as Wanted
+    from metalens.pillars.fit import ProxyTolerances as ProxyTolerances
     from metalens.pillars.fit import fit_proxy as fit
     from metalens.pillars.proxy import Proxy as Proxy
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Proxy": "metalens.pillars.proxy",
-        "Wanted": "metalens.pillars.fit",
+        "ProxyTolerances": "metalens.pillars.fit",
         "fit": "metalens.pillars.fit:fit_proxy",
     },
 )

@@ -47,7 +47,7 @@ ARITHMETIC = {
 # fits, compiled loops.
 QUICK = (
     "tests/metalens/cell",
-    "tests/metalens/ground/test_legendre.py",
+    "tests/metalens/core/test_legendre.py",
     "tests/metalens/image",
     "tests/metalens/pillars/test_polynomial.py",
     "tests/metalens/pillars/test_rational.py",

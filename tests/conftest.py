@@ -8,7 +8,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-from metalens.ground import report
+from metalens.core import report
 from tests import small
 
 # No clock decides a test: no deadline, no complaint of slow data. Every run draws anew;
@@ -76,7 +76,7 @@ def pixels_of_pictures() -> Iterator[int]:
     """Those of an inch as users have them. In tests a quarter of that: two thirds of
     the time, the same drawing.
     """
-    usual = report.png.__kwdefaults__
+    usual = report.figure_png.__kwdefaults__
     fine = usual["dpi"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(usual, "dpi", fine // 4)
@@ -86,7 +86,7 @@ def pixels_of_pictures() -> Iterator[int]:
 @pytest.fixture
 def fine_pictures(pixels_of_pictures: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures as users have them, for a test that asks how large they are."""
-    monkeypatch.setitem(report.png.__kwdefaults__, "dpi", pixels_of_pictures)
+    monkeypatch.setitem(report.figure_png.__kwdefaults__, "dpi", pixels_of_pictures)
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from metalens.cell.record import Cell, Index
 from metalens.cli import BAD_INPUT, main
 from metalens.commands import design
 from metalens.commands.library import CellFile
-from metalens.ground import config, transaction
+from metalens.core import config, transaction
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -81,17 +81,20 @@ NEEDS = {
     "field": ("cell.toml --diameter-um 0.12", "metalens.commands.field:near_fields"),
     "design": ("design.toml", "metalens.commands.design:_make"),
     "psf": ("lens.h5", "metalens.commands.psf:_compute"),
-    "export": ("lens.h5", "metalens.lens.export:write"),
+    "export": ("lens.h5", "metalens.lens.export:export_lens"),
     "scene": ("scene.toml", "codesign.commands.scene:_make"),
     "layout": ("lens.h5", "layout.commands.make:_prepare"),
-    "capture": ("lens.h5 --truth truth.toml", "characterize.bench.bench:shoot"),
+    "capture": (
+        "lens.h5 --truth truth.toml",
+        "characterize.bench.bench:simulate_frames",
+    ),
     "measure": ("captures", "characterize.commands.measure:_frames"),
     "fit": ("captures --design lens.h5", "characterize.commands.fit:fit"),
     "codesign": ("run.toml", "codesign.commands.codesign:_work"),
     "evaluate": ("optics lens.h5", "codesign.commands.evaluate_optics:_measure"),
     "budget": ("lens.h5", "codesign.commands.budget:bench"),
     "check": ("mask.gds", "layout.drc:check_library"),
-    "study": ("", "metalens.pillars.study:run"),
+    "study": ("", "metalens.pillars.study:run_study"),
     "view": ("lens.h5", "metalens.commands.view:_shown"),
 }
 NAMES = {"library": "o.h5", "field": "o.h5", "design": "o.h5", "psf": "o.h5", "export": "o.npz", "fit": "o.h5",
@@ -237,7 +240,8 @@ def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(
     inputs, monkeypatch, capsys
 ):
     monkeypatch.setattr(
-        "codesign.budget.links.entries", lambda *_, **__: pytest.fail("the work began")
+        "codesign.budget.links.budget_entries",
+        lambda *_, **__: pytest.fail("the work began"),
     )
     assert main(["budget", "lens.h5", "--led-fwhm-nm", "-1", "-o", "o.h5"]) == BAD_INPUT
     assert "--led-fwhm-nm -1: need 0 or more" in capsys.readouterr().err
@@ -408,8 +412,8 @@ def test_room_is_asked_for_as_soon_as_the_size_is_known(
     monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
     (inputs / "design.toml").write_text("aperture_mm = 0.023\n")
     for name in (
-        "metalens.lens.export:write",
-        "layout.mask.build:prepare",
+        "metalens.lens.export:export_lens",
+        "layout.mask.build:prepare_mask",
         "metalens.commands.design:_phase",
     ):
         module, _, word = name.partition(":")

@@ -144,7 +144,7 @@ def test_an_existing_file_is_kept_without_force(tmp_path):
 def test_info_shows_kind_and_provenance(tmp_path):
     import numpy as np
 
-    from metalens.ground import store
+    from metalens.core import store
 
     made = store.Provenance(config="x = 1\n", inputs={"a.toml": "0" * 64})
     store.save(

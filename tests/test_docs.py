@@ -15,10 +15,10 @@ from characterize.captures.stage import read_about
 from characterize.model import PARAMETERS
 from metalens.chain.stages import ChainFiles
 from metalens.cli import VERBS, main
-from metalens.commands.design import Design
+from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile
-from metalens.commands.psf import Settings
-from metalens.ground import config
+from metalens.commands.psf import PsfSettings
+from metalens.core import config
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -47,25 +47,25 @@ def _blocks(path, language):
 
 
 def _records():
-    from characterize.bench.bench import Truth
-    from characterize.bench.protocol import Protocol
+    from characterize.bench.bench import HiddenLens
+    from characterize.bench.protocol import BenchProtocol
     from characterize.pupil.record import PupilSpec
-    from codesign.commands.evaluate_optics import Settings as Optics
-    from layout.arrange import Arrangement
+    from codesign.commands.evaluate_optics import OpticsSettings as Optics
+    from layout.arrange import Floorplan
     from layout.process.process import Process
-    from metalens.pillars.study import Study
+    from metalens.pillars.study import CellStudy
 
     return {
         "CELL.toml": CellFile,
-        "STUDY.toml": Study,
-        "DESIGN.toml": Design,
-        "PSF.toml": Settings,
+        "STUDY.toml": CellStudy,
+        "DESIGN.toml": DesignSettings,
+        "PSF.toml": PsfSettings,
         "PROCESS.toml": Process,
-        "TRUTH.toml": Truth,
-        "PROTOCOL.toml": Protocol,
+        "TRUTH.toml": HiddenLens,
+        "PROTOCOL.toml": BenchProtocol,
         "PUPIL.toml": PupilSpec,
         "CHAIN.toml": ChainFiles,
-        "ARRANGEMENT.toml": Arrangement,
+        "ARRANGEMENT.toml": Floorplan,
         "OPTICS.toml": Optics,
     }
 

@@ -14,7 +14,7 @@ import torch
 from codesign.train import checkpoint
 from codesign.train.inner import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.ground import manifest, store
+from metalens.core import manifest, store
 from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
@@ -132,7 +132,7 @@ def test_a_file_of_a_folder_is_told_by_its_manifest_as_long_as_it_is_as_written(
     tmp_path, capsys
 ):
     (tmp_path / "report.html").write_text("<p>as made</p>", encoding="utf-8")
-    manifest.write(tmp_path, "layout lens.h5 -o mask")
+    manifest.write_manifest(tmp_path, "layout lens.h5 -o mask")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     assert main(["info", str(tmp_path / "report.html")]) == SUCCESS
     assert (

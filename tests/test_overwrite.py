@@ -11,7 +11,7 @@ import layout
 from layout.process import Process
 from metalens import cli, lens
 from metalens.cell.record import Cell, Index
-from metalens.ground import store
+from metalens.core import store
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 from tests.command_line import run

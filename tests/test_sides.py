@@ -14,16 +14,17 @@ import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
-from characterize.model import made, pillar_slopes, state, vector
+from characterize.model import made, parameter_vector, pillar_slopes, process_state_of
 from codesign.adapt import correction
 from codesign.budget import links
-from codesign.budget.prepared import Given
+from codesign.budget.prepared import BudgetInputs
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import LensError, variance_rad2
 from layout.process import Process
 from layout.study import tolerance
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle
+from metalens.core.errors import ConfigError, FitError, ProcessError
 from metalens.fabrication import (
     Bias,
     Printed,
@@ -34,7 +35,6 @@ from metalens.fabrication import (
     named,
     sensitivity,
 )
-from metalens.ground.errors import ConfigError, FitError, ProcessError
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 from metalens.rcwa import jones
@@ -116,7 +116,9 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
         lens, **{name: 1e-3 * change.get(row, 0.0) for name, row in amounts.items()}
     )
     got, before = (
-        seen(lens, made.pillars(lens, response, vector(change))),
+        seen(
+            lens, made.as_built_transmission(lens, response, parameter_vector(change))
+        ),
         seen(lens, anew(lens)),
     )
     want = seen(lens, truth)
@@ -127,8 +129,15 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
 def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_order(
     lens, response
 ):
-    still = made.pillars(lens, response, vector({"turn_deg": 1.5}))
-    assert np.abs(still - made.pillars(lens, response, vector())).max() < 1e-9
+    still = made.as_built_transmission(
+        lens, response, parameter_vector({"turn_deg": 1.5})
+    )
+    assert (
+        np.abs(
+            still - made.as_built_transmission(lens, response, parameter_vector())
+        ).max()
+        < 1e-9
+    )
     assert np.abs(anew(lens, turn_deg=1.5) - anew(lens)).max() < 2e-3
     oblique = dataclasses.replace(
         lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5))
@@ -142,7 +151,7 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
 
 
 def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
-    found = tolerance.analyse(
+    found = tolerance.analyse_tolerance(
         lens, Process(spread=Spread.only(width_nm=4.0)), depths_um=(90.0,), draws=10
     )
     effect = {e.cause: e for e in found.effects}["width_nm"]
@@ -193,15 +202,15 @@ def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response
     """As pillar by pillar, by a table over the diameter and another of what edges do
     beyond it.
     """
-    known = vector({"bias_nm": 8.0, "bias_x_nm": -5.0, "width_nm": 3.0})
+    known = parameter_vector({"bias_nm": 8.0, "bias_x_nm": -5.0, "width_nm": 3.0})
     ready = MadeLens(lens, OpticsConfig(), response=response)
     side = ready._block
-    t = made.pillars(lens, response, known) * ready._carrier
+    t = made.as_built_transmission(lens, response, known) * ready._carrier
     rows, columns = (n // side * side for n in t.shape)
     built = (lens.diameters.diameter_um > 0)[:rows, :columns]
     blocks = rows // side, side, columns // side, side
     sums, counts = (v.reshape(blocks).sum((1, 3)) for v in (t[:rows, :columns], built))
-    cells = ready._gathered(state(known))[: len(sums), : len(sums[0])]
+    cells = ready._gathered(process_state_of(known))[: len(sums), : len(sums[0])]
     # half a step of the table, 5e-6 um, at 45 rad/um
     assert np.abs(cells - sums / np.maximum(counts, 1))[counts > 0].max() < 3e-4
 
@@ -212,8 +221,8 @@ def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(
     """Rectangles come out 5 nm too narrow, 17 nm too long; with the edges moved as
     proposed, solved anew, they answer
     as designed up to a piston."""
-    x = vector({"width_nm": -10.0, "length_nm": 12.0, "bias_nm": 5.0})
-    plan = correction.propose(lens, x, response=response, old=Bias())
+    x = parameter_vector({"width_nm": -10.0, "length_nm": 12.0, "bias_nm": 5.0})
+    plan = correction.propose_correction(lens, x, response=response, old=Bias())
     off = []
     for designed in SIZES.tolist():
         drawn = float(np.interp(designed, plan.designed_um, plan.drawn_nm)) * 1e-3
@@ -242,14 +251,14 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     )
     assert lacking(CELL) == ("pedestal_nm", "cap_nm")
     with pytest.raises(FitError, match="length_nm"):
-        pillar_slopes.slopes(plain, wanted={"length_nm"})
+        pillar_slopes.log_response_slopes(plain, wanted={"length_nm"})
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
-        tolerance.analyse(plain, Process(spread=Spread.only(turn_deg=0.2)))
+        tolerance.analyse_tolerance(plain, Process(spread=Spread.only(turn_deg=0.2)))
     about = SimpleNamespace(
-        given=Given(mask=Printed(spread=Spread.only(width_nm=1.0))), lens=plain
+        given=BudgetInputs(mask=Printed(spread=Spread.only(width_nm=1.0))), lens=plain
     )
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
-        list(links.process(about))
+        list(links.process_entries(about))
     assert State.of({"width_nm": 3.0}).answers()[
         named(ResponseError).index("width_nm")
     ] == pytest.approx(3e-3)

@@ -15,8 +15,8 @@ import pytest
 
 from metalens import cli
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.ground import lock, transaction
-from metalens.ground.errors import OutputError
+from metalens.core import lock, transaction
+from metalens.core.errors import OutputError
 
 ROOT = Path(__file__).parents[1]
 
@@ -146,7 +146,7 @@ WORDS = f"{sys.executable} -m metalens info ."
 
 
 def _made(tmp_path):
-    with transaction.folder(tmp_path / "out") as draft:
+    with transaction.claim_folder(tmp_path / "out") as draft:
         (draft.path / "a.txt").write_text("first")
     return tmp_path / "out"
 
@@ -209,7 +209,7 @@ def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
 
 
 def test_info_shows_what_a_folder_holds_and_refuses_a_changed_one(tmp_path, capsys):
-    with transaction.folder(tmp_path / "out") as draft:
+    with transaction.claim_folder(tmp_path / "out") as draft:
         (draft.path / "a.txt").write_text("first")
     assert main(["info", str(tmp_path / "out"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
@@ -270,5 +270,5 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(
         (inside, "out.h5: folder .*library.h5 is a file: give another name"),
     ):
         monkeypatch.setattr(lock, "_taken", refused)
-        with pytest.raises(OutputError, match=found), transaction.file(target):
+        with pytest.raises(OutputError, match=found), transaction.claim_file(target):
             pass

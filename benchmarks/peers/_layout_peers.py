@@ -12,7 +12,7 @@ import layout
 from benchmarks import Row, fastest
 from benchmarks.speed.layout import NAN, PITCH, RULES, lens_of, plan
 from layout.drc import check_plan
-from layout.mask.plan import Lattice, MaskPlan
+from layout.mask.plan import MaskPlan, PillarLattice
 
 
 def measured(target: Path) -> list[Row]:
@@ -168,7 +168,9 @@ def _klayout_check(db: object, mask: MaskPlan) -> Row:
     thin = region.width_check(80, False, db.Region.Projection).count()  # type: ignore[attr-defined]
     overlap = region.merged(False, 2).count()
     seconds = time.perf_counter() - start
-    plan_of_patch = lens_of(Lattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0))
+    plan_of_patch = lens_of(
+        PillarLattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0)
+    )
     own = check_plan(plan_of_patch, RULES).counts
     wrong = (
         abs(count - own["space"])

@@ -36,8 +36,8 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 
 COUNT, SEED = 200, 9377
 HARMONICS = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.psf import PsfStack
 
 

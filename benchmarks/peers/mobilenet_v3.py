@@ -2,8 +2,8 @@
 networks: its count is published.
 """
 
-from codesign.network.architecture import Block, divisible
-from codesign.network.cost import Cost, backbone
+from codesign.network.architecture import BlockSpec, round_channels
+from codesign.network.cost import MacPolynomial, backbone_cost
 
 
 def counted(variant: str, *, size: int = 224, classes: int = 1000) -> int:
@@ -14,22 +14,24 @@ def counted(variant: str, *, size: int = 224, classes: int = 1000) -> int:
     inputs, chain = 16, []
     for kernel, wide, outputs, squeeze, stride in rows:
         chain.append(
-            Block(
+            BlockSpec(
                 kernel,
                 inputs,
                 wide,
                 outputs,
                 stride,
-                divisible(wide / 4) if squeeze else 0,
+                round_channels(wide / 4) if squeeze else 0,
                 "relu",
             )
         )
         inputs = outputs
-    body = backbone(16, chain, inputs=3)
+    body = backbone_cost(16, chain, inputs=3)
     end = max(body.per_pixel)
     per_pixel = dict(body.per_pixel) | {end: body.per_pixel[end] + inputs * last}
     return int(
-        Cost(per_pixel, body.constant + last * hidden + hidden * classes).at(size)
+        MacPolynomial(per_pixel, body.constant + last * hidden + hidden * classes).at(
+            size
+        )
     )
 
 

@@ -15,11 +15,17 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import j0
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.paths import source_path
-from metalens.propagate import SAFETY, Case, draw, scan, square_error
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.paths import source_path
+from metalens.propagate import (
+    SAFETY,
+    PropagationCase,
+    draw_pixels,
+    morton_scan,
+    square_error,
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,7 +57,7 @@ class RadialField:
     error: float
 
 
-def field_radial(lens: Radial, case: Case, tolerance: float) -> RadialField:
+def field_radial(lens: Radial, case: PropagationCase, tolerance: float) -> RadialField:
     """Field of a radial lens on the window, for sources and window on the axis.
 
     Raises:
@@ -75,7 +81,7 @@ def field_radial(lens: Radial, case: Case, tolerance: float) -> RadialField:
 
 
 def _converged(
-    lens: Radial, case: Case, reach: float, tolerance: float
+    lens: Radial, case: PropagationCase, reach: float, tolerance: float
 ) -> tuple[Array, float]:
     """(depth, ρ) field on an even grid, and its own error; nodes are doubled until two
     results agree.
@@ -100,7 +106,7 @@ def _converged(
     )
 
 
-def _band(lens: Radial, case: Case, reach: float) -> float:
+def _band(lens: Radial, case: PropagationCase, reach: float) -> float:
     """Twice the largest spatial frequency of rays to the window, cycles per um: what a
     hard rim scatters further out is
     felt where the band ends."""
@@ -112,7 +118,7 @@ def _band(lens: Radial, case: Case, reach: float) -> float:
 
 def _hankel(
     lens: Radial,
-    case: Case,
+    case: PropagationCase,
     counts: tuple[int, int],
     rho: tuple[float, int],
     band: float,
@@ -120,7 +126,10 @@ def _hankel(
     """(depth, ρ) by Gauss-Legendre quadrature of both transforms; ρ runs evenly from 0
     in (reach, count).
     """
-    (t, w), (s, v) = legendre.nodes(counts[0]), legendre.nodes(counts[1])
+    (t, w), (s, v) = (
+        legendre.gauss_legendre_nodes(counts[0]),
+        legendre.gauss_legendre_nodes(counts[1]),
+    )
     r, f = (t + 1) / 2 * lens.radius_um, (s + 1) / 2 * band
     inverse = np.array(case.inverse_depths_per_um)[:, None]
     path = source_path(r, 0.0, (0.0, 0.0), inverse)
@@ -146,15 +155,15 @@ def _bessel(
 ) -> tuple[Array, Array]:
     """J0 of both transforms, (r, f) and (f, ρ); the last few are kept."""
     r, f = (
-        (legendre.nodes(counts[0])[0] + 1) / 2 * radius,
-        (legendre.nodes(counts[1])[0] + 1) / 2 * band,
+        (legendre.gauss_legendre_nodes(counts[0])[0] + 1) / 2 * radius,
+        (legendre.gauss_legendre_nodes(counts[1])[0] + 1) / 2 * band,
     )
     return j0(2 * np.pi * r[:, None] * f), j0(
         2 * np.pi * f[:, None] * np.linspace(0, *rho)
     )
 
 
-def _rim_error(lens: Radial, case: Case, field: Array) -> float:
+def _rim_error(lens: Radial, case: PropagationCase, field: Array) -> float:
     """Relative L2 of the PSFs from the staircase rim: light of every cut cell's missing
     or surplus area, at points
     that all depths share."""
@@ -166,7 +175,9 @@ def _rim_error(lens: Radial, case: Case, field: Array) -> float:
     normalised = power / energy
     points, chance = (
         np.tile(v, (len(depths), 1))
-        for v in draw(normalised.mean(0, keepdims=True), scan(field.shape), 160)
+        for v in draw_pixels(
+            normalised.mean(0, keepdims=True), morton_scan(field.shape), 160
+        )
     )
     value = np.take_along_axis(field[depths].reshape(power.shape), points, 1)
     y, x = case.window_um
@@ -177,7 +188,9 @@ def _rim_error(lens: Radial, case: Case, field: Array) -> float:
     return float(SAFETY * np.sqrt(square / (normalised**2).sum()))
 
 
-def _surplus(lens: Radial, case: Case, inverse: Array, points: Array) -> Array:
+def _surplus(
+    lens: Radial, case: PropagationCase, inverse: Array, points: Array
+) -> Array:
     """(depth, point) field of the pixelated rim less the round one; ``points`` are
     (point, [x, y]).
     """

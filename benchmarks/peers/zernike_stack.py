@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks import Row
 from characterize.inference import leastsquares
-from characterize.inference.leastsquares import Data, Prior, Settings
+from characterize.inference.leastsquares import FitImages, GaussianPrior, SolverSettings
 from characterize.pupil import zernike
 from characterize.pupil.record import PupilModel, PupilSpec
 
@@ -125,7 +125,7 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
         float((images - level).sum((1, 2)).mean()),
         level,
     )
-    settings = Settings(iterations=15, step_tolerance=1.0, near=3.0, finish=False)
+    settings = SolverSettings(iterations=15, step_tolerance=1.0, near=3.0, finish=False)
     best = None
     for astigmatism in (
         0.0,
@@ -134,7 +134,9 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
     ):  # further starts only where the first leaves something unexplained
         begin[small.phase_indices.index((2, 2))] = astigmatism
         rough = _fit(small, images[middle], begin, settings)
-        found = _fit(large, images, rough.value, Settings(near=1.0, step_tolerance=0.1))
+        found = _fit(
+            large, images, rough.value, SolverSettings(near=1.0, step_tolerance=0.1)
+        )
         best = found if best is None or found.merit < best.merit else best
         if best.chi2_per_dof < 1.1:
             break
@@ -146,20 +148,22 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
 
 
 def _fit(
-    model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: Settings
-) -> leastsquares.Solution:
+    model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: SolverSettings
+) -> leastsquares.FitSolution:
     everywhere = np.ones(images.shape, bool)
-    data = Data(
+    data = FitImages(
         images,
         everywhere,
         ~everywhere,
         np.full(images.shape, 1.0),
         np.ones(images.shape),
     )
-    prior = Prior.none(begin)
+    prior = GaussianPrior.none(begin)
     blur = len(begin) - 2 * len(images) - 1
     prior.low[blur] = prior.high[blur] = begin[blur]
-    return leastsquares.fit(model.images, data, begin, prior=prior, settings=settings)
+    return leastsquares.fit_levenberg_marquardt(
+        model.images, data, begin, prior=prior, settings=settings
+    )
 
 
 def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, float]:
@@ -181,7 +185,7 @@ def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, 
     n = inside.shape[0]
     v, u = (g / (n / 2) for g in np.mgrid[:n, :n] - (n - 1) / 2)
     keep = inside & (np.hypot(u, v) <= 1)
-    flat = zernike.basis(zernike.indices(0, 1), u[keep], v[keep])
+    flat = zernike.zernike_basis(zernike.zernike_indices(0, 1), u[keep], v[keep])
     errors = []
     for sign in (1, -1):  # their axes and sign of time may differ from ours
         for turn in (1, -1):
@@ -190,7 +194,9 @@ def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, 
                     (turn * (v if swap else u))[keep],
                     (turn * (u if swap else v))[keep],
                 )
-                truth = case["phase"] @ zernike.basis(_model().phase_indices, a, b)
+                truth = case["phase"] @ zernike.zernike_basis(
+                    _model().phase_indices, a, b
+                )
                 rest = sign * np.asarray(found.opd)[keep] * length - truth
                 rest = rest - np.linalg.lstsq(flat.T, rest, rcond=None)[0] @ flat
                 errors.append(float(np.sqrt((rest**2).mean())))

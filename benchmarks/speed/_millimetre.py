@@ -5,9 +5,9 @@ import time
 import numpy as np
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import Known
+from characterize.bench.bench import BenchCamera, HiddenLens
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import KnownValue
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.lens.record import Lens
@@ -35,22 +35,22 @@ def shoot() -> tuple[Lens, float, np.ndarray]:
         cell=Cell(pitch_um=0.4),
         proxy=bench_lens.proxy(),
     )[0]
-    known = tuple(Known(name, value) for name, value in HIDDEN.items())
-    truth = Truth(
+    known = tuple(KnownValue(name, value) for name, value in HIDDEN.items())
+    truth = HiddenLens(
         DEPTHS,
         peak_e=PEAK_E,
         parameter=known,
-        camera=Camera(pixel_um=PIXEL_UM, pixels=PIXELS),
+        camera=BenchCamera(pixel_um=PIXEL_UM, pixels=PIXELS),
     )
     start = time.perf_counter()
-    light = bench.irradiance(lens, truth, RESPONSE)
+    light = bench.bench_irradiance(lens, truth, RESPONSE)
     return lens, time.perf_counter() - start, light
 
 
 def model(lens: Lens) -> ForwardModel:
     """The reduced model of these captures."""
     n = len(DEPTHS)
-    setting = Setting(
+    setting = FrameSetting(
         np.array(DEPTHS), np.zeros((n, 2)), np.ones(n), PIXEL_UM, PIXELS, PIXELS
     )
     return ForwardModel(lens, setting, RESPONSE)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from metalens import propagate, psf
-from metalens.propagate.estimate import draw, scan, square_error
+from metalens.propagate.estimate import draw_pixels, morton_scan, square_error
 
 PITCH, WAVELENGTH, D, SOURCE, RADIUS = 0.4, 0.85, 2000.0, 20e3, 500.0
 K = 2 * np.pi / WAVELENGTH
@@ -77,7 +77,7 @@ def error(
         row, pick
     ]
     flat = light.reshape(len(pick), -1)
-    points, chance = draw(flat, scan(light.shape), 64 * len(pick))
+    points, chance = draw_pixels(flat, morton_scan(light.shape), 64 * len(pick))
     want = np.stack(
         [exact(maps, plain, (z, row), p) for z, p in zip(pick, points, strict=True)]
     )
@@ -97,7 +97,7 @@ def exact(
     ``at``.
     """
     depth, row = at
-    case = propagate.case(
+    case = propagate.make_case(
         maps[0].shape,
         **GEOMETRY,
         depths_um=stack.depths_um[depth],

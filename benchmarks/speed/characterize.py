@@ -15,8 +15,8 @@ from benchmarks.studies import characterize_referee as referee
 from characterize.bench import bench
 from characterize.captures import capture
 from characterize.measure import sem
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import vector
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import parameter_vector
 from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilSpec
 
@@ -113,7 +113,7 @@ def _millimetre() -> list[Row]:
     start = time.perf_counter()
     model = millimetre.model(design)
     built = time.perf_counter() - start
-    x = vector(millimetre.HIDDEN | {"background_e": 0.0})
+    x = parameter_vector(millimetre.HIDDEN | {"background_e": 0.0})
     found = model.images(x)[0]
     found *= (found * light).sum() / (found**2).sum()
     quick = fastest(lambda: model.images(x))
@@ -206,11 +206,13 @@ def _fit() -> list[Row]:
 def _reduced() -> list[Row]:
     from tests.characterize import bench_lens as b
 
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
+    )
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
-    x = vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
+    x = parameter_vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
     start = time.perf_counter()
-    want = bench.irradiance(b.lens(), b.truth(), b.RESPONSE)
+    want = bench.bench_irradiance(b.lens(), b.truth(), b.RESPONSE)
     full = time.perf_counter() - start
     found = model.images(x)[0]
     scale = (found * want).sum() / (found**2).sum()
@@ -245,7 +247,9 @@ def _micrographs() -> list[Row]:
     drawn = time.perf_counter() - start
     start = time.perf_counter()
     found = (
-        np.array([sem.measure(p, test_sem.ABOUT).diameter_nm for p in pictures])
+        np.array(
+            [sem.measure_diameters(p, test_sem.ABOUT).diameter_nm for p in pictures]
+        )
         / test_sem.PIXEL
     )
     seconds = (time.perf_counter() - start) / len(pictures)

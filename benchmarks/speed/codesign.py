@@ -14,18 +14,18 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks import Row, fastest
 from benchmarks.peers import mobilenet_v3
 from codesign.batches import pool
-from codesign.batches.flat import depth_um, flattened, irradiance
+from codesign.batches.flat import depth_um, flatten_layers, sensor_irradiance
 from codesign.batches.pool import PoolScenes
 from codesign.batches.scenes import EyeScenes, SceneConfig
 from codesign.network import architecture, blur, cost
-from codesign.network.architecture import Architecture, Space
+from codesign.network.architecture import Architecture, SearchSpace
 from codesign.network.supernet import Supernet
 from codesign.optics import formed
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from codesign.train import inner
 from codesign.train.formation import read_out
-from codesign.train.inner import InnerConfig, Schedule, Trainer
+from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image import sensor as camera
 from metalens.image.pupil import psf
 from metalens.image.sensor import Sensor
@@ -35,7 +35,7 @@ SCENES = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
 OPTICS = OpticsConfig(focus_mm=33.0, depth_count=20, image="uniform")
 TRUE = replace(OPTICS, image="true", fwhm_nm=30.0)  # over ±16 degrees and their corners
 SENSOR = Sensor(9.0, 9.0, 2000.0, 0.0, 4000.0, 5.0, 10)
-SPACE = Space(
+SPACE = SearchSpace(
     widths=(0.25, 0.5, 0.75),
     depths=(2, 3),
     expansions=(3, 4),
@@ -49,7 +49,7 @@ ASKED = {"uniform": "asked 50 % at 20 MMACs", "true": "asked 25 %, 150 frames/s"
 def rows() -> list[Row]:
     """Rows of this topic."""
     threads = torch.get_num_threads()
-    made = pool.fill(SCENES, 2 * BATCH)
+    made = pool.render_pool(SCENES, 2 * BATCH)
     trained = [
         row for optics in (OPTICS, TRUE) for row in _training(threads, made, optics)
     ]
@@ -69,17 +69,17 @@ def _member(width: float, depth: int) -> Architecture:
 
 
 def _counts() -> list[Row]:
-    generator, space, worst = np.random.default_rng(0), Space(), 0.0
+    generator, space, worst = np.random.default_rng(0), SearchSpace(), 0.0
     net = Supernet(space).eval()
     for _ in range(40):
-        member = architecture.sample(space, generator)
+        member = architecture.sample_architecture(space, generator)
         size = round(128 * member.resolution)
         with FlopCounterMode(display=False) as counter, torch.no_grad():
             net(torch.zeros(1, 1, size, size), replace(member, resolution=1.0))
         worst = max(
             worst,
             abs(
-                float(cost.network(space, member).at(size))
+                float(cost.network_cost(space, member).at(size))
                 * 2
                 / counter.get_total_flops()
                 - 1
@@ -140,22 +140,25 @@ def _optics(threads: int) -> list[Row]:
 
     def gradient() -> torch.Tensor:
         return torch.autograd.grad(
-            (optics.stack(OPTICS, phase).intensity * weight).sum(), phase
+            (optics.lens_psf_stack(OPTICS, phase).intensity * weight).sum(), phase
         )[0]
 
-    quick = optics.stack(OPTICS, phase).intensity.detach()
+    quick = optics.lens_psf_stack(OPTICS, phase).intensity.detach()
     error = float((quick - _slow_stack(phase.detach())).norm() / quick.norm())
     way = torch.randn(35, generator=generator, dtype=torch.float64)
     step = 1e-3
     with torch.no_grad():
         ends = [
-            (optics.stack(OPTICS, phase + s * way).intensity.double() * weight).sum()
+            (
+                optics.lens_psf_stack(OPTICS, phase + s * way).intensity.double()
+                * weight
+            ).sum()
             for s in (step, -step)
         ]
     slope = float(ends[0] - ends[1]) / (2 * step)
     wrong = abs(float(gradient() @ way) / slope - 1)
     case = "20 PSFs of 33² samples, 35 polynomials"
-    forward = fastest(lambda: optics.stack(OPTICS, phase.detach()))
+    forward = fastest(lambda: optics.lens_psf_stack(OPTICS, phase.detach()))
     return [
         Row(
             case,
@@ -204,20 +207,20 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
     return (taps @ bright.double() @ taps.mT).float()
 
 
-def _stages(threads: int, made: pool.Pool) -> list[Row]:
-    lens = optics.prepared(
-        OPTICS, optics.stack(OPTICS, torch.zeros(35)), 160, margin=16
+def _stages(threads: int, made: pool.FramePool) -> list[Row]:
+    lens = optics.prepare_transfers(
+        OPTICS, optics.lens_psf_stack(OPTICS, torch.zeros(35)), 160, margin=16
     )
     sheets, scale = SCENES.rendered(0, 8).frames, SCENES.states(0, 8).scale
     exact, quick = (
-        irradiance(sheets, lens, margin=16),
-        irradiance(flattened(sheets, scale), lens, margin=16),
+        sensor_irradiance(sheets, lens, margin=16),
+        sensor_irradiance(flatten_layers(sheets, scale), lens, margin=16),
     )
     error = float(
         (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
     )
     batch = PoolScenes(made, 16, 0.2, 0).batch(0, BATCH)
-    light = irradiance(batch.frames, lens, margin=16)
+    light = sensor_irradiance(batch.frames, lens, margin=16)
     pitch, noise = (
         torch.tensor(9.0, dtype=torch.float64),
         torch.Generator().manual_seed(0),
@@ -228,7 +231,7 @@ def _stages(threads: int, made: pool.Pool) -> list[Row]:
 
     render = fastest(lambda: SCENES.rendered(1, 8)) / 8
     one, two = (
-        fastest(partial(irradiance, f, lens, margin=16)) / n
+        fastest(partial(sensor_irradiance, f, lens, margin=16)) / n
         for f, n in ((batch.frames, BATCH), (sheets, 8))
     )
     fast, slow = (fastest(partial(sensor, e)) / BATCH for e in (False, True))
@@ -311,23 +314,25 @@ def _rate(seconds: float) -> str:
 
 
 def _trainer(
-    made: pool.Pool,
+    made: pool.FramePool,
     member: Architecture | None,
     of: OpticsConfig,
     *,
     live: bool,
 ) -> Trainer:
-    lens, pitch = (Schedule(rate if live else 0.0, 0.0, 0.9) for rate in (0.02, 0.005))
+    lens, pitch = (
+        LearningRateSchedule(rate if live else 0.0, 0.0, 0.9) for rate in (0.02, 0.005)
+    )
     settings = InnerConfig(
         steps=10_000, batch=BATCH, optics=lens, pitch=pitch, optics_weight=0.0
     )
-    fresh = inner.model(of, pitch_um=9.0, seed=0, space=SPACE)
+    fresh = inner.make_model(of, pitch_um=9.0, seed=0, space=SPACE)
     return Trainer(
         settings, of, SENSOR, PoolScenes(made, 16, 0.2, 0), fresh, architecture=member
     )
 
 
-def _training(threads: int, made: pool.Pool, of: OpticsConfig) -> list[Row]:
+def _training(threads: int, made: pool.FramePool, of: OpticsConfig) -> list[Row]:
     """Whole steps, lens and pitch fixed and moving; the share of the fixed one's that
     its frames take.
     """
@@ -384,7 +389,7 @@ def _training(threads: int, made: pool.Pool, of: OpticsConfig) -> list[Row]:
     return out
 
 
-def _data(made: pool.Pool, of: OpticsConfig) -> float:
+def _data(made: pool.FramePool, of: OpticsConfig) -> float:
     """Seconds a frame of what a network is trained on: drawn from the pool, imaged,
     read out, with its depths.
     """
@@ -393,12 +398,12 @@ def _data(made: pool.Pool, of: OpticsConfig) -> float:
         torch.tensor(9.0, dtype=torch.float64),
         torch.Generator(),
     )
-    lens = formed.imager(of, torch.zeros(35, dtype=torch.float64), 160, margin=16)
+    lens = formed.make_imager(of, torch.zeros(35, dtype=torch.float64), 160, margin=16)
 
     @torch.no_grad()
     def work() -> None:
         batch = scenes.batch(0, BATCH)
-        light = irradiance(batch.frames, lens, margin=16)
+        light = sensor_irradiance(batch.frames, lens, margin=16)
         blur.window_vergence(depth_um(batch.frames, margin=16))
         read_out(light, 9.0, pitch, SENSOR, generator=noise.manual_seed(0), exact=False)
 
@@ -415,14 +420,14 @@ def _anew(of: OpticsConfig) -> float:
         torch.full((35,), 0.01 * n, dtype=torch.float64) for n in range(1, 9)
     )  # none is formed twice
     seconds = fastest(
-        lambda: formed.imager(of, next(places), 160, margin=16), repeats=2
+        lambda: formed.make_imager(of, next(places), 160, margin=16), repeats=2
     )
     return seconds / (InnerConfig().refresh * BATCH)
 
 
 def _forward(member: Architecture) -> float:
     """Seconds a frame of a network's forward pass as it trains."""
-    net = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.train()
+    net = inner.make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.train()
     frames = torch.randn(BATCH, 1, 128, 128).contiguous(
         memory_format=torch.channels_last
     )
@@ -448,7 +453,7 @@ def _compiled(threads: int) -> list[Row]:
             )
         ]
     member, frames = _member(0.5, 2), torch.randn(8, 1, 128, 128)
-    net = inner.model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.eval()
+    net = inner.make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.eval()
     quick = torch.compile(lambda x: net(x, member).slip)
     with torch.no_grad():
         error = float((quick(frames) - net(frames, member).slip).abs().max())

@@ -26,7 +26,7 @@ from metalens.field.plan import spectral
 from metalens.image import Frames
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
-from metalens.psf import Nodes, Source, spectrum
+from metalens.psf import Source, SpectralNodes, spectrum
 
 FRAMES = 8
 GRID = Grid((128, 128), 9.0, (15e3, 28e3), margin=16, window=41)
@@ -78,7 +78,9 @@ def points_row(wave: SmoothWave) -> Row:
         ),
         -1,
     )
-    waves = Nodes(*spectrum.gauss(*spectrum.weight(Source(850.0, 30.0)), 9), 0.0)
+    waves = SpectralNodes(
+        *spectrum.gauss_rule(*spectrum.spectral_weight(Source(850.0, 30.0)), 9), 0.0
+    )
     optics, window = Optics(wave, Layers(), 2e3), Window(GRID.window, GRID.step_um)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     seconds = fastest(
@@ -110,7 +112,9 @@ def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
         ),
         -1,
     )
-    waves = Nodes(*spectrum.gauss(*spectrum.weight(Source(850.0, 30.0)), 9), 0.0)
+    waves = SpectralNodes(
+        *spectrum.gauss_rule(*spectrum.spectral_weight(Source(850.0, 30.0)), 9), 0.0
+    )
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     pillars = pillar_lens(wave.focus, wave.radius_um)
     for count in (0, 2, 3):
@@ -149,7 +153,7 @@ def pillar_lens(focus: Focus, radius_um: float) -> Lens:
     x = (
         np.arange(2 * math.floor(radius_um / pitch) + 1) - math.floor(radius_um / pitch)
     ) * pitch
-    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus), 2 * math.pi)
+    wanted = np.remainder(profiles.hyperbolic_phase(x, x[:, None], focus), 2 * math.pi)
     wanted += 2 * math.pi * np.ceil((low - wanted) / (2 * math.pi))
     diameter = np.where(
         np.hypot(x, x[:, None]) <= radius_um,

@@ -22,17 +22,17 @@ import layout
 from benchmarks import Row, fastest
 from layout.drc import check_plan
 from layout.formats import compare, gdsii_write, oasis_write
-from layout.mask.plan import Lattice, MaskPlan, pillar_classes
-from layout.process.process import Rules
-from metalens.ground import store
-from metalens.ground.arrays import Array
+from layout.mask.plan import MaskPlan, PillarLattice, pillar_classes
+from layout.process.process import DesignRules
+from metalens.core import store
+from metalens.core.arrays import Array
 
 if TYPE_CHECKING:
     from metalens.lens import Lens
 
 PITCH = 400
 SIZES = np.arange(100, 302, 2)
-RULES = Rules(minimum_gap_nm=70, minimum_feature_nm=80)
+RULES = DesignRules(minimum_gap_nm=70, minimum_feature_nm=80)
 NAN = float("nan")
 
 
@@ -64,7 +64,7 @@ def sites(*, freeform: bool) -> Array:
 def plan(*, freeform: bool = True) -> MaskPlan:
     """The mask of the lens alone."""
     return lens_of(
-        Lattice.of(
+        PillarLattice.of(
             "LENS",
             sites(freeform=freeform),
             pitch=PITCH,
@@ -74,7 +74,7 @@ def plan(*, freeform: bool = True) -> MaskPlan:
     )
 
 
-def lens_of(lattice: Lattice) -> MaskPlan:
+def lens_of(lattice: PillarLattice) -> MaskPlan:
     """A mask of one lattice of the bench's sizes."""
     classes = pillar_classes(
         SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round"
@@ -99,7 +99,7 @@ def large(diameter_mm: float) -> MaskPlan:
         return out
 
     half = (count - 1) * PITCH // 2
-    return lens_of(Lattice("LENS", count, count, PITCH, -half, half, rows))
+    return lens_of(PillarLattice("LENS", count, count, PITCH, -half, half, rows))
 
 
 @contextlib.contextmanager
@@ -202,7 +202,7 @@ def _raw_row(target: Path) -> Row:
 
     def raw() -> None:
         with (
-            store.replacing(target / "raw") as part,
+            store.replace_atomically(target / "raw") as part,
             open(part, "wb", buffering=0) as file,
         ):
             for _ in range(size // len(block)):
@@ -298,14 +298,17 @@ def _certificate_rows(target: Path) -> list[Row]:
     """8.7 million pillars with corrected doses, written, read back and exposed again."""
     from layout.formats import doses
     from layout.mask import build
-    from layout.process.process import Exposure, Process
+    from layout.process.process import ExposureSettings, Process
     from layout.verify import verify_exposure
 
-    process = Process(exposure=Exposure(alpha_um=0.012, beta_um=30.0, eta=0.7))
-    made = build.prepare(_lens(1.0, 0.3).diameters, process, furniture="none")
+    process = Process(exposure=ExposureSettings(alpha_um=0.012, beta_um=30.0, eta=0.7))
+    made = build.prepare_mask(_lens(1.0, 0.3).diameters, process, furniture="none")
     layout.write_gdsii(made.plan, target / "c.gds")
-    doses.write(made.plan, process, target / "c.csv")
-    content, table = layout.read_gdsii(target / "c.gds"), doses.read(target / "c.csv")
+    doses.write_dose_table(made.plan, process, target / "c.csv")
+    content, table = (
+        layout.read_gdsii(target / "c.gds"),
+        doses.read_dose_table(target / "c.csv"),
+    )
     found = verify_exposure(content, made.plan, table, process)
     seconds, peak = measured(
         lambda: verify_exposure(content, made.plan, table, process), repeats=1
@@ -402,7 +405,7 @@ def _foreign_check_rows(target: Path) -> list[Row]:
     from metalens import lens as lenses
 
     for diameter_mm in (0.02, 1.0):  # the first compiles what the second runs
-        made = build.prepare(
+        made = build.prepare_mask(
             _lens(diameter_mm, 0.3).diameters,
             Process(),
             furniture="none",

@@ -13,7 +13,7 @@ from benchmarks import Row, fastest
 from metalens import library, rcwa
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
-from metalens.ground import executor
+from metalens.core import executor
 from metalens.pillars import curve as reduced
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars.proxy import Proxy
@@ -54,12 +54,12 @@ def _curves() -> list[Row]:
     found = []
     for tolerance in (1e-3, 1e-4, 1e-6):
         start = time.perf_counter()
-        nodes = reduced.explore(_exact, *SPAN, tolerance=tolerance)
+        nodes = reduced.sample_adaptively(_exact, *SPAN, tolerance=tolerance)
         seconds = time.perf_counter() - start
-        silent = reduced.Nodes(
+        silent = reduced.SolvedNodes(
             nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, ""
         )
-        value, estimate = reduced.curve(silent, tolerance=tolerance)(d)
+        value, estimate = reduced.fit_response_curve(silent, tolerance=tolerance)(d)
         error = np.abs(value[:, 0] - exact)
         held = f"{int((error <= estimate).sum())} of {HELD_OUT} held-out diameters within their estimate"
         goal = f"{len(nodes.diameter_um)} solves" + (
@@ -86,7 +86,7 @@ def _sweep(case: str, sweep: Sweep) -> tuple[Row, PillarLibrary]:
         seconds,
         float(made.t_error.max()),
         against,
-        threads=executor.cores(),
+        threads=executor.usable_cores(),
     ), made
 
 
@@ -170,7 +170,7 @@ def _evaluations(proxy: Proxy) -> list[Row]:
                     seconds,
                     off,
                     against,
-                    executor.cores(),
+                    executor.usable_cores(),
                     goal=told,
                 )
             )

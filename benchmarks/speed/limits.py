@@ -20,7 +20,7 @@ from pathlib import Path
 from benchmarks import Row
 from benchmarks.__main__ import table
 from metalens.chain import stages as chain
-from metalens.chain.stages import Stage
+from metalens.chain.stages import ChainStage
 
 NAN = float("nan")
 BUDGET = (
@@ -35,17 +35,19 @@ BUDGET = (
 )
 EVALUATE = ("evaluate", "experiment", "run", "-o", "experiment")
 OTHERS = (
-    Stage("", "", BUDGET, ("gaze_error_deg", "deg of gaze from all links")),
-    Stage(
+    ChainStage("", "", BUDGET, ("gaze_error_deg", "deg of gaze from all links")),
+    ChainStage(
         "",
         "",
         ("plan", "--gaze-error", "2deg", "-o", "plan"),
         ("predicted_deg", "deg of gaze, predicted"),
     ),
-    Stage("", "", ("scene", "-o", "scene"), ("", "no error")),
-    Stage("", "", ("evaluate", "optics", "lens.h5", "-o", "optics"), ("", "no error")),
-    Stage("", "", EVALUATE, ("", "no error")),
-    Stage("", "", ("info", "lens.h5"), ("", "no error")),
+    ChainStage("", "", ("scene", "-o", "scene"), ("", "no error")),
+    ChainStage(
+        "", "", ("evaluate", "optics", "lens.h5", "-o", "optics"), ("", "no error")
+    ),
+    ChainStage("", "", EVALUATE, ("", "no error")),
+    ChainStage("", "", ("info", "lens.h5"), ("", "no error")),
 )
 SIZES = {"library": "one cell, one wavelength", "design": "1 mm", "psf": "1 mm, 21 depths, 3 angles", "layout": "1 mm",
          "budget": "1 mm", "plan": "1 mm", "evaluate": "1 mm", "info": "1 mm", "scene": "as shipped"}  # fmt: skip
@@ -59,15 +61,15 @@ def rows() -> list[Row]:
 
 def measured(folder: Path, verbs: tuple[str, ...]) -> list[Row]:
     """A row a command; only these verbs where some are named."""
-    files = chain.shipped()
-    chain.laid(files, None, aperture_mm=None).write(folder)
-    every = [*chain.stages(files), *OTHERS]
+    files = chain.shipped_settings()
+    chain.lay_out_inputs(files, None, aperture_mm=None).write(folder)
+    every = [*chain.chain_stages(files), *OTHERS]
     return [
         _row(folder, stage) for stage in every if not verbs or stage.words[0] in verbs
     ]
 
 
-def _row(folder: Path, stage: Stage) -> Row:
+def _row(folder: Path, stage: ChainStage) -> Row:
     force = () if stage.words[0] == "info" else ("--force",)
     values, seconds, peak = _run(folder, [*stage.words, "--json", *force])
     key, meaning = stage.error

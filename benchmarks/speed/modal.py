@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row, fastest
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal import solve
 from metalens.modal.case import case_of
 from metalens.modal.engine import (
     cached_basis,
     disc_geometry,
-    evaluate,
     small_cached_basis,
+    solve_on_mesh,
 )
 from metalens.modal.ladder import RUNGS
 
@@ -46,9 +46,13 @@ def dense() -> dict[float, complex]:
     references.
     """
     rung = next(rung for rung in RUNGS if rung.name == "fine")
-    cases = {float(d): case_of(CELL, float(d), Light(WAVELENGTH_UM)) for d in DIAMETERS}
+    cases = {
+        float(d): case_of(CELL, float(d), Incidence(WAVELENGTH_UM)) for d in DIAMETERS
+    }
     return {
-        d: complex(evaluate(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0])
+        d: complex(
+            solve_on_mesh(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0]
+        )
         for d, c in cases.items()
     }
 
@@ -112,13 +116,13 @@ def mesh(name: str) -> Row:
     rung = next(rung for rung in RUNGS if rung.name == name)
     rough = rung.usual > 5e-5
     wanted = dense() if rough else {d: t for (d, _), t in references(0.0).items()}
-    cases = {d: case_of(CELL, d, Light(WAVELENGTH_UM)) for d in wanted}
+    cases = {d: case_of(CELL, d, Incidence(WAVELENGTH_UM)) for d in wanted}
 
     def one(d: float) -> complex:
         return complex(
-            evaluate(cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak).matrix[
-                1, 0
-            ]
+            solve_on_mesh(
+                cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak
+            ).matrix[1, 0]
         )
 
     error = max(abs(one(d) - t) for d, t in wanted.items())

@@ -15,9 +15,9 @@ from benchmarks import Row, fastest
 from layout import solids
 from layout.mask import cells, fields
 from layout.pec import correct as dose
-from layout.process.process import Etch, Exposure, Process
+from layout.process.process import EtchProfile, ExposureSettings, Process
 from layout.study import focus, stitching, tolerance
-from layout.study.sensitivity import Sensitivities
+from layout.study.sensitivity import LogSensitivities
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
@@ -32,7 +32,7 @@ PROXY = Proxy(
     0.0,
 )
 TABLE_UM = np.arange(100, 301, 2) * 1e-3
-SENS = Sensitivities(
+SENS = LogSensitivities(
     TABLE_UM,
     np.array(
         [
@@ -43,8 +43,8 @@ SENS = Sensitivities(
     ),
     0.0,
 )
-BEAM = Exposure(alpha_um=0.010, beta_um=31.0, eta=0.6)
-PROCESS = Process(etch=Etch(sidewall_deg=1.0), exposure=BEAM)
+BEAM = ExposureSettings(alpha_um=0.010, beta_um=31.0, eta=0.6)
+PROCESS = Process(etch=EtchProfile(sidewall_deg=1.0), exposure=BEAM)
 BIASED = dataclasses.replace(
     PROCESS,
     bias=dataclasses.replace(
@@ -83,14 +83,14 @@ def rows() -> list[Row]:
 
 def _process_rows() -> list[Row]:
     source = lens().diameters
-    found = cells.quantise(source, BIASED)
+    found = cells.quantise_diameters(source, BIASED)
     table = np.r_[0, found.diameters_nm] * 1e-3
     written = DiameterMap(table[found.classes], 0.4)
     made = BIASED.made_diameter_nm(BIASED.written_diameter_nm(TABLE_UM * 1e3))
     times = {
-        "bias": fastest(lambda: cells.quantise(source, BIASED)),
+        "bias": fastest(lambda: cells.quantise_diameters(source, BIASED)),
         "dose": fastest(lambda: dose.correct_table(found.classes, table, 0.4, BIASED)),
-        "fields": fastest(lambda: fields.split(written, BIASED)),
+        "fields": fastest(lambda: fields.split_write_fields(written, BIASED)),
     }
     result = dose.correct(written, BIASED)
     wide = dataclasses.replace(
@@ -101,7 +101,7 @@ def _process_rows() -> list[Row]:
     case, exact = "4.9 M pillars", "exposure against exact discs, relative"
     edges, cut = (
         "1 - exposure at the edge of all pillars",
-        fields.split(written, BIASED).cut_before,
+        fields.split_write_fields(written, BIASED).cut_before,
     )
     return [
         Row(
@@ -154,11 +154,15 @@ def _process_rows() -> list[Row]:
 
 def _optics_rows() -> list[Row]:
     source = lens(freeform=False)
-    plan = fields.split(source.diameters, PROCESS)
-    report = stitching.stitching(source, plan, PROCESS)
-    study = tolerance.analyse(source, PROCESS, sens=SENS)
-    seconds = fastest(lambda: stitching.stitching(source, plan, PROCESS), repeats=1)
-    amount = fastest(lambda: tolerance.analyse(source, PROCESS, sens=SENS), repeats=1)
+    plan = fields.split_write_fields(source.diameters, PROCESS)
+    report = stitching.simulate_stitching(source, plan, PROCESS)
+    study = tolerance.analyse_tolerance(source, PROCESS, sens=SENS)
+    seconds = fastest(
+        lambda: stitching.simulate_stitching(source, plan, PROCESS), repeats=1
+    )
+    amount = fastest(
+        lambda: tolerance.analyse_tolerance(source, PROCESS, sens=SENS), repeats=1
+    )
     case = "4.9 M pillars"
     return [
         Row(
@@ -200,17 +204,17 @@ def _focus_error() -> tuple[float, float]:
         sensor_distance_um=200.0,
     )
     axis = np.linspace(-6, 9, 6)
-    where = focus.Window(axis, axis, 200.0, 0.85, np.array([16e3, 20e3, 26e3]))
+    where = focus.FocusWindow(axis, axis, 200.0, 0.85, np.array([16e3, 20e3, 26e3]))
     t = (small.transmission() * np.exp(1j * small.phase_rad()))[None].astype(
         np.complex64
     )
-    ready = focus.prepare(small, where)
+    ready = focus.prepare_focus(small, where)
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     exact = field_at(np.angle(t[0]), np.abs(t[0]), ready.case, points).reshape(-1, 6, 6)
     exact *= np.exp(-1j * ready.case.wavenumber * chief_path(ready.case))
 
     def fast() -> np.ndarray:
-        ready = focus.prepare(small, where)
+        ready = focus.prepare_focus(small, where)
         return ready.light(ready.project(t))[0]
 
     return fastest(fast), float(abs(fast() - exact).max() / abs(exact).max())

@@ -35,8 +35,8 @@ from benchmarks.speed._psf_case import (
     textbook,
 )
 from metalens import propagate, psf
-from metalens.propagate.direct import transfer
-from metalens.propagate.estimate import draw, scan, square_error
+from metalens.propagate.direct import free_space_transfer
+from metalens.propagate.estimate import draw_pixels, morton_scan, square_error
 
 WIDE = dict(
     window_um=128.0, samples=64, integrate=False
@@ -91,8 +91,12 @@ def _main_rows() -> list[Row]:
         fastest(lambda: gradient(maps), repeats=15),
     )
     memory = peak_mb(lambda: forward(maps)), peak_mb(lambda: gradient(maps))
-    case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW)
-    h = torch.tensor(transfer(case, (5000, 5000), band_limited=False).astype("c8"))
+    case = propagate.make_case(
+        maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW
+    )
+    h = torch.tensor(
+        free_space_transfer(case, (5000, 5000), band_limited=False).astype("c8")
+    )
     slow = [
         fastest(lambda g=g: textbook(maps, h, grad=g), repeats=2) * len(DEPTHS)
         for g in (False, True)
@@ -329,7 +333,7 @@ def _polarised_error(
     """
     plain, depth = stack.numpy(), len(stack.depths_um) // 2
     flat = np.asarray(plain.intensity[depth], float).reshape(1, -1)
-    points, chance = draw(flat, scan(plain.intensity.shape), 64)
+    points, chance = draw_pixels(flat, morton_scan(plain.intensity.shape), 64)
     y, x = np.divmod(points[0], len(plain.x_um))
     where = np.stack([plain.x_um[x], plain.y_um[y]], -1)
     one = {
@@ -337,7 +341,7 @@ def _polarised_error(
         "window_um": plain.step_um,
         "samples": 1,
     }
-    case = propagate.case(maps[0].shape, **GEOMETRY, **one)
+    case = propagate.make_case(maps[0].shape, **GEOMETRY, **one)
 
     def at(factor: np.ndarray | float) -> np.ndarray:
         return propagate.field_at(
@@ -352,7 +356,7 @@ def _polarised_error(
 
 
 def _from_fields(
-    at: Callable[[np.ndarray], np.ndarray], case: propagate.Case, kind: str
+    at: Callable[[np.ndarray], np.ndarray], case: propagate.PropagationCase, kind: str
 ) -> np.ndarray:
     """Ex Hy* - Ey Hx* or |E|² of both polarisations, each ray turned from the axis to
     the middle of the window.
@@ -407,7 +411,7 @@ def _other_rows() -> list[Row]:
         np.ones_like,
         RADIUS,
     )
-    case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS, **WINDOW)
+    case = propagate.make_case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS, **WINDOW)
     hankel = field_radial(round_lens, case, 1e-4)
     light = np.abs(hankel.field) ** 2
     energy = light.sum((1, 2))

@@ -27,7 +27,7 @@ from benchmarks.speed._psf_case import (
     textbook,
 )
 from metalens import propagate
-from metalens.propagate.direct import transfer
+from metalens.propagate.direct import free_space_transfer
 from metalens.propagate.grids import FIELDS
 
 WINDOWS = (
@@ -40,8 +40,12 @@ PADDED = 5000  # points of the textbook's transforms along an axis
 def rows() -> Iterator[Row]:
     """Windows of 384 um and 1 mm; samples are 0.75 and 0.78 um apart."""
     maps, threads = lens("free-form"), torch.get_num_threads()
-    case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW)
-    h = torch.tensor(transfer(case, (PADDED, PADDED), band_limited=False).astype("c8"))
+    case = propagate.make_case(
+        maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW
+    )
+    h = torch.tensor(
+        free_space_transfer(case, (PADDED, PADDED), band_limited=False).astype("c8")
+    )
     slow = fastest(lambda: textbook(maps, h, grad=False), repeats=1) * len(DEPTHS)
     yield Row(
         "1 mm free-form, 21 depths",

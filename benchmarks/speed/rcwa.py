@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from metalens import modal, rcwa
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
 from metalens.cell.response import Response
 
@@ -50,7 +50,7 @@ def truncated_row(cell: Cell, wavelength_um: float, exact: Any, harmonics: int) 
     from metalens.rcwa.solver import solve_truncated
 
     found = rcwa.solve_many(cell, DIAMETERS, wavelength_um, harmonics=harmonics)
-    this = disc_case(cell, Light(wavelength_um))
+    this = disc_case(cell, Incidence(wavelength_um))
     seconds = fastest(
         lambda: solve_truncated(this, DIAMETERS, harmonics), repeats=2
     ) / len(DIAMETERS)

@@ -8,8 +8,8 @@ import torch
 from benchmarks import Row, fastest
 from benchmarks.peers import layered
 from codesign.eye import dataset, renderer
-from codesign.eye.population import Rig, parameters
-from codesign.eye.renderer import Camera
+from codesign.eye.population import CameraRig, model_parameters
+from codesign.eye.renderer import PinholeCamera
 from metalens.image import pupil, scene, sensor
 from metalens.image.pupil import Pupil
 
@@ -36,18 +36,21 @@ def rows() -> list[Row]:
     return out
 
 
-def _twin_error(states: object, camera: Camera) -> float:
+def _twin_error(states: object, camera: PinholeCamera) -> float:
     few = states[:2]  # type: ignore[index]
     out = renderer.render(few, camera=camera)
-    p = parameters(few, Rig(), pixel_rad=camera.pitch_um / 2000.0)
-    light, *_ = renderer.twin(p, Rig(), camera)
+    p = model_parameters(few, CameraRig(), pixel_rad=camera.pitch_um / 2000.0)
+    light, *_ = renderer.render_in_torch(p, CameraRig(), camera)
     return float((out.frames.radiance - light).norm() / light.norm())
 
 
 def _rendering(threads: int) -> list[Row]:
     out = []
     for pixels, pitch, goal in ((160, 9.0, 800), (400, 3.6, 100)):
-        camera, states = Camera(pixels, pitch), dataset.states_at(torch.arange(32), 1)
+        camera, states = (
+            PinholeCamera(pixels, pitch),
+            dataset.states_at(torch.arange(32), 1),
+        )
         seconds = fastest(
             lambda c=camera, s=states: renderer.render(s, camera=c), repeats=12
         ) / len(states)
@@ -60,19 +63,19 @@ def _rendering(threads: int) -> list[Row]:
 
 
 def _derivatives(threads: int) -> list[Row]:
-    camera, states = Camera(), dataset.states_at(torch.arange(16), 1)
+    camera, states = PinholeCamera(), dataset.states_at(torch.arange(16), 1)
     plain = fastest(lambda: renderer.render(states, camera=camera), repeats=12) / len(
         states
     )
     dual = fastest(
-        lambda: renderer.sensitivities(states, camera=camera), repeats=12
+        lambda: renderer.render_sensitivities(states, camera=camera), repeats=12
     ) / len(states)
     few = states[:3]
-    made = renderer.sensitivities(few, camera=camera)
+    made = renderer.render_sensitivities(few, camera=camera)
     p, first, second = renderer.parameter_tangents(
-        few, ("gaze_x", "slip_z"), rig=Rig(), camera=camera
+        few, ("gaze_x", "slip_z"), rig=CameraRig(), camera=camera
     )
-    triple = dataset.triplets(
+    triple = dataset.render_triplets(
         few, gaze_step_rad=np.radians(0.5), slip_step_um=200.0, camera=camera
     )
     coarse = {
@@ -86,7 +89,9 @@ def _derivatives(threads: int) -> list[Row]:
         ("slip", made.second, second),
     ):
         _, want = torch.func.jvp(
-            lambda q: renderer.twin(q, Rig(), camera)[0], (p,), (tangent,)
+            lambda q: renderer.render_in_torch(q, CameraRig(), camera)[0],
+            (p,),
+            (tangent,),
         )
         error = float((got.radiance - want).norm() / want.norm())
         goal = f"{dual / plain:.1f} x the primal for both tangents; asked 4 x at 1e-3"
@@ -112,7 +117,7 @@ def _derivatives(threads: int) -> list[Row]:
 
 def _imaging(threads: int) -> list[Row]:
     states = dataset.states_at(torch.arange(8), 2)
-    frames = renderer.render(states, camera=Camera()).frames
+    frames = renderer.render(states, camera=PinholeCamera()).frames
     depths = 1 / torch.linspace(1 / 32e3, 1 / 12e3, 21, dtype=torch.float64).flip(0)
     optics = Pupil(nodes=224)
     fine = pupil.psf(torch.zeros(224, 224, dtype=torch.float64), optics, depths_um=depths, focus_um=20e3,
@@ -127,7 +132,7 @@ def _imaging(threads: int) -> list[Row]:
     plain = fastest(lambda: layered.published(all_layers, stack)) / 8
     start = time.perf_counter()
     others = renderer.render(
-        dataset.states_at(torch.arange(100, 104), 2), camera=Camera()
+        dataset.states_at(torch.arange(100, 104), 2), camera=PinholeCamera()
     ).frames
     basis = layered.trimmed(
         scene.basis(stack, depths, tolerance=2e-4), others, tolerance=1e-3, margin=16

@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from characterize.inference.estimate import Options, fit
-from characterize.model import Known, slopes
-from metalens.ground import store
-from metalens.ground.errors import CaptureError, FitError
+from characterize.inference.estimate import FitOptions, fit
+from characterize.model import KnownValue, log_response_slopes
+from metalens.core import store
+from metalens.core.errors import CaptureError, FitError
 
 FOLDER = Path(__file__).parents[1] / "results" / "characterize_referee"
 CASES: dict[str, dict[str, Any]] = {
@@ -90,7 +90,7 @@ def prepared(case: str) -> tuple[Any, Any]:
     from tests.referees import hidden_lens
 
     lens = hidden_lens.lens(*CASES[case]["lens"])
-    return lens, slopes(lens)
+    return lens, log_response_slopes(lens)
 
 
 def study(
@@ -108,13 +108,13 @@ def study(
     )
     session, known = (
         pillar_bench.with_faults(session, **drawn),
-        tuple(Known(name, 0.0) for name in absent),
+        tuple(KnownValue(name, 0.0) for name in absent),
     )
     seen = pillar_bench.shoot(lens, session)
     start, clock = time.process_time(), time.perf_counter()
     try:
         found = fit(
-            seen.capture, lens, Options(known=known, insist=True), response=response
+            seen.capture, lens, FitOptions(known=known, insist=True), response=response
         )
     except (CaptureError, FitError) as refusal:
         return {

@@ -26,13 +26,13 @@ import numpy as np
 
 from benchmarks import Row
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures.capture import Capture
 from characterize.inference.asbuilt import AsBuilt
-from characterize.inference.estimate import Options, fit
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import PLACE, Known
-from metalens.ground import store
+from characterize.inference.estimate import FitOptions, fit
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import PLACE, KnownValue
+from metalens.core import store
 
 FOLDER = Path(__file__).parents[1] / "results" / "characterize_study"
 SEEDS, PEAKS, GOALS = 100, (8000, 200), {8000: 1.10, 200: 1.25}
@@ -83,17 +83,17 @@ def study(seed: int, peak_e: int) -> dict[str, Any]:
 
     values = hidden(seed)
     told = tuple(
-        Known(name, MIDDLE.get(name, 0.0), sigma) for name, sigma in SPREAD.items()
+        KnownValue(name, MIDDLE.get(name, 0.0), sigma) for name, sigma in SPREAD.items()
     )
-    light = bench.irradiance(b.lens(), _truth(values, DEPTHS, 0.0), b.RESPONSE)
-    electrons = light * (peak_e / light.max()) + bench.background(
+    light = bench.bench_irradiance(b.lens(), _truth(values, DEPTHS, 0.0), b.RESPONSE)
+    electrons = light * (peak_e / light.max()) + bench.background_plane(
         _truth(values, DEPTHS, 0.0)
     )
     start = time.process_time()
     found = fit(
         _read(electrons, seed),
         b.lens(),
-        Options(known=told, scan_um=60.0, insist=True),
+        FitOptions(known=told, scan_um=60.0, insist=True),
         response=b.RESPONSE,
     )
     seconds = time.process_time() - start
@@ -185,10 +185,13 @@ def _mean(runs: list[dict[str, Any]], key: str) -> float:
 
 def _truth(
     values: dict[str, float], depths: tuple[float, ...], angle_deg: float
-) -> Truth:
-    known = tuple(Known(name, value) for name, value in values.items())
-    return Truth(
-        depths, (angle_deg,), parameter=known, camera=Camera(pixel_um=1.5, pixels=16)
+) -> HiddenLens:
+    known = tuple(KnownValue(name, value) for name, value in values.items())
+    return HiddenLens(
+        depths,
+        (angle_deg,),
+        parameter=known,
+        camera=BenchCamera(pixel_um=1.5, pixels=16),
     )
 
 
@@ -212,11 +215,13 @@ def _predicted(
     middle = float(np.mean(DEPTHS))
     moved = values["stage_zero_um"] + values["stage_scale"] * (np.mean(depths) - middle)
     truth = _truth(values | {"stage_zero_um": float(moved)}, depths, angle_deg)
-    want = bench.irradiance(b.lens(), truth, b.RESPONSE)
+    want = bench.bench_irradiance(b.lens(), truth, b.RESPONSE)
     n = len(depths)
     angles = np.tile([math.radians(angle_deg), 0.0], (n, 1))
     model = ForwardModel(
-        b.lens(), Setting(np.array(depths), angles, np.ones(n), 1.5, 16, 16), b.RESPONSE
+        b.lens(),
+        FrameSetting(np.array(depths), angles, np.ones(n), 1.5, 16, 16),
+        b.RESPONSE,
     )
     model.stage_centre_um = middle
     x = found.parameters()

@@ -20,7 +20,7 @@ from benchmarks.studies.hard_cells import KINDS as HARD
 from benchmarks.studies.hard_cells import Drawn
 from metalens import modal, rcwa
 from metalens.cell import Cell, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 COUNT, SEED = 200, 9203  # no factor of either was chosen on its cells
 TOLERANCE = 1e-2  # of the modal method

@@ -20,11 +20,11 @@ import numpy as np
 
 from benchmarks import Row
 from metalens import modal, rcwa
-from metalens.cell import Cell, Index, Light
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Incidence, Index
+from metalens.core.errors import CellError
 from metalens.modal import RUNGS
 from metalens.modal.case import ModalCase, case_of
-from metalens.modal.engine import evaluate
+from metalens.modal.engine import solve_on_mesh
 
 COUNT = 1000
 SEED = 8023  # no factor of the estimate was chosen on its cells
@@ -130,7 +130,7 @@ def referee(case: ModalCase, bar: float) -> tuple[tuple[complex, complex], float
     """
     found, doubt = (0j, 0j), math.inf
     for rung in RUNGS[FINER:]:
-        solution = evaluate(case, rung.choice(case.rho).plan)
+        solution = solve_on_mesh(case, rung.choice(case.rho).plan)
         r, t = solution.matrix[:, 0].tolist()
         found, doubt = (t, r), rung.error(solution, case.rho)
         if doubt <= SHARE * bar:
@@ -168,7 +168,8 @@ def judged(
             continue
         seconds += time.perf_counter() - start
         want, doubt = referee(
-            case_of(cell, diameter, Light(wavelength, angle, polarization)), got.t_error
+            case_of(cell, diameter, Incidence(wavelength, angle, polarization)),
+            got.t_error,
         )
         if doubt > SHARE * got.t_error:
             open_ += 1

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal.case import case_of
-from metalens.modal.engine import evaluate
+from metalens.modal.engine import solve_on_mesh
 from metalens.modal.mesh import MeshPlan, build_mesh
 from metalens.modal.spaces import select_functions
 
@@ -103,8 +103,8 @@ def entry(
     name: str, cell: Cell, d: float, wavelength: float, angle: float, p: str, plans: Any
 ) -> dict[str, Any]:
     """Solve one case on both meshes."""
-    case = case_of(cell, d, Light(wavelength, float(np.deg2rad(angle)), p))
-    finer, other = (evaluate(case, plan, weak=WEAK) for plan in plans)
+    case = case_of(cell, d, Incidence(wavelength, float(np.deg2rad(angle)), p))
+    finer, other = (solve_on_mesh(case, plan, weak=WEAK) for plan in plans)
     t, r = finer.matrix[1, 0], finer.matrix[0, 0]
     return {
         "name": name,

@@ -25,10 +25,10 @@ from benchmarks.speed.image import pillar_lens
 from benchmarks.studies import neighbours as rows_of_unlike
 from metalens import design, library, rcwa
 from metalens.cell import Cell, Film, Index
+from metalens.core.arrays import Array
 from metalens.design import Focus
 from metalens.design.neighbours import neighbours
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.ground.arrays import Array
 from metalens.image import Frames, UniformImager, basis, image, uniform_imager
 from metalens.lens import Lens
 from metalens.psf import PsfStack, Source, View, from_lens, spectrum
@@ -193,7 +193,7 @@ def field_rows() -> Iterator[Row]:
 def spectrum_rows() -> Iterator[Row]:
     """A diode of 30 nm, and its middle wavelength in its place."""
     lens = millimetre()
-    um, share = spectrum.weight(LED)
+    um, share = spectrum.spectral_weight(LED)
     some = np.linspace(um[0], um[-1], LINES)
     weights = np.interp(some, um, share)
     judge = referee(lens)
@@ -424,7 +424,10 @@ def image_rows() -> Iterator[Row]:
     ]
     one, seconds = _by_one(wave, distance, grid, frames)
     made = imager(
-        wave, grid, spectrum=spectrum.Nodes(*np.array(lines).T, 0.0), tolerance=1e-2
+        wave,
+        grid,
+        spectrum=spectrum.SpectralNodes(*np.array(lines).T, 0.0),
+        tolerance=1e-2,
     )
     true, took = timed(lambda: made(frames)[0].numpy())
     before, after = (

@@ -24,10 +24,10 @@ from benchmarks import Row
 from metalens import design, library
 from metalens.cell import Cell
 from metalens.commands.library import CellFile
+from metalens.core import config
+from metalens.core.arrays import Array
 from metalens.design.neighbours import neighbours, printed
-from metalens.ground import config
-from metalens.ground.arrays import Array
-from metalens.lens import Lens, Neighbours
+from metalens.lens import Lens, NeighbourRows
 from metalens.psf import among
 from metalens.rcwa import solve_row
 
@@ -198,10 +198,12 @@ def _phase(lens: Lens) -> Array:
     )
 
 
-def factor(lens: Lens, found: Neighbours, place: int) -> Array:
+def factor(lens: Lens, found: NeighbourRows, place: int) -> Array:
     """C at every pillar as PSFs take it from maps, of the field along (0) or across (1)
     the cut.
     """
     phase = torch.as_tensor(np.tile(_phase(lens), (9, 1)))
-    made = among.jones(phase, torch.ones_like(phase), found, lens.cell.pitch_um)
+    made = among.apply_jones_coupling(
+        phase, torch.ones_like(phase), found, lens.cell.pitch_um
+    )
     return np.asarray((made.xx if place == 0 else made.yy)[4].numpy())

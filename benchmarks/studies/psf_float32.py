@@ -26,8 +26,8 @@ import torch
 from benchmarks import Row
 from benchmarks.peers import plain_sum
 from metalens import psf
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 
 COUNT, SEED, POINTS = 500, 4127, 600
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)

@@ -30,8 +30,8 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 
 COUNT, SEED = 16, 7411
 FINEST = {
@@ -53,7 +53,7 @@ class Drawn:
     angle_rad: float = 0.0
     azimuth_rad: float = 0.0
 
-    def jones(self, **how: Any) -> rcwa.Jones:
+    def jones(self, **how: Any) -> rcwa.JonesResponse:
         """By coupled waves; how: tolerance or harmonics."""
         light = {"angle_rad": self.angle_rad, "azimuth_rad": self.azimuth_rad}
         return rcwa.jones(self.cell, self.size_um, self.wavelength_um, **light, **how)

@@ -2,23 +2,23 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from characterize.bench import bench as bench
     from characterize.bench import protocol as protocol
-    from characterize.bench.bench import Shots as Shots
-    from characterize.bench.bench import Truth as Truth
-    from characterize.bench.protocol import Plan as Plan
-    from characterize.bench.protocol import Protocol as Protocol
+    from characterize.bench.bench import HiddenLens as HiddenLens
+    from characterize.bench.bench import SimulatedFrames as SimulatedFrames
+    from characterize.bench.protocol import BenchProtocol as BenchProtocol
+    from characterize.bench.protocol import CapturePlan as CapturePlan
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Plan": "protocol",
-        "Protocol": "protocol",
-        "Shots": "bench",
-        "Truth": "bench",
+        "CapturePlan": "protocol",
+        "BenchProtocol": "protocol",
+        "SimulatedFrames": "bench",
+        "HiddenLens": "bench",
         "bench": "",
         "protocol": "",
     },

@@ -19,20 +19,20 @@ from scipy import ndimage, signal
 from characterize.model import (
     LIGHT,
     PLACE,
-    Films,
-    Known,
-    Spectrum,
+    FilmStack,
+    KnownValue,
+    SpectralLine,
     extra_path,
     incidence_rad,
     light_maps,
     made,
-    vector,
+    parameter_vector,
 )
 from metalens import psf
+from metalens.core import executor
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import Sensitivity
-from metalens.ground import executor
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens
 
 FINE = 9
@@ -44,7 +44,7 @@ _TOGETHER = (
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class BenchCamera:
     """Sensor of the virtual bench; read noise in electrons, gain in electrons a count,
     offset in counts.
 
@@ -89,7 +89,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class HiddenLens:
     """A hidden as-built lens and its captures; TOML of ``metalens capture``.
 
     depths_um: stated source depths of the frames. angles_deg: field angles along x,
@@ -104,8 +104,8 @@ class Truth:
     depths_um: tuple[float, ...]
     angles_deg: tuple[float, ...] = (0.0,)
     peak_e: float = 8000.0
-    parameter: tuple[Known, ...] = ()
-    camera: Camera = Camera()
+    parameter: tuple[KnownValue, ...] = ()
+    camera: BenchCamera = BenchCamera()
     diameter_noise_nm: float = 0.0
     dark_frames: int = field(default=8, metadata={"above": 0})
     flat_frames: int = field(default=16, metadata={"above": 0})
@@ -119,7 +119,7 @@ class Truth:
 
     def vector(self) -> Array:
         """True parameters; log_gain is set by ``peak_e``."""
-        return vector({k.name: k.value for k in self.parameter})
+        return parameter_vector({k.name: k.value for k in self.parameter})
 
     @property
     def stated(self) -> tuple[Array, Array]:
@@ -129,7 +129,7 @@ class Truth:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Shots:
+class SimulatedFrames:
     """What the bench hands over: frames, dark, flat (counts), and the noise-free
     electrons that the fit never sees.
     """
@@ -140,11 +140,13 @@ class Shots:
     electrons: Array
 
 
-def shoot(lens: Lens, truth: Truth, response: Sensitivity) -> Shots:
+def simulate_frames(
+    lens: Lens, truth: HiddenLens, response: Sensitivity
+) -> SimulatedFrames:
     """Frames with noise; the same seed gives the same frames."""
     random = np.random.default_rng(truth.seed)
-    light = irradiance(lens, truth, response)
-    electrons = light * (truth.peak_e / light.max()) + background(truth)
+    light = bench_irradiance(lens, truth, response)
+    electrons = light * (truth.peak_e / light.max()) + background_plane(truth)
     camera = truth.camera
     hot = random.random(electrons.shape[1:]) < camera.hot_share
     frames = np.stack([_read(frame, camera, random, hot) for frame in electrons])
@@ -158,10 +160,10 @@ def shoot(lens: Lens, truth: Truth, response: Sensitivity) -> Shots:
     flat = np.stack(
         [_read(half, camera, random, hot) for _ in range(max(truth.flat_frames, 2))]
     )
-    return Shots(frames, dark, flat, electrons)
+    return SimulatedFrames(frames, dark, flat, electrons)
 
 
-def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
+def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Array:
     """(n, y, x) noise-free light in the pixels, in units of its own; background left
     out.
     """
@@ -176,7 +178,7 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
             f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens"
         )
     tasks = []
-    line = Spectrum.of(lens, depth, angles, tolerance=_SPECTRUM)
+    line = SpectralLine.of(lens, depth, angles, tolerance=_SPECTRUM)
     for offset_nm, weight in line.colours(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
@@ -185,12 +187,16 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
             for way, index in _alike(lens, truth, colour, depth, angles)
         ]
     frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
-    seen = executor.gather(_shown, _Made(lens, truth, response), tasks, beside=False)
+    seen = executor.gather_parallel(
+        _shown, _Made(lens, truth, response), tasks, beside=False
+    )
     for task, light in zip(tasks, seen, strict=True):
         frames[task.index] += task.weight * light
     return np.asarray(
         frames
-        / Films.of(lens.layers, lens.wavelength_um).apparent_um(depth[:, None, None])
+        / FilmStack.of(lens.layers, lens.wavelength_um).apparent_um(
+            depth[:, None, None]
+        )
         ** 2
     )
 
@@ -207,14 +213,14 @@ class _Way:
 
 
 def _alike(
-    lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Array
+    lens: Lens, truth: HiddenLens, x: Array, depth_um: Array, angles_rad: Array
 ) -> Iterator[tuple[_Way, list[int]]]:
     """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold;
     through glass one by one.
     """
     distance, films = (
         lens.sensor_distance_um + x[PLACE["distance_um"]],
-        Films.of(lens.layers, lens.wavelength_um),
+        FilmStack.of(lens.layers, lens.wavelength_um),
     )
     ways: dict[_Way, list[int]] = {}
     for i, (z, angle) in enumerate(
@@ -270,7 +276,7 @@ class _Made:
     """
 
     lens: Lens
-    truth: Truth
+    truth: HiddenLens
     response: Sensitivity
     kept: tuple[tuple[bytes, float], Array] | None = None
     noise_um: Array | None = None
@@ -285,7 +291,7 @@ class _Made:
                 self.noise_um = np.asarray(noise) * (
                     self.truth.diameter_noise_nm * 1e-3
                 )
-            t = made.pillars(
+            t = made.as_built_transmission(
                 self.lens,
                 self.response,
                 x,
@@ -303,7 +309,7 @@ def _shown(hidden: _Made, task: _Task) -> Array:
 
 
 def _frames(
-    lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: Array
+    lens: Lens, truth: HiddenLens, x: Array, t: Array, way: _Way, depth_um: Array
 ) -> Array:
     """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
     camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
@@ -315,7 +321,7 @@ def _frames(
         t = t * np.exp(
             np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2
         )
-    films = Films.of(lens.layers, wavelength_um)
+    films = FilmStack.of(lens.layers, wavelength_um)
     near, far = films.reduced_um(distance), films.apparent_um(depth_um)
     if x[PLACE["glass_um"]]:
         path = extra_path(
@@ -378,7 +384,7 @@ def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:
     )
 
 
-def background(truth: Truth) -> Array:
+def background_plane(truth: HiddenLens) -> Array:
     """(y, x) electrons of the background plane."""
     x, camera = truth.vector(), truth.camera
     n = camera.pixels
@@ -392,7 +398,7 @@ def background(truth: Truth) -> Array:
 
 
 def _read(
-    electrons: Array, camera: Camera, random: np.random.Generator, hot: Array
+    electrons: Array, camera: BenchCamera, random: np.random.Generator, hot: Array
 ) -> Array:
     """Counts of one read-out: photon noise, read noise, offset, quantisation, clipping."""
     top = 2**camera.bits - 1

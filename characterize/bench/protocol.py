@@ -16,21 +16,28 @@ from typing import Literal
 
 import numpy as np
 
-from characterize.inference import Data, Task, Unstated, invert, missing, posterior
+from characterize.inference import (
+    FitImages,
+    SearchTask,
+    UnmodelledShifts,
+    invert_information,
+    missing,
+    posterior,
+)
 from characterize.model import (
     NAMES,
     PARAMETERS,
     PLACE,
     ForwardModel,
-    Known,
-    Setting,
-    unfitted,
-    usual,
-    vector,
+    FrameSetting,
+    KnownValue,
+    parameter_vector,
+    unfitted_sizes,
+    usual_parameters,
 )
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError, nearest_name_hint
 from metalens.fabrication import Sensitivity
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
 
 REACH = posterior.REACH
@@ -43,7 +50,7 @@ _DEFOCUS_WAVES = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class IntervalRequirement:
     """An interval that the session is to give: half of the 95 % interval of a
     parameter, in its unit.
 
@@ -57,7 +64,7 @@ class Wanted:
     def __post_init__(self) -> None:
         if self.name not in PLACE:
             raise FitError(
-                f"wanted {self.name!r}: no such parameter{nearest(self.name, NAMES)}"
+                f"wanted {self.name!r}: no such parameter{nearest_name_hint(self.name, NAMES)}"
             )
         if not (self.within > 0 and math.isfinite(self.within)):
             raise FitError(
@@ -66,7 +73,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Protocol:
+class BenchProtocol:
     """What the bench can do; TOML of ``metalens capture --protocol``.
 
     depths_um: (nearest, farthest) source depth; depth_count: candidates between them,
@@ -95,8 +102,8 @@ class Protocol:
     pixel_um: float = 3.0
     pixels: int = field(default=32, metadata={"above": 0})
     free: tuple[str, ...] = ()
-    known: tuple[Known, ...] = ()
-    wanted: tuple[Wanted, ...] = ()
+    known: tuple[KnownValue, ...] = ()
+    wanted: tuple[IntervalRequirement, ...] = ()
 
     def __post_init__(self) -> None:
         near, far = self.depths_um
@@ -117,7 +124,7 @@ class Protocol:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Plan:
+class CapturePlan:
     """Frames to take, in the order of what each adds.
 
     depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,)
@@ -141,7 +148,9 @@ class Plan:
     warnings: tuple[str, ...] = ()
 
 
-def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
+def plan_captures(
+    lens: Lens, protocol: BenchProtocol, response: Sensitivity
+) -> CapturePlan:
     """The best frames for a lens and what they will tell.
 
     Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change
@@ -153,7 +162,7 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     names, prior = _parameters(lens, protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
     place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
-    chosen = choose(
+    chosen = choose_frames(
         information,
         prior,
         protocol.frames,
@@ -170,10 +179,14 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     ]
     even = _even(candidates, protocol, len(chosen))
     values = [
-        score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names)
+        design_criterion(
+            prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names
+        )
         for i in range(len(chosen))
     ]
-    covariances = [invert(prior + information[pick].sum(0)) for pick in (chosen, even)]
+    covariances = [
+        invert_information(prior + information[pick].sum(0)) for pick in (chosen, even)
+    ]
     sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
     depth, angle, exposure = candidates[chosen].T
     words = (
@@ -182,21 +195,21 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
         *_blind(lens, protocol, depth),
     )
     gain = np.array(values) / values[-1]
-    return Plan(
+    return CapturePlan(
         depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, words
     )
 
 
 def _unstated(
-    lens: Lens, protocol: Protocol, response: Sensitivity, frames: Array
-) -> Unstated:
+    lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
+) -> UnmodelledShifts:
     """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as
     asked for, will reckon with.
     """
     known = {k.name: k for k in protocol.known}
-    sizes = unfitted(known, lens)
+    sizes = unfitted_sizes(known, lens)
     angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
-    setting = Setting(
+    setting = FrameSetting(
         frames[:, 0],
         angles,
         frames[:, 2],
@@ -205,21 +218,23 @@ def _unstated(
         protocol.pixels,
     )
     model = ForwardModel(lens, setting, response)
-    x = vector({name: k.value for name, k in known.items()})
+    x = parameter_vector({name: k.value for name, k in known.items()})
     brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
     image = model.images(x)[0]
     full, ones = image >= protocol.full_well_e, np.ones_like(image)
-    data = Data(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
+    data = FitImages(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
     )
-    return missing.expected(Task(model, data, x, known, None, free, sizes))
+    return missing.expected_score_tests(
+        SearchTask(model, data, x, known, None, free, sizes)
+    )
 
 
 def _left(
-    names: tuple[str, ...], untold: Array, wanted: Sequence[Wanted]
-) -> list[Wanted]:
+    names: tuple[str, ...], untold: Array, wanted: Sequence[IntervalRequirement]
+) -> list[IntervalRequirement]:
     """What the model's own errors may take of the wanted intervals; all where what
     cannot be told takes more.
     """
@@ -229,7 +244,7 @@ def _left(
             REACH * float(untold[names.index(one.name)]) if one.name in names else 0.0
         )
         rest = one.within**2 - beside**2
-        left.append(Wanted(one.name, math.sqrt(rest)) if rest > 0 else one)
+        left.append(IntervalRequirement(one.name, math.sqrt(rest)) if rest > 0 else one)
     return left
 
 
@@ -251,7 +266,7 @@ def _needed(
     prior: Array,
     chosen: list[int],
     names: tuple[str, ...],
-    wanted: Sequence[Wanted],
+    wanted: Sequence[IntervalRequirement],
     *,
     least: int,
 ) -> int:
@@ -262,7 +277,9 @@ def _needed(
     if not places:
         return len(chosen)
     for count in range(least, len(chosen)):
-        sigma = np.sqrt(np.diag(invert(prior + information[chosen[:count]].sum(0))))
+        sigma = np.sqrt(
+            np.diag(invert_information(prior + information[chosen[:count]].sum(0)))
+        )
         if all(REACH * sigma[i] <= within for i, within in places):
             return count
     return len(chosen)
@@ -271,8 +288,8 @@ def _needed(
 def _short(
     names: tuple[str, ...],
     sigma: Array,
-    unstated: Unstated,
-    wanted: Sequence[Wanted],
+    unstated: UnmodelledShifts,
+    wanted: Sequence[IntervalRequirement],
     count: int,
 ) -> list[str]:
     """Intervals that are wanted and not reached, with the light that they would take,
@@ -319,7 +336,7 @@ def _few(frames: Array) -> list[str]:
     ]
 
 
-def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
+def _blind(lens: Lens, protocol: BenchProtocol, chosen_um: Array) -> list[str]:
     """Ranges of depth whose images hide what is to be found: all in focus, or on one
     side of it.
     """
@@ -349,7 +366,7 @@ def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
 
 
 def candidate_information(
-    lens: Lens, protocol: Protocol, response: Sensitivity, names: tuple[str, ...]
+    lens: Lens, protocol: BenchProtocol, response: Sensitivity, names: tuple[str, ...]
 ) -> tuple[Array, Array]:
     """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every
     candidate frame.
@@ -358,7 +375,7 @@ def candidate_information(
     depths = 1 / np.linspace(1 / near, 1 / far, protocol.depth_count)
     pairs = np.array([(z, a) for a in protocol.angles_deg for z in depths])
     angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
-    setting = Setting(
+    setting = FrameSetting(
         pairs[:, 0],
         angles,
         np.ones(len(pairs)),
@@ -367,7 +384,7 @@ def candidate_information(
         protocol.pixels,
     )
     model = ForwardModel(lens, setting, response)
-    x = vector({k.name: k.value for k in protocol.known if k.name in PLACE})
+    x = parameter_vector({k.name: k.value for k in protocol.known if k.name in PLACE})
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
     images, slopes = model.images(x, names)
     if slopes is None:
@@ -387,7 +404,7 @@ def candidate_information(
     return np.concatenate(rows), np.concatenate(information)
 
 
-def choose(
+def choose_frames(
     information: Array,
     prior: Array,
     count: int,
@@ -417,7 +434,7 @@ def choose(
         return int(
             np.argmax(
                 [
-                    score(base + one, criterion, names) if some else -np.inf
+                    design_criterion(base + one, criterion, names) if some else -np.inf
                     for one, some in zip(information, new, strict=True)
                 ]
             )
@@ -437,7 +454,9 @@ def choose(
     return chosen
 
 
-def score(information: Array, criterion: str, names: tuple[str, ...]) -> float:
+def design_criterion(
+    information: Array, criterion: str, names: tuple[str, ...]
+) -> float:
     """What is to be large: det^(1/p) in typical units (D), or p over the sum of
     variances in typical units (A).
     """
@@ -450,7 +469,7 @@ def score(information: Array, criterion: str, names: tuple[str, ...]) -> float:
     )
 
 
-def _parameters(lens: Lens, protocol: Protocol) -> tuple[tuple[str, ...], Array]:
+def _parameters(lens: Lens, protocol: BenchProtocol) -> tuple[tuple[str, ...], Array]:
     """Names of what will be fitted, and what is known of it beforehand as (p, p)
     information.
     """
@@ -462,12 +481,12 @@ def _parameters(lens: Lens, protocol: Protocol) -> tuple[tuple[str, ...], Array]
     names = tuple(name for name in NAMES if name in wanted - held)
     sigma = [
         known[row.name].sigma if row.name in known else row.sigma
-        for row in usual(names, lens)
+        for row in usual_parameters(names, lens)
     ]
     return names, np.diag([s**-2.0 for s in sigma])
 
 
-def _even(candidates: Array, protocol: Protocol, count: int) -> list[int]:
+def _even(candidates: Array, protocol: BenchProtocol, count: int) -> list[int]:
     usual = np.flatnonzero(
         (candidates[:, 1] == protocol.angles_deg[0])
         & (candidates[:, 2] == protocol.exposures[0])

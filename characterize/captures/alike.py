@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 def above_rim(frames: Array) -> Array:
@@ -29,7 +29,9 @@ def _norm(frames: Array, noise: Array | float) -> Array:
     return np.asarray(np.sqrt(np.maximum(power - noise**2, 0.1 * power)))
 
 
-def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
+def normalized_cross_correlation(
+    a: Array, b: Array, noise: float
+) -> tuple[float, tuple[float, float]]:
     """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a
     against b in pixels.
 
@@ -49,7 +51,7 @@ def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, floa
     return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
-def shifted(light: Array, shift: tuple[int, int]) -> Array:
+def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
     """(..., y, x) moved by whole pixels (y, x); nothing comes in from outside."""
     out = np.zeros_like(light)
     rows, columns = light.shape[-2:]
@@ -61,8 +63,8 @@ def shifted(light: Array, shift: tuple[int, int]) -> Array:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Spectra:
-    """Frames as :func:`likeness` correlates them: spectra (n, u, v) of twice the side,
+class FrameSpectra:
+    """Frames as :func:`normalized_cross_correlation` correlates them: spectra (n, u, v) of twice the side,
     norms (n,) freed of noise.
     """
 
@@ -71,12 +73,12 @@ class Spectra:
     sides: tuple[int, int]
 
     @classmethod
-    def of(cls, frames: Array, noise: Array) -> "Spectra":
+    def of(cls, frames: Array, noise: Array) -> "FrameSpectra":
         """Of frames with noise of some norm, (n,)."""
         sides = 2 * frames.shape[1], 2 * frames.shape[2]
         return cls(fft.rfft2(frames, sides), _norm(frames, noise), sides)
 
-    def alike(self, expected: "Spectra", index: Array) -> float:
+    def alike(self, expected: "FrameSpectra", index: Array) -> float:
         """Mean likeness of the frames, taken in some order, to those expected."""
         cross = fft.irfft2(
             self.spectrum[index] * np.conj(expected.spectrum), self.sides

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 ORDERS = ("nyx", "yxn")
 # a frame whose rows are shorter than its columns by more, in a stack that is as long,
@@ -17,7 +17,7 @@ ORDERS = ("nyx", "yxn")
 _SHORT = 2.0
 
 
-def stated(about: dict[str, Any], where: str) -> str | None:
+def stated_axes(about: dict[str, Any], where: str) -> str | None:
     """``axes`` of the capture's description, which is taken out; None where it says
     nothing.
 
@@ -82,7 +82,7 @@ def frames_first(
         )
     if last < min(first, second) or second == first:
         name, taken = (
-            reading.shown(path.name),
+            reading.to_valid_utf8(path.name),
             f"taken as (n, y, x), {first} frames of {second} x {last} pixels",
         )
         return (
@@ -113,7 +113,7 @@ def as_large(
 
 def _moved(stack: Array, path: Path, why: str) -> tuple[Array, str]:
     first, second, last = stack.shape[:3]
-    name = reading.shown(path.name)
+    name = reading.to_valid_utf8(path.name)
     note = (
         f"{name} taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
     )

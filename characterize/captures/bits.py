@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 _DEPTHS = (8, 10, 12, 14, 16)
 # different counts that all lie as stretched ones do: by chance one of 14 bits in 4**32

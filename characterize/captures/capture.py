@@ -18,14 +18,14 @@ import numpy as np
 
 from characterize.captures import axes, folder, png, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
-from characterize.captures.colour import Colours
-from metalens.ground import manifest, reading, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError, MetalensError
+from characterize.captures.colour import ColourChannels
+from metalens.core import manifest, reading, store
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5 = (".tif", ".tiff", ".tf8", ".btf"), (".png",), (".h5", ".hdf5")
 LOSSY = (".jpg", ".jpeg", ".jp2", ".webp")
-_PLAIN = Colours()
+_PLAIN = ColourChannels()
 Stack = tuple[Array, str]
 
 
@@ -118,7 +118,7 @@ def load(path: str | Path) -> Capture:
         logging.CRITICAL
     )  # what it makes of a damaged file is said in one error
     try:
-        with reading.steady(path):
+        with reading.refuse_changes(path):
             return _load_folder(path) if path.is_dir() else _load_file(path)
     except MetalensError:
         raise
@@ -140,12 +140,12 @@ def read_images(path: Path) -> Array:
     Raises:
         CaptureError: unknown, lossy, truncated or non-finite; colour.
     """
-    return sound(_PLAIN.pick(read_all(path), path), path)
+    return check_images(_PLAIN.pick(read_all(path), path), path)
 
 
 def _stack(
     path: Path,
-    colours: Colours,
+    colours: ColourChannels,
     order: str | None,
     *,
     count: int | None = None,
@@ -154,20 +154,20 @@ def _stack(
     """Frames of one file and what to say of their axes."""
     images = read_all(path, colours)
     if order is None and path.suffix.lower() in TIFF:
-        order = tiff_pages.order(path)
+        order = tiff_pages.page_order(path)
     images, note = axes.frames_first(images, path, order, count=count, pages=pages)
-    return sound(colours.pick(images, path, grey=False), path), note
+    return check_images(colours.pick(images, path, grey=False), path), note
 
 
-def _beside(path: Path, colours: Colours, size: tuple[int, ...]) -> Stack:
+def _beside(path: Path, colours: ColourChannels, size: tuple[int, ...]) -> Stack:
     """Dark or flat of frames of a size, and what to say of its axes."""
     images, note = axes.as_large(
         read_all(path, colours), path, size, pitch=colours.pitch
     )
-    return sound(colours.pick(images, path, grey=True), path), note
+    return check_images(colours.pick(images, path, grey=True), path), note
 
 
-def sound(images: Array, path: Path) -> Array:
+def check_images(images: Array, path: Path) -> Array:
     """Images as they are.
 
     Raises:
@@ -179,7 +179,7 @@ def sound(images: Array, path: Path) -> Array:
     return images
 
 
-def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
+def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
     """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they
     lie there.
 
@@ -192,13 +192,13 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
             f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5"
         )
     read_tiff = partial(
-        tiff_pages.read,
+        tiff_pages.read_tiff,
         coloured=colours.channel is not None,
         mosaic=bool(colours.mosaic),
     )
     readers: dict[tuple[str, ...], Callable[[Path], Array]] = {
         TIFF: read_tiff,
-        PNG: png.read,
+        PNG: png.read_png,
         HDF5: _read_hdf5,
     }
     reader = next(
@@ -207,7 +207,7 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
     if reader is None:
         kind = suffix or "a file without suffix"
         raise CaptureError(
-            f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.cure(suffix)}"
+            f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.conversion_hint(suffix)}"
         )
     images = reader(path)
     return images[None] if images.ndim == 2 else images
@@ -215,9 +215,13 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
 
 def _load_file(path: Path) -> Capture:
     about = stage.read_beside(path)
-    colours = Colours.of(about, str(path))
-    images, said = _stack(path, colours, axes.stated(about, str(path)))
-    tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
+    colours = ColourChannels.of(about, str(path))
+    images, said = _stack(path, colours, axes.stated_axes(about, str(path)))
+    tags = (
+        tiff_tags.read_tags(path)
+        if path.suffix.lower() in TIFF
+        else tiff_tags.TiffTags()
+    )
     images, bits, note, _ = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
     step = about.get("step_um", math.nan)
@@ -228,7 +232,7 @@ def _load_file(path: Path) -> Capture:
         position if len(position) == n else np.full(n, np.nan),
         np.zeros((n, 2)),
         np.full(n, np.nan),
-        tuple(f"{reading.shown(path.name)}[{i}]" for i in range(n)),
+        tuple(f"{reading.to_valid_utf8(path.name)}[{i}]" for i in range(n)),
         bits,
         pixel_um=about.pop("pixel_um", tags.pixel_um) * colours.pitch,
         wavelength_um=about.pop("wavelength_um", math.nan),
@@ -239,24 +243,28 @@ def _load_file(path: Path) -> Capture:
 
 
 def _load_folder(at: Path) -> Capture:
-    manifest.check(at)
+    manifest.check_manifest(at)
     about = stage.read_about(at)
     rows = stage.read_stage(at)
-    files = folder.images(at, TIFF + PNG + HDF5 + LOSSY)
+    files = folder.list_images(at, TIFF + PNG + HDF5 + LOSSY)
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
-    colours, order = Colours.of(about, str(at)), axes.stated(about, str(at))
+    colours, order = ColourChannels.of(about, str(at)), axes.stated_axes(about, str(at))
     said = [
         *(stage.left_out(files, rows) if rows else ()),
-        *stage.unread(about),
-        *folder.unread(at, special),
+        *stage.unread_keys_text(about),
+        *folder.unread_images_text(at, special),
     ]
     if rows is None:
         names, frames, notes = _all_frames(files, at, colours, order)
-        rows = stage.Rows.unknown(names)
+        rows = stage.StageRows.unknown(names)
     else:
         frames, notes = _listed_frames(
-            {stage.spelt(p.name): p for p in files}, at, rows, colours, order
+            {stage.normalize_spelling(p.name): p for p in files},
+            at,
+            rows,
+            colours,
+            order,
         )
     beside = {
         name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()
@@ -293,7 +301,7 @@ def _load_folder(at: Path) -> Capture:
 
 
 def _all_frames(
-    files: Sequence[Path], at: Path, colours: Colours, order: str | None
+    files: Sequence[Path], at: Path, colours: ColourChannels, order: str | None
 ) -> tuple[tuple[str, ...], Array, list[str]]:
     """Names, frames, and what to say of their axes."""
     if not files:
@@ -309,14 +317,14 @@ def _all_frames(
             else [path.name]
         )
         stacks.append(images)
-    return tuple(map(reading.shown, names)), _join(stacks, files), notes
+    return tuple(map(reading.to_valid_utf8, names)), _join(stacks, files), notes
 
 
 def _listed_frames(
     there: Mapping[str, Path],
     at: Path,
-    rows: stage.Rows,
-    colours: Colours,
+    rows: stage.StageRows,
+    colours: ColourChannels,
     order: str | None,
 ) -> tuple[Array, list[str]]:
     """The frames that the stage file names, in its order; without a column of pages,
@@ -328,10 +336,10 @@ def _listed_frames(
     images = []
     rows_of, met = Counter(rows.files), Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
-        path = there.get(stage.spelt(name), at / name)
+        path = there.get(stage.normalize_spelling(name), at / name)
         if not path.is_file():
             raise CaptureError(
-                f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.like(name, there)}"
+                f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.similar_name_hint(name, there)}"
             )
         if name not in stacks:
             count = rows_of[name] if stated is None else None

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 CHANNELS = ("red", "green", "blue")
 
@@ -20,7 +20,7 @@ def red_first(image: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Colours:
+class ColourChannels:
     """Which colour is lit, and how a raw mosaic holds it.
 
     channel: one of ``CHANNELS``, or None. mosaic: letters of the 2 x 2 pixels that
@@ -33,7 +33,7 @@ class Colours:
     mosaic: str = ""
 
     @classmethod
-    def of(cls, about: dict[str, Any], where: str) -> "Colours":
+    def of(cls, about: dict[str, Any], where: str) -> "ColourChannels":
         """As the capture's description says; its entries are taken out.
 
         Raises:

@@ -9,9 +9,9 @@ import numpy as np
 from scipy import ndimage
 
 from characterize.captures.capture import Capture
-from characterize.captures.rounding import Dark
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from characterize.captures.rounding import DarkStatistics
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 # counts of noise from which on rounding is off by a twentieth of a count at most
 _HIDES = 0.3
@@ -24,7 +24,7 @@ _ASSUMED_READ_NOISE_E = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Gain:
+class SensorNoise:
     """Noise model of a sensor: variance in counts = mean / gain + (read noise / gain)²
     + 1/12.
 
@@ -54,7 +54,7 @@ class Gain:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Frames:
+class ElectronFrames:
     """Frames ready for a fit, in electrons above the dark level.
 
     electrons: (n, y, x), flat-fielded.
@@ -81,14 +81,14 @@ class Frames:
     saturated: Array
     variance_e2: Array
     scale: Array
-    gain: Gain
+    gain: SensorNoise
     corrections: tuple[str, ...]
     common_floor: float | Array = 0.0
     common_light: float = 0.0
     count_e: float = 0.0
 
 
-def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
+def photon_transfer(flat: Array, dark: Array | None = None) -> SensorNoise:
     """Gain and read noise from repeated flat frames (mean-variance method, Janesick
     2007).
 
@@ -139,10 +139,10 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
         )
     gain = 1 / inverse
     read = math.sqrt(max(floor - 1 / 12, 0)) * gain
-    return Gain(gain, gain**2 * sigma, read, read_known=dark_known)
+    return SensorNoise(gain, gain**2 * sigma, read, read_known=dark_known)
 
 
-def clean(capture: Capture) -> Frames:
+def to_electrons(capture: Capture) -> ElectronFrames:
     """Frames in electrons with masks; the gain from the flats, else one electron a
     count, and so said.
 
@@ -181,7 +181,7 @@ def clean(capture: Capture) -> Frames:
         gain.read_noise_e**2 + gain.gain_e**2 / 12,
         (gain.gain_e * dark_error) ** 2,
     )
-    return Frames(
+    return ElectronFrames(
         (raw - dark) / flat * gain.gain_e,
         np.broadcast_to(~bad, raw.shape).copy(),
         saturated,
@@ -214,7 +214,7 @@ def saturation_level(capture: Capture) -> float:
     return highest if clipped else float(capture.full_scale)
 
 
-def full_well(counts: Array, gain: Gain) -> float:
+def full_well(counts: Array, gain: SensorNoise) -> float:
     """Counts above the dark level from which on pixels are full; inf where none shows
     it.
 
@@ -267,8 +267,8 @@ def bad_pixels(capture: Capture) -> Array:
 
 
 def merge_brackets(
-    frames: Frames, exposure_s: Array, group: Array
-) -> tuple[Frames, Array]:
+    frames: ElectronFrames, exposure_s: Array, group: Array
+) -> tuple[ElectronFrames, Array]:
     """One frame for each value of ``group``: the brackets' rates averaged by inverse
     variance, saturated ones left out.
 
@@ -297,12 +297,12 @@ def merge_brackets(
         (*frames.corrections, note) if len(kinds) < len(group) else frames.corrections
     )
     common = frames.common_floor, frames.common_light
-    return Frames(
+    return ElectronFrames(
         value, usable, saturated, floor, scale, frames.gain, notes, *common
     ), np.sort(first)
 
 
-def _merge(frames: Frames, index: Array, exposure_s: Array) -> list[Array]:
+def _merge(frames: ElectronFrames, index: Array, exposure_s: Array) -> list[Array]:
     time = exposure_s[index][:, None, None] / exposure_s[index].max()
     open_ = frames.usable[index] & ~frames.saturated[index]
     total = np.maximum((open_ * time).sum(0), 1e-12)
@@ -332,7 +332,7 @@ def _merge(frames: Frames, index: Array, exposure_s: Array) -> list[Array]:
     ]
 
 
-def _gain(capture: Capture, notes: list[str]) -> Gain:
+def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
     """Gain and read noise as stated, else as measured, else assumed; notes say which.
 
     Read noise comes from the description, else from two dark frames or more, else from
@@ -368,11 +368,11 @@ def _gain(capture: Capture, notes: list[str]) -> Gain:
     else:
         read, origin, read_known = _ASSUMED_READ_NOISE_E, "assumed", False
     notes.append(f"read noise {read:.2g} e, {origin}")
-    return Gain(gain, sigma, read, known=known, read_known=read_known)
+    return SensorNoise(gain, sigma, read, known=known, read_known=read_known)
 
 
 def _dark_level(
-    capture: Capture, gain: Gain, notes: list[str]
+    capture: Capture, gain: SensorNoise, notes: list[str]
 ) -> tuple[Array | float, Array | float]:
     """(counts without light, their standard error), of every pixel where there are dark
     frames.
@@ -392,7 +392,7 @@ def _dark_level(
     )
     told, errors = level, np.full_like(level, error / math.sqrt(len(capture.dark)))
     if gain.coarse:
-        rounded = Dark.of(capture.dark)
+        rounded = DarkStatistics.of(capture.dark)
         told, errors = rounded.level, rounded.error
     notes.append(
         f"offset {np.mean(told):.4g} counts on average, measured pixel by pixel in "
@@ -445,7 +445,9 @@ def _floor(dark: Array) -> float:
     before rounding.
     """
     variance = _pair_variance(dark)
-    return variance if variance > _ROUGH else Dark.of(dark).noise ** 2 + 1 / 12
+    return (
+        variance if variance > _ROUGH else DarkStatistics.of(dark).noise ** 2 + 1 / 12
+    )
 
 
 def _pair_variance(frames: Array) -> float:

@@ -7,8 +7,8 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from metalens.ground import reading
-from metalens.ground.errors import CaptureError
+from metalens.core import reading
+from metalens.core.errors import CaptureError
 
 # suffixes of the description's two files, and of what is saved in their place
 _TABLES = {
@@ -53,14 +53,14 @@ _CURES = {
 }
 
 
-def cure(suffix: str) -> str:
+def conversion_hint(suffix: str) -> str:
     """How to save anew what is held in a kind of file that is not read; empty where
     that is not known.
     """
     return f": save it {_CURES[suffix]}" if suffix in _CURES else ""
 
 
-def images(folder: Path, suffixes: Collection[str]) -> list[Path]:
+def list_images(folder: Path, suffixes: Collection[str]) -> list[Path]:
     """Image files of a folder in the order of their names, numbers counted (frame_2
     before frame_10).
 
@@ -75,7 +75,7 @@ def images(folder: Path, suffixes: Collection[str]) -> list[Path]:
     return sorted(found, key=lambda path: [part[::-1] for part in _parts(path.name)])
 
 
-def table(folder: Path, kind: str) -> Path | None:
+def find_table(folder: Path, kind: str) -> Path | None:
     """The file ``stage`` or ``capture`` of a folder, in capital letters or small ones;
     None where there is none.
 
@@ -100,7 +100,7 @@ def table(folder: Path, kind: str) -> Path | None:
     return None
 
 
-def unread(folder: Path, beside: Collection[str]) -> tuple[str, ...]:
+def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]:
     """What to say of images in kinds of file that are not read; ``beside``: dark and
     flat, where they are there.
 
@@ -115,9 +115,9 @@ def unread(folder: Path, beside: Collection[str]) -> tuple[str, ...]:
     for path in rest:
         if path.stem.lower() in {"dark", "flat"} - set(beside):
             raise CaptureError(
-                f"{path}: cannot read {path.suffix}, and it would not be used{cure(path.suffix.lower())}"
+                f"{path}: cannot read {path.suffix}, and it would not be used{conversion_hint(path.suffix.lower())}"
             )
-    names = ", ".join(reading.shown(path.name) for path in rest[:5])
+    names = ", ".join(reading.to_valid_utf8(path.name) for path in rest[:5])
     return (
         (f"{len(rest)} files left out, of kinds that are not read: {names}",)
         if rest
@@ -156,7 +156,7 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
         )
 
 
-def like(name: str, there: Collection[str]) -> str:
+def similar_name_hint(name: str, there: Collection[str]) -> str:
     """A hint for the name of a file that is not there: the one that is most like it."""
     close = difflib.get_close_matches(
         name.lower(), [other.lower() for other in there], n=1

@@ -6,13 +6,13 @@ from pathlib import Path
 
 from characterize.captures.colour import red_first
 from characterize.captures.tiff_pages import DENSEST
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 _LEAST = 33  # bytes of a PNG's mark and head
 
 
-def read(path: Path) -> Array:
+def read_png(path: Path) -> Array:
     """(y, x) image of a file, or (1, y, x, red green blue [alpha]).
 
     Raises:

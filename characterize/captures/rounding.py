@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, special
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _SMOOTH = 1.0  # counts of noise from which on rounding is a variance of 1/12 to 1e-8
 _REACH = 9.0  # sigma to the farthest count that is summed
@@ -31,7 +31,7 @@ _USUAL = (
 )  # counts of noise and of the scatter of pixels' levels where frames do not tell
 
 
-def told(off: Array, noise: Array) -> tuple[Array, Array]:
+def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
     """What a count says of the light under it: (score, expected information), counts⁻¹
     and counts⁻².
 
@@ -76,7 +76,7 @@ def _score(off: Array, noise: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Dark:
+class DarkStatistics:
     """What repeated frames without light tell, in counts.
 
     level: (y, x) of every pixel before rounding. error: (y, x) standard deviation of
@@ -89,7 +89,7 @@ class Dark:
     noise: float
 
     @classmethod
-    def of(cls, frames: Array) -> "Dark":
+    def of(cls, frames: Array) -> "DarkStatistics":
         """Of (n, y, x) counts whose noise is below one, by the likelihood of all
         pixels' counts together.
 

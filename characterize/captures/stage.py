@@ -19,9 +19,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from characterize.captures import folder as naming
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError, nearest
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError, nearest_name_hint
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _BARE = ("depth", "z", "position", "exposure")
@@ -74,7 +74,7 @@ _COLUMNS = {"file", "page", *_EXPOSURES, *_ANGLES_Y, *_POSITIONS, *_ANGLES}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rows:
+class StageRows:
     """One row a frame, as listed in the stage file.
 
     files: image names; page: index inside that image file, None where the table has no
@@ -101,7 +101,7 @@ class Rows:
         return len(listed) if listed == set(range(len(listed))) else 0
 
     @classmethod
-    def unknown(cls, names: tuple[str, ...]) -> "Rows":
+    def unknown(cls, names: tuple[str, ...]) -> "StageRows":
         """Rows for frames of which nothing but the name is known."""
         n = len(names)
         return cls(
@@ -114,7 +114,7 @@ class Rows:
         )
 
 
-def read_stage(folder: Path) -> Rows | None:
+def read_stage(folder: Path) -> StageRows | None:
     """The stage file of a capture folder; None where there is none.
 
     Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in
@@ -130,7 +130,7 @@ def read_stage(folder: Path) -> Rows | None:
             page that is not whole; file
             and row are named. A table in another format (``stage.xlsx``).
     """
-    if path := naming.table(folder, "stage"):
+    if path := naming.find_table(folder, "stage"):
         return _rows(
             _read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path
         )
@@ -144,7 +144,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     Raises:
         CaptureError: not TOML or JSON, a misspelt name, or an impossible number.
     """
-    return _about(naming.table(folder, "capture"))
+    return _about(naming.find_table(folder, "capture"))
 
 
 def read_beside(path: Path) -> dict[str, Any]:
@@ -281,7 +281,7 @@ def _read_json(path: Path) -> list[dict[str, Any]]:
     return table
 
 
-def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
+def _rows(table: list[dict[str, Any]], path: Path) -> StageRows:
     if not table:
         raise CaptureError(f"{path}: no rows; need one a frame")
     parted = next((mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None)
@@ -308,7 +308,7 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
                 )
             if key not in _COLUMNS:
                 raise CaptureError(
-                    f"{path}, row {row}: unknown column {key!r}{nearest(str(key), _COLUMNS)}"
+                    f"{path}, row {row}: unknown column {key!r}{nearest_name_hint(str(key), _COLUMNS)}"
                 )
         if not entries.get("file"):
             raise CaptureError(
@@ -329,7 +329,7 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
     columns = [
         _column(table, key, path) * s for key, s in zip(angle, scales, strict=True)
     ]
-    return Rows(
+    return StageRows(
         files=tuple(str(entries["file"]) for entries in table),
         page=_pages(table, path) if "page" in head else (None,) * len(table),
         position_um=_column(table, place, path, np.nan)
@@ -362,14 +362,14 @@ def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]
     return plain
 
 
-def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
+def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
     """What to say of images in the folder that the stage file does not name.
 
     Raises:
         CaptureError: they are called as dark frames or flats, and would not be used.
     """
-    named = {spelt(Path(name).name) for name in rows.files}
-    rest = [path.name for path in files if spelt(path.name) not in named]
+    named = {normalize_spelling(Path(name).name) for name in rows.files}
+    rest = [path.name for path in files if normalize_spelling(path.name) not in named]
     for name in rest:
         if kind := re.match(r"(dark|flat)s?(?![a-z])", name.lower()):
             raise CaptureError(
@@ -385,9 +385,9 @@ def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
     )
 
 
-def unread(about: dict[str, Any]) -> tuple[str, ...]:
+def unread_keys_text(about: dict[str, Any]) -> tuple[str, ...]:
     """What to say of entries of a capture's description that nothing reads."""
-    rest = [reading.shown(name) for name in about if name not in _KNOWN]
+    rest = [reading.to_valid_utf8(name) for name in about if name not in _KNOWN]
     return (
         (
             f"entries of the description that change nothing, kept as notes: {', '.join(rest[:8])}",
@@ -397,7 +397,7 @@ def unread(about: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def spelt(name: str) -> str:
+def normalize_spelling(name: str) -> str:
     """A file name in one spelling: some systems write an umlaut as a letter and its
     dots.
     """

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from characterize.captures.colour import red_first
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 DENSEST = 1040  # values' bytes for a byte of the file, at best
 _MOST_BYTES = 1 << 34  # of all frames of a file
@@ -34,7 +34,7 @@ _ELSEWHERE = {34925: "LZMA", 50000: "Zstandard"}  # only that package
 _TURNED = 274  # the tag that says which way up an image is
 
 
-def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
+def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
     """(n, y, x) images of a file, or (n, y, x, colours).
 
     Args:
@@ -78,7 +78,7 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
         raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
 
 
-def stacked(file: Any) -> int:
+def count_images(file: Any) -> int:
     """How many images a file holds: its pages, or what ImageJ laid behind the head of
     one (stacks above 4 GB).
     """
@@ -90,7 +90,7 @@ def stacked(file: Any) -> int:
     )
 
 
-def order(path: Path) -> str | None:
+def page_order(path: Path) -> str | None:
     """How the images of a file lie where that is sure: "nyx" of pages written one by
     one, as cameras and image programs
     do; None of an array that was written at once (tifffile), whose axes may be any,
@@ -111,7 +111,7 @@ def order(path: Path) -> str | None:
 
 
 def _images(path: Path, file: Any) -> Array:
-    count, first = stacked(file), file.pages.first
+    count, first = count_images(file), file.pages.first
     if count == len(file.pages):
         return np.stack(_alike(_pages(path, file), path))
     begins, size = first.dataoffsets[0], path.stat().st_size

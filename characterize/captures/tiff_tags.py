@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from characterize.captures import stage, tiff_pages
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 _MICRONS = (
     "um",
@@ -32,7 +32,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tags:
+class TiffTags:
     """position_um: (n,) of the frames, empty where not told. pixel_um: nan where not
     told; notes: in words.
     """
@@ -42,7 +42,7 @@ class Tags:
     notes: tuple[str, ...] = ()
 
 
-def read(path: Path) -> Tags:
+def read_tags(path: Path) -> TiffTags:
     """Tags of a TIFF file; nothing where it has none of these.
 
     Raises:
@@ -56,21 +56,21 @@ def read(path: Path) -> Tags:
                 path,
                 file.imagej_metadata,
                 _resolution(file.pages[0]),
-                tiff_pages.stacked(file),
+                tiff_pages.count_images(file),
             )
         if file.is_ome and file.ome_metadata:
             return _ome(path, file.ome_metadata, len(file.pages))
-    return Tags()
+    return TiffTags()
 
 
-def _ome(path: Path, xml: str, pages: int) -> Tags:
+def _ome(path: Path, xml: str, pages: int) -> TiffTags:
     """Positions of the planes, else steps of the voxel's height; nothing of a text that
     is no XML.
     """
     try:
         pixels = next(stage.ome_entries(xml, "Pixels"), {})
     except ElementTree.ParseError:
-        return Tags(
+        return TiffTags(
             notes=(
                 "the OME tags are no XML: what they say of stage and pixel is not read",
             )
@@ -84,11 +84,11 @@ def _ome(path: Path, xml: str, pages: int) -> Tags:
     )
     planes, times = (max(int(pixels.get(f"Size{axis}", 1)), 1) for axis in "ZT")
     if len(position) or not math.isfinite(step) or step == 0 or planes == 1 < pages:
-        return Tags(position, pixel, _words(pixel))
+        return TiffTags(position, pixel, _words(pixel))
     order, page = pixels.get("DimensionOrder", "XYZCT"), np.arange(pages)
     place = page % planes if order.index("Z") < order.index("T") else page // times
     note = f"stage step of {step:.4g} um from the OME tags"
-    return Tags(place * step, pixel, (note, *_words(pixel)))
+    return TiffTags(place * step, pixel, (note, *_words(pixel)))
 
 
 def _ome_size(pixels: dict[str, str], axis: str) -> float:
@@ -105,7 +105,9 @@ def _one_channel(path: Path, channels: int) -> None:
         )
 
 
-def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) -> Tags:
+def _imagej(
+    path: Path, about: dict[str, object], per_pixel: float, pages: int
+) -> TiffTags:
     """Steps without a unit are in um; of a unit that is no length (pixels) neither
     steps nor a pixel are told.
 
@@ -124,7 +126,7 @@ def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) 
     notes = (
         (f"stage step of {step:.4g} um from the ImageJ tags",) if len(position) else ()
     )
-    return Tags(position, pixel, notes + _words(pixel))
+    return TiffTags(position, pixel, notes + _words(pixel))
 
 
 def _resolution(page: object) -> float:

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
 MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
 
 
-def turn(frames: Array, orientation: int) -> Array:
+def orient_frames(frames: Array, orientation: int) -> Array:
     """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation
     mod 4) times.
     """
@@ -16,7 +16,7 @@ def turn(frames: Array, orientation: int) -> Array:
     return np.rot90(turned, orientation % 4, axes=(-2, -1))
 
 
-def between(first: int, second: int) -> int:
+def relative_orientation(first: int, second: int) -> int:
     """The orientation that makes of frames turned by the first those turned by the
     second.
 
@@ -27,5 +27,7 @@ def between(first: int, second: int) -> int:
     return next(
         k
         for k in range(8)
-        if np.array_equal(turn(turn(frame, first), k), turn(frame, second))
+        if np.array_equal(
+            orient_frames(orient_frames(frame, first), k), orient_frames(frame, second)
+        )
     )

@@ -6,12 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.bench import Plan, Protocol, Shots, Truth, bench, protocol
+from characterize.bench import (
+    BenchProtocol,
+    CapturePlan,
+    HiddenLens,
+    SimulatedFrames,
+    bench,
+    protocol,
+)
 from characterize.commands.capture_options import Options
-from characterize.model import slopes
+from characterize.model import log_response_slopes
 from metalens import lens as lenses
-from metalens.ground import config, store, transaction
-from metalens.ground.errors import ConfigError
+from metalens.core import config, store, transaction
+from metalens.core.errors import ConfigError
 from metalens.lens import Lens
 
 _STATED = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
@@ -35,11 +42,11 @@ def _plan(options: Options, path: Path) -> int:
         )
     target, wanted, design = (
         options.output,
-        config.load(path, Protocol),
+        config.load(path, BenchProtocol),
         lenses.load(options.lens),
     )
     with options.claim(target) as draft:
-        found = protocol.plan(design, wanted, slopes(design))
+        found = protocol.plan_captures(design, wanted, log_response_slopes(design))
         store.write_text(draft.path, _listed(found))
     rows = _rows(found)
     values = {"file": str(target), "frames": rows, "gain": found.gain.tolist()}
@@ -73,7 +80,7 @@ def _plan(options: Options, path: Path) -> int:
     return 0
 
 
-def _rows(found: Plan) -> list[tuple[float, float, float]]:
+def _rows(found: CapturePlan) -> list[tuple[float, float, float]]:
     """Depth, angle and exposure of the frames to take."""
     return list(
         zip(
@@ -85,7 +92,7 @@ def _rows(found: Plan) -> list[tuple[float, float, float]]:
     )
 
 
-def _listed(found: Plan) -> str:
+def _listed(found: CapturePlan) -> str:
     """The frames to take, as rows of a stage.csv but for the times, which the bench
     sets in proportion to ``relative_exposure``.
     """
@@ -99,15 +106,17 @@ def _listed(found: Plan) -> str:
 
 def _shoot(options: Options, path: Path) -> int:
     target = options.output
-    truth = config.load(path, Truth)
+    truth = config.load(path, HiddenLens)
     design = lenses.load(options.lens)
     frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
     room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
     with options.claim_folder(target, room=room) as draft, options.shared():
-        shots = bench.shoot(
+        shots = bench.simulate_frames(
             design,
             truth,
-            slopes(design, wanted=[k.name for k in truth.parameter if k.value]),
+            log_response_slopes(
+                design, wanted=[k.name for k in truth.parameter if k.value]
+            ),
         )
         _fill(draft.path, shots, truth, design)
     values = {
@@ -122,15 +131,19 @@ def _shoot(options: Options, path: Path) -> int:
     return 0
 
 
-def write(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+def write_capture_folder(
+    folder: Path, shots: SimulatedFrames, truth: HiddenLens, lens: Lens
+) -> None:
     """A capture folder as :func:`characterize.load` reads it, whole or not at all; one
     of ours is replaced.
     """
-    with transaction.folder(folder, terms=transaction.Terms(force=True)) as draft:
+    with transaction.claim_folder(
+        folder, terms=transaction.ClaimTerms(force=True)
+    ) as draft:
         _fill(draft.path, shots, truth, lens)
 
 
-def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
+def _fill(folder: Path, shots: SimulatedFrames, truth: HiddenLens, lens: Lens) -> None:
     import tifffile
 
     depths, angles = truth.stated

@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from metalens.commands import Distributed, Output
+from metalens.commands import DistributedOptions, Output
 
 WORK = "characterize.commands.capture"
 
 
 @dataclass(frozen=True)
-class Options(Distributed):
+class Options(DistributedOptions):
     """Options of ``metalens capture``: either --truth or --protocol.
 
     Attributes:

@@ -10,21 +10,21 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from characterize.bench import Truth
+from characterize.bench import HiddenLens
 from characterize.captures import capture as captures
 from characterize.commands import report
 from characterize.commands.fit_options import Options
 from characterize.inference import AsBuilt, asbuilt, fit
-from characterize.inference import Options as FitOptions
-from characterize.model import Known
+from characterize.inference import FitOptions as FitOptions
+from characterize.model import KnownValue
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
-from metalens.ground import config, reading, store, transaction
-from metalens.ground.errors import ConfigError
+from metalens.core import config, reading, store, transaction
+from metalens.core.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Metrology:
+class MetrologySettings:
     """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma),
     and of how to fit.
 
@@ -34,7 +34,7 @@ class Metrology:
     left out: chosen from the depths.
     """
 
-    known: tuple[Known, ...] = ()
+    known: tuple[KnownValue, ...] = ()
     free: tuple[str, ...] = ()
     window: int = field(default=48, metadata={"above": 0})
     scan_um: float | None = field(default=None, metadata={"above": 0})
@@ -61,12 +61,14 @@ def run(options: Options) -> int:
 def _run_lens(options: Options, design: Path, target: Path) -> int:
     lens, shots = lenses.load(design), captures.load(options.capture)
     told = (
-        config.load(options.metrology, Metrology) if options.metrology else Metrology()
+        config.load(options.metrology, MetrologySettings)
+        if options.metrology
+        else MetrologySettings()
     )
     choice = FitOptions(
         told.free, told.known, told.window, told.scan_um, insist=options.insist
     )
-    truth = config.load(options.truth, Truth) if options.truth else None
+    truth = config.load(options.truth, HiddenLens) if options.truth else None
     hidden = {k.name: k.value for k in truth.parameter} if truth else None
     about = _provenance(options, design)
     with options.claim(

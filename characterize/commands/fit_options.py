@@ -11,13 +11,13 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "characterize.commands.fit"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens fit``: either --design or --pupil.
 
     Attributes:

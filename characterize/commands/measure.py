@@ -19,15 +19,15 @@ from characterize.commands import measure_page
 from characterize.measure import frames, metrics, overlay, picture, sem
 from metalens import lens as lenses
 from metalens.cell.shapes import Circle
-from metalens.commands import Common, Output
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError, ConfigError
+from metalens.commands import CommonOptions, Output
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError, ConfigError
 from metalens.lens import DiameterMap
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens measure``: a micrograph or an edge where its pixel is
     given, else captures.
 
@@ -94,7 +94,7 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, lis
     """Measure captures into the folder: numbers, text, and no failure."""
     shots = captures.load(options.source)
     design = lenses.load(options.design) if options.design else None
-    found = frames.measure(shots, design=design, reference_e=options.reference_e)
+    found = frames.measure_frames(shots, design=design, reference_e=options.reference_e)
     rows = [_plain(row) for row in found.frames]
     values: dict[str, object] = {
         "frames": rows,
@@ -135,7 +135,7 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[
     failure.
     """
     image, pixel = (
-        _cropped(picture.read(options.source), options.crop),
+        _cropped(picture.read_picture(options.source), options.crop),
         float(options.edge_um or 0),
     )
     found = metrics.mtf_of_edge(image, pixel_um=pixel)
@@ -163,28 +163,28 @@ def _micrograph(
     """Measure a picture of pillars into the folder: numbers, text, and why its pillars
     are not measured.
     """
-    whole = picture.read(options.source)
+    whole = picture.read_picture(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = (
         _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
     )
-    found = sem.measure(
+    found = sem.measure_diameters(
         image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm)
     )
-    laid: overlay.Overlay | None = None
+    laid: overlay.MaskOverlay | None = None
     table: overlay.Table = []
     scale = 1.0
     if options.design is not None:
         design = _drawn_round(options.design)
         laid, scale = (
-            overlay.overlay(found, design),
-            overlay.scale(found, pixel, design),
+            overlay.overlay_design(found, design),
+            overlay.lattice_scale(found, pixel, design),
         )
         sure = (
             laid.clearly and abs(scale - 1) < overlay.SCALE
         )  # elsewhere, other diameters were drawn
         table = overlay.bias_table(laid) if sure else []
-        found = overlay.numbered(found, laid)
+        found = overlay.register_to_mask(found, laid)
     values = _summary(found, laid, table, pixel) | (
         {"pitch_over_design": scale} if laid is not None else {}
     )
@@ -208,7 +208,7 @@ def _micrograph(
     return values, "\n".join(lines), _unmeasured(found, pixel)
 
 
-def _unmeasured(found: sem.Diameters, pixel_nm: float) -> list[str]:
+def _unmeasured(found: sem.MeasuredDiameters, pixel_nm: float) -> list[str]:
     """Why a picture's pillars are not measured; nothing where they are."""
     if float((found.collapsed | found.oval).mean()) > sem.MOST:
         return [
@@ -244,8 +244,8 @@ def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
 
 
 def _summary(
-    found: sem.Diameters,
-    laid: overlay.Overlay | None,
+    found: sem.MeasuredDiameters,
+    laid: overlay.MaskOverlay | None,
     table: overlay.Table,
     pixel: float,
 ) -> dict[str, object]:
@@ -272,7 +272,7 @@ def _summary(
 
 
 def _pillars(
-    found: sem.Diameters, laid: overlay.Overlay | None
+    found: sem.MeasuredDiameters, laid: overlay.MaskOverlay | None
 ) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
@@ -298,8 +298,8 @@ def _pillars(
 
 
 def _words(
-    found: sem.Diameters,
-    laid: overlay.Overlay | None,
+    found: sem.MeasuredDiameters,
+    laid: overlay.MaskOverlay | None,
     table: overlay.Table,
     target: Path,
 ) -> str:
@@ -334,7 +334,7 @@ def _scale_words(scale: float, pixel_nm: float) -> list[str]:
     ]
 
 
-def _plain(row: frames.Frame) -> dict[str, object]:
+def _plain(row: frames.FrameMetrics) -> dict[str, object]:
     values: dict[str, object] = dataclasses.asdict(row)
     del values["spot"]
     spot: dict[str, object] = dataclasses.asdict(row.spot)

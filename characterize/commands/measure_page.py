@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from characterize.measure import frames, metrics, overlay, sem
-from metalens.ground import report
-from metalens.ground.arrays import Array
+from metalens.core import report
+from metalens.core.arrays import Array
 
 COLUMNS = {  # of a frame's record, and as the page has them
     "name": "frame",
@@ -27,7 +27,7 @@ CURVES = "Modulation transfer along x up to the pixel's Nyquist frequency, and l
 _NAMED = 8  # lines that a legend holds
 
 
-def frames_page(path: Path, found: frames.Quality) -> None:
+def frames_page(path: Path, found: frames.CaptureQuality) -> None:
     """Every frame with its numbers, and encircled energy over the radius."""
     columns = {
         words: [attrgetter(name)(row) for row in found.frames]
@@ -67,12 +67,12 @@ def frames_page(path: Path, found: frames.Quality) -> None:
     sections.append(
         report.Section("Put right or assumed on the way", "\n\n".join(found.notes))
     )
-    report.write(path, "Image quality of the captures", sections)
+    report.write_report(path, "Image quality of the captures", sections)
 
 
-def _curves(found: frames.Quality) -> bytes:
+def _curves(found: frames.CaptureQuality) -> bytes:
     """Modulation over frequency and encircled energy over the radius."""
-    figure, (mtf, energy) = report.canvas(1, 2)
+    figure, (mtf, energy) = report.make_figure(1, 2)
     radius = np.linspace(0, min(found.light.shape[1:]) / 2 * found.step_um, 60)
     for row, image in zip(found.frames, found.light, strict=True):
         curve = metrics.mtf_of_psf(image, step_um=found.step_um)
@@ -89,12 +89,14 @@ def _curves(found: frames.Quality) -> bytes:
     energy.set_ylabel("share of the light")
     if len(found.frames) <= _NAMED:
         energy.legend(fontsize=7)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) -> None:
+def edge_page(
+    path: Path, image: Array, found: metrics.EdgeMtf, *, pixel_um: float
+) -> None:
     """The edge and the modulation across it."""
-    figure, (picture, curve) = report.canvas(1, 2)
+    figure, (picture, curve) = report.make_figure(1, 2)
     picture.imshow(image, cmap="gray")
     picture.set_axis_off()
     curve.plot(found.frequency_per_um, found.modulation)
@@ -102,18 +104,22 @@ def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) 
     curve.set_xlabel("cycles / µm")
     curve.set_ylabel("modulation")
     caption = f"Modulation one half at {found.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
-    report.write(
+    report.write_report(
         path,
         "Slanted edge",
-        [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])],
+        [
+            report.Section(
+                "Edge", "", [report.Figure(report.figure_png(figure), caption)]
+            )
+        ],
     )
 
 
 def micrograph_page(
     path: Path,
     image: Array,
-    found: sem.Diameters,
-    laid: overlay.Overlay | None,
+    found: sem.MeasuredDiameters,
+    laid: overlay.MaskOverlay | None,
     table: overlay.Table,
     *,
     pixel_nm: float,
@@ -135,11 +141,14 @@ def micrograph_page(
                 "Bias table", "", [report.Table(head, [tuple(row) for row in table])]
             )
         )
-    report.write(path, "Diameters of the pillars", sections)
+    report.write_report(path, "Diameters of the pillars", sections)
 
 
 def _drawn(
-    image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pixel_nm: float
+    image: Array,
+    found: sem.MeasuredDiameters,
+    laid: overlay.MaskOverlay | None,
+    pixel_nm: float,
 ) -> bytes:
     from matplotlib.collections import EllipseCollection
     from matplotlib.figure import Figure
@@ -186,4 +195,4 @@ def _drawn(
         label="diameter / nm" if laid is None else "error / nm",
         shrink=0.8,
     )
-    return report.png(figure)
+    return report.figure_png(figure)

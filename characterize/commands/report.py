@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from characterize.inference import AsBuilt, invert, knowable
+from characterize.inference import AsBuilt, invert_information, knowable
 from characterize.model import PARAMETERS, PLACE
 from characterize.pupil import PupilFit
-from metalens.ground import report, store
-from metalens.ground.arrays import Array
+from metalens.core import report, store
+from metalens.core.arrays import Array
 
 BESIDE = (
     ".html",
@@ -54,7 +54,9 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
     ]
     if fit.problems:
         sections.insert(0, report.Section("Problems", "\n\n".join(fit.problems)))
-    report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
+    report.write_report(
+        path, "Pupil from a through-focus stack", sections, key_figures=keys
+    )
 
 
 def asbuilt_report(
@@ -71,7 +73,7 @@ def asbuilt_report(
     sure = float(
         np.mean(
             [
-                s < 0.5 * scale(name)
+                s < 0.5 * typical_sigma(name)
                 for name, s in zip(result.names, result.sigma, strict=True)
             ]
         )
@@ -131,7 +133,9 @@ def asbuilt_report(
     if result.problems:
         sections.insert(0, report.Section("Problems", "\n\n".join(result.problems)))
     lead = "The lens that was really made, from what the bench saw: how it differs from the design, and how surely."
-    report.write(path, "The lens as built", sections, lead=lead, key_figures=keys)
+    report.write_report(
+        path, "The lens as built", sections, lead=lead, key_figures=keys
+    )
 
 
 def _curves(
@@ -179,13 +183,13 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
         axis.plot(
             at,
-            knowable.density(_stretched(result, name, within), at),
+            knowable.profile_density(_stretched(result, name, within), at),
             color="#1f6feb",
             linewidth=1.2,
         )
         axis.plot(
             at,
-            knowable.density(within, at),
+            knowable.profile_density(within, at),
             color="#1f6feb",
             linewidth=0.6,
             linestyle=(0, (3, 2)),
@@ -209,7 +213,7 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         axis.tick_params(labelsize=6)
         for side in ("top", "right", "left"):
             axis.spines[side].set_visible(False)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _stretched(result: AsBuilt, name: str, curve: Array) -> Array:
@@ -246,7 +250,7 @@ def _parameters(result: AsBuilt) -> report.Table:
     return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
 
 
-def scale(name: str) -> float:
+def typical_sigma(name: str) -> float:
     """Typical uncertainty of a parameter."""
     return PARAMETERS[PLACE[name]].scale
 
@@ -278,9 +282,11 @@ def _intervals(result: AsBuilt) -> bytes:
         if name != "log_gain" and not name.startswith("background")
     ]
     names = [result.names[i] for i in shown]
-    unit = np.array([scale(name) for name in names])
+    unit = np.array([typical_sigma(name) for name in names])
     value = result.value[shown] / unit
-    told = np.diag(invert(result.within_covariance) - result.information)[shown]
+    told = np.diag(invert_information(result.within_covariance) - result.information)[
+        shown
+    ]
     prior = np.maximum(told, 1e-12) ** -0.5 / unit
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()
@@ -321,7 +327,7 @@ def _intervals(result: AsBuilt) -> bytes:
     )
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _correlation(result: AsBuilt) -> bytes:
@@ -334,7 +340,7 @@ def _correlation(result: AsBuilt) -> bytes:
     )
     axis.set_xticks(range(len(result.names)), result.names, rotation=90, fontsize=6)
     axis.set_yticks(range(len(result.names)), result.names, fontsize=6)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def frames_figure(
@@ -393,7 +399,7 @@ def frames_figure(
                     va="center",
                     fontsize=7,
                 )
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _maps(fit: PupilFit) -> bytes:
@@ -411,4 +417,4 @@ def _maps(fit: PupilFit) -> bytes:
         figure.colorbar(axis.imshow(values, cmap=colours), ax=axis)
         axis.set_title(title, fontsize=9)
         axis.set_axis_off()
-    return report.png(figure)
+    return report.figure_png(figure)

@@ -9,14 +9,14 @@ import numpy as np
 from characterize.captures import capture as captures
 from characterize.inference import AsBuilt
 from characterize.model import PARAMETERS, PLACE
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.report import in_words
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.report import in_words
 from metalens.psf import PsfStack
-from metalens.view import Axis, Images, Numbers, Panel, at_brightest
+from metalens.view import ImagePanel, Panel, SliderAxis, TablePanel, at_brightest
 
 
-def capture(path: Path) -> list[Panel]:
+def capture_panels(path: Path) -> list[Panel]:
     """Every frame of a capture, in counts, and what was written down with it."""
     read = captures.load(path)
     frames = np.asarray(read.frames, float)
@@ -41,8 +41,10 @@ def capture(path: Path) -> list[Panel]:
     about += [(in_words(key), str(value)) for key, value in sorted(read.about.items())]
     about += [("put right", text) for text in read.corrections]
     return [
-        Images("Frames", frames, [Axis("frame", list(read.names))], step, "counts"),
-        Numbers(
+        ImagePanel(
+            "Frames", frames, [SliderAxis("frame", list(read.names))], step, "counts"
+        ),
+        TablePanel(
             "Stage",
             (
                 "frame",
@@ -53,24 +55,24 @@ def capture(path: Path) -> list[Panel]:
             ),
             rows,
         ),
-        Numbers("As captured", ("name", "value"), about),
+        TablePanel("As captured", ("name", "value"), about),
     ]
 
 
-def asbuilt(path: Path) -> list[Panel]:
+def asbuilt_panels(path: Path) -> list[Panel]:
     """The lens as built: its parameters with intervals, frames beside fit and residual,
     and its PSFs.
     """
     made = AsBuilt.load(path)
     axis = [
-        Axis(
+        SliderAxis(
             "frame",
             [_said(d, a) for d, a in zip(made.depth_um, made.angle_rad, strict=True)],
         )
     ]
     peak = float(made.measured.max())
     panels: list[Panel] = [
-        Numbers(
+        TablePanel(
             "Parameters",
             ("parameter", "value", "95 % from", "to", "meaning"),
             [
@@ -78,14 +80,14 @@ def asbuilt(path: Path) -> list[Panel]:
                 for name, v in zip(made.names, made.value, strict=True)
             ],
         ),
-        Images(
+        ImagePanel(
             "Frames as captured and as fitted",
             np.stack([made.measured, made.predicted]) / peak,
-            [Axis("shown", ["captured", "fitted"], blink=True), *axis],
+            [SliderAxis("shown", ["captured", "fitted"], blink=True), *axis],
             made.pixel_um,
             "of the brightest pixel",
         ),
-        Images(
+        ImagePanel(
             "Captured less fitted",
             made.residual_sigma,
             axis,
@@ -93,12 +95,12 @@ def asbuilt(path: Path) -> list[Panel]:
             "sigma",
             signed=True,
         ),
-        Numbers("What is known", ("", "in words"), _words(made)),
+        TablePanel("What is known", ("", "in words"), _words(made)),
     ]
     return [*panels, _psf(made.psf())]
 
 
-def pupil(path: Path) -> list[Panel]:
+def pupil_panels(path: Path) -> list[Panel]:
     """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the
     numbers.
     """
@@ -109,12 +111,12 @@ def pupil(path: Path) -> list[Panel]:
         for name in held["names"].tolist()
     ]
     rows = list(zip(names, held["value"].tolist(), held["sigma"].tolist(), strict=True))
-    planes = [Axis("plane", held["position_um"].tolist(), "µm")]
+    planes = [SliderAxis("plane", held["position_um"].tolist(), "µm")]
     both = np.stack([held["measured"], held["predicted"]])
     step = 2 / held["phase_rad"].shape[-1]
     said = [(in_words(key), str(about[key])) for key in sorted(about) if key != "spec"]
     return [
-        Images(
+        ImagePanel(
             "Phase in the pupil",
             np.nan_to_num(held["phase_rad"]),
             [],
@@ -123,7 +125,7 @@ def pupil(path: Path) -> list[Panel]:
             signed=True,
             across="radius",
         ),
-        Images(
+        ImagePanel(
             "Amplitude in the pupil",
             np.nan_to_num(held["amplitude"]),
             [],
@@ -131,15 +133,15 @@ def pupil(path: Path) -> list[Panel]:
             "of its mean",
             across="radius",
         ),
-        Images(
+        ImagePanel(
             "Stack as measured and as fitted",
             both / both.max(),
-            [Axis("shown", ["measured", "fitted"], blink=True), *planes],
+            [SliderAxis("shown", ["measured", "fitted"], blink=True), *planes],
             1.0,
             "of the brightest pixel",
             across="pixels",
         ),
-        Images(
+        ImagePanel(
             "Measured less fitted",
             held["residual_sigma"],
             planes,
@@ -148,22 +150,22 @@ def pupil(path: Path) -> list[Panel]:
             signed=True,
             across="pixels",
         ),
-        Numbers("Parameters", ("parameter", "value", "standard error"), rows),
-        Numbers("How good it is", ("", "value"), said),
+        TablePanel("Parameters", ("parameter", "value", "standard error"), rows),
+        TablePanel("How good it is", ("", "value"), said),
     ]
 
 
 def _psf(stack: PsfStack) -> Panel:
     values = np.asarray(stack.intensity)
     axes = [
-        Axis("field angle", [_said(None, pair) for pair in stack.angles_rad]),
-        Axis("depth", (1e-3 * stack.depths_um).tolist(), "mm"),
+        SliderAxis("field angle", [_said(None, pair) for pair in stack.angles_rad]),
+        SliderAxis("depth", (1e-3 * stack.depths_um).tolist(), "mm"),
     ]
     values = values.reshape(
         len(axes[0].values), len(axes[1].values), *values.shape[-2:]
     )
     peak = float(values.max())
-    return Images(
+    return ImagePanel(
         "PSF as built",
         values / peak,
         at_brightest(axes, values),

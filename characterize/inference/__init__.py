@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from characterize.inference import asbuilt as asbuilt
@@ -11,30 +11,32 @@ if TYPE_CHECKING:
     from characterize.inference import missing as missing
     from characterize.inference import posterior as posterior
     from characterize.inference.asbuilt import AsBuilt as AsBuilt
-    from characterize.inference.estimate import Options as Options
+    from characterize.inference.estimate import FitOptions as FitOptions
     from characterize.inference.estimate import fit as fit
-    from characterize.inference.leastsquares import Data as Data
-    from characterize.inference.leastsquares import Prior as Prior
-    from characterize.inference.leastsquares import Settings as Settings
-    from characterize.inference.leastsquares import Solution as Solution
-    from characterize.inference.leastsquares import invert as invert
-    from characterize.inference.missing import Unstated as Unstated
-    from characterize.inference.search import Task as Task
+    from characterize.inference.leastsquares import FitImages as FitImages
+    from characterize.inference.leastsquares import FitSolution as FitSolution
+    from characterize.inference.leastsquares import GaussianPrior as GaussianPrior
+    from characterize.inference.leastsquares import SolverSettings as SolverSettings
+    from characterize.inference.leastsquares import (
+        invert_information as invert_information,
+    )
+    from characterize.inference.missing import UnmodelledShifts as UnmodelledShifts
+    from characterize.inference.search import SearchTask as SearchTask
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "AsBuilt": "asbuilt",
-        "Data": "leastsquares",
-        "Options": "estimate",
-        "Prior": "leastsquares",
-        "Settings": "leastsquares",
-        "Solution": "leastsquares",
-        "Task": "search",
-        "Unstated": "missing",
+        "FitImages": "leastsquares",
+        "FitOptions": "estimate",
+        "GaussianPrior": "leastsquares",
+        "SolverSettings": "leastsquares",
+        "FitSolution": "leastsquares",
+        "SearchTask": "search",
+        "UnmodelledShifts": "missing",
         "asbuilt": "",
         "fit": "estimate",
-        "invert": "leastsquares",
+        "invert_information": "leastsquares",
         "knowable": "",
         "leastsquares": "",
         "missing": "",

@@ -12,17 +12,17 @@ from scipy import optimize
 from characterize.captures import (
     MIRRORED,
     TURNS,
-    Spectra,
+    FrameSpectra,
     above_rim,
-    between,
-    likeness,
-    shifted,
-    turn,
+    normalized_cross_correlation,
+    orient_frames,
+    relative_orientation,
+    shift_frames,
 )
-from characterize.inference.leastsquares import Data
-from characterize.model import PLACE, ForwardModel, Setting, vector
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import FitImages
+from characterize.model import PLACE, ForwardModel, FrameSetting, parameter_vector
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 _EVERY = range(8)  # orientation
 Way = tuple[bool, int]  # reordered, orientation
@@ -44,7 +44,7 @@ _DISTANCES = 17
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Arrangement:
+class FrameArrangement:
     """What the nominal lens says about the frames.
 
     stage_zero_um, distance_um: best of the scan; shift_px: (y, x) mean displacement of
@@ -72,7 +72,7 @@ class Arrangement:
     orientation: int
     clearly: bool
     alike: tuple[int, ...]
-    others: tuple["Arrangement", ...] = ()
+    others: tuple["FrameArrangement", ...] = ()
 
     @property
     def words(self) -> str:
@@ -80,7 +80,7 @@ class Arrangement:
         return (TURNS + MIRRORED)[self.orientation]
 
 
-def few_frames(setting: Setting) -> Array:
+def few_frames(setting: FrameSetting) -> Array:
     """Frames that tell the starts apart: the ends and the middle of the depths at every
     angle.
     """
@@ -94,14 +94,14 @@ def few_frames(setting: Setting) -> Array:
     return np.unique(chosen)
 
 
-def arrange(
+def find_arrangement(
     model: ForwardModel,
-    data: Data,
+    data: FitImages,
     *,
     scan_um: float,
     start: Array | None = None,
     reach_um: float = 0.0,
-) -> Arrangement:
+) -> FrameArrangement:
     """Scan the stage zero over +-``scan_um`` and compare every frame with every depth,
     in all eight orientations.
 
@@ -113,7 +113,7 @@ def arrange(
     taken.
     """
     frames = _Frames.of(model, data)
-    start = vector() if start is None else start.copy()
+    start = parameter_vector() if start is None else start.copy()
     nearest = float(model.setting.depth_um.min())
     zeros = (
         np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS)
@@ -154,7 +154,7 @@ class _Frames:
     back: Array
 
     @classmethod
-    def of(cls, model: ForwardModel, data: Data) -> "_Frames":
+    def of(cls, model: ForwardModel, data: FitImages) -> "_Frames":
         light = above_rim(np.where(data.usable, data.electrons, np.nan))
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
         return cls(
@@ -194,9 +194,11 @@ class _Frames:
         places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
             part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
         )
-        turned = [Spectra.of(turn(self.light, k), self.noise) for k in _EVERY]
+        turned = [
+            FrameSpectra.of(orient_frames(self.light, k), self.noise) for k in _EVERY
+        ]
         scores = np.nan_to_num(
-            threads.each(lambda x: self._scores(x, turned), places), nan=-math.inf
+            threads.run_each(lambda x: self._scores(x, turned), places), nan=-math.inf
         )
         stated, back = scores.max(0)
         orientation, back_first = _way(stated, back)
@@ -205,15 +207,15 @@ class _Frames:
             scores[place, int(back_first), orientation]
         ) - _TWIN * back_first
 
-    def _scores(self, x: Array, turned: list[Spectra]) -> Array:
+    def _scores(self, x: Array, turned: list[FrameSpectra]) -> Array:
         """(2, orientations) likeness at some parameters: of frames as stated, and end
         to end.
         """
         upright, aside = _expected(self.rough, x, self.clipped)
-        first = Spectra.of(upright, 0 * self.noise)
+        first = FrameSpectra.of(upright, 0 * self.noise)
         expected = (
             first,
-            first if aside is upright else Spectra.of(aside, 0 * self.noise),
+            first if aside is upright else FrameSpectra.of(aside, 0 * self.noise),
         )
         orders = np.arange(len(self.light)), self.back
         return np.array(
@@ -235,7 +237,7 @@ def _way(stated: Array, back: Array) -> tuple[int, bool]:
     return (int(back.argmax()) if back.max() > back[0] + _TWIN else 0), True
 
 
-def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
+def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     """Order and orientation of the frames, judged against the images at some
     parameters.
     """
@@ -251,7 +253,7 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
         reordered, clearly = _plainest(light, expected, noise, order, orientation)
     chosen = reordered, orientation if clearly else 0
     apart = {k: _apart(k, expected, light, noise) for k in _EVERY}
-    found = Arrangement(
+    found = FrameArrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
         shift_px=shifts[chosen],
@@ -266,7 +268,8 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
     told = [
         way
         for way in alike
-        if way[0] == reordered and apart[between(chosen[1], way[1])] >= _TOLD
+        if way[0] == reordered
+        and apart[relative_orientation(chosen[1], way[1])] >= _TOLD
     ]
     twin = sorted(
         (way for way in alike if way[0] != reordered), key=lambda way: -alike[way]
@@ -295,7 +298,9 @@ def _ways(
     for way in itertools.product(orders, _EVERY):
         index = orders[way[0]]
         found = _compare(
-            turn(frames.light[index], way[1]), expected[way[1] % 2], frames.noise[index]
+            orient_frames(frames.light[index], way[1]),
+            expected[way[1] % 2],
+            frames.noise[index],
         )
         alike[way] = float(np.mean([score for score, _ in found]))
         y, x = np.median([shift for _, shift in found], axis=0).tolist()
@@ -307,9 +312,9 @@ def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
     """Chi-square between the nominal images, as bright as the light, and these turned
     about the chief ray.
     """
-    unlike = ((turn(expected[0], k) - expected[k % 2]) ** 2).sum((1, 2)) * _brightness(
-        light, expected[0], noise
-    ) ** 2
+    unlike = ((orient_frames(expected[0], k) - expected[k % 2]) ** 2).sum(
+        (1, 2)
+    ) * _brightness(light, expected[0], noise) ** 2
     return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
@@ -346,7 +351,8 @@ def _compare(
     light: Array, expected: Array, noise: Array
 ) -> list[tuple[float, tuple[float, float]]]:
     return [
-        likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)
+        normalized_cross_correlation(a, b, float(s))
+        for a, b, s in zip(light, expected, noise, strict=True)
     ]
 
 
@@ -392,8 +398,8 @@ def _brightness(light: Array, expected: Array, noise: Array) -> float:
 
 def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift that makes them most alike."""
-    _, (dy, dx) = likeness(a, b, 0.0)
-    return float(((a - shifted(b, (int(dy), int(dx)))) ** 2).sum())
+    _, (dy, dx) = normalized_cross_correlation(a, b, 0.0)
+    return float(((a - shift_frames(b, (int(dy), int(dx)))) ** 2).sum())
 
 
 def _plainest(
@@ -402,7 +408,7 @@ def _plainest(
     """(reordered, turned): the least that explains the frames, of reordering, turning
     and both.
     """
-    turned = turn(light, orientation)
+    turned = orient_frames(light, orientation)
     ways = {
         (True, False): light[order],
         (False, True): turned,
@@ -420,7 +426,10 @@ def _plainest(
 def _orientation(light: Array, expected: Both, noise: Array) -> tuple[int, bool]:
     return _plainest_turn(
         np.array(
-            [_mean_likeness(turn(light, k), expected[k % 2], noise) for k in _EVERY]
+            [
+                _mean_likeness(orient_frames(light, k), expected[k % 2], noise)
+                for k in _EVERY
+            ]
         )
     )
 
@@ -445,13 +454,17 @@ def _bare(x: Array) -> Array:
     return out
 
 
-def rearranged(values: Array, arrangement: Arrangement) -> Array:
+def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
     """Frames turned and put in order as the arrangement says, where it is clear."""
-    out = turn(values, arrangement.orientation) if arrangement.clearly else values
+    out = (
+        orient_frames(values, arrangement.orientation)
+        if arrangement.clearly
+        else values
+    )
     return np.asarray(out[arrangement.order] if arrangement.reordered else out)
 
 
-def laid_words(found: Arrangement) -> list[str]:
+def laid_words(found: FrameArrangement) -> list[str]:
     """What to say of how the frames lie: turned or reordered, and what of that cannot
     be seen.
     """

@@ -30,20 +30,20 @@ import numpy as np
 
 from characterize.model import (
     PLACE,
-    Setting,
+    FrameSetting,
     made,
-    oversampling,
+    parameter_vector,
+    required_oversampling,
     true_depth,
-    usual,
-    vector,
+    usual_parameters,
 )
 from metalens import lens as lenses
 from metalens import psf as psfs
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
 from metalens.fabrication import PairSensitivities, Sensitivity, Solved
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.reading import reader
-from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
 
 
@@ -199,7 +199,7 @@ class AsBuilt:
         ones, the best without it.
         """
         fitted = self.value if value is None else value
-        return vector(
+        return parameter_vector(
             self.held
             | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True))
         )
@@ -232,7 +232,9 @@ class AsBuilt:
             return self.samples(count, seed)
         rng, one = np.random.default_rng(seed), self.within
         own = _drawn(rng, count, self.value, one.covariance, one.draws)
-        return _bounded(self.names, self.design, own + spread(rng, count, self.bench))
+        return _bounded(
+            self.names, self.design, own + gaussian_draws(rng, count, self.bench)
+        )
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of
@@ -249,7 +251,7 @@ class AsBuilt:
         """(y, x) complex transmission of every as-built pillar at normal incidence,
         wave-front errors included.
         """
-        return made.pillars(
+        return made.as_built_transmission(
             self.design,
             self.response,
             self.parameters(value),
@@ -263,7 +265,7 @@ class AsBuilt:
         Computed anew by each call: seconds for a lens of a millimetre.
         """
         side = max(self.measured.shape[1:])
-        setting = Setting(
+        setting = FrameSetting(
             self.depth_um,
             self.angle_rad,
             np.ones(len(self.depth_um)),
@@ -279,7 +281,7 @@ class AsBuilt:
         angles = tuple(
             (float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0)
         )
-        samples = side * oversampling(self.design, self.pixel_um)
+        samples = side * required_oversampling(self.design, self.pixel_um)
         view = psfs.View(tuple(depths.tolist()), angles, side * self.pixel_um, samples)
         return self.psf_stack(view, tolerance=1e-3)
 
@@ -350,19 +352,19 @@ def _drawn(
     ones where there are none.
     """
     if not len(draws):
-        return np.asarray(value + spread(rng, count, covariance))
+        return np.asarray(value + gaussian_draws(rng, count, covariance))
     order = [rng.permutation(len(draws)) for _ in range(-(-count // len(draws)))]
     return np.asarray(draws[np.concatenate(order)[:count]])
 
 
 def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
-    rows = usual(names, lens)
+    rows = usual_parameters(names, lens)
     return np.asarray(
         np.clip(draws, [row.low for row in rows], [row.high for row in rows])
     )
 
 
-def spread(rng: np.random.Generator, count: int, covariance: Array) -> Array:
+def gaussian_draws(rng: np.random.Generator, count: int, covariance: Array) -> Array:
     """(count, p) Gaussian draws about 0."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(
@@ -422,7 +424,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
         }
         arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
-    design, about = lenses.parts(result.design, group="design/")
+    design, about = lenses.lens_to_parts(result.design, group="design/")
     arrays |= design | {
         "design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)
     }
@@ -439,7 +441,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
     store.save(path, "asbuilt", arrays, attributes=about, provenance=result.provenance)
 
 
-@reader
+@typed_reader
 def load(path: str | Path) -> AsBuilt:
     """Read an as-built file.
 
@@ -448,7 +450,7 @@ def load(path: str | Path) -> AsBuilt:
     """
     stored = store.load(path, "asbuilt")
     a, about = stored.arrays, stored.attributes
-    design = lenses.from_parts(a, about, where=str(path), group="design/")
+    design = lenses.lens_from_parts(a, about, where=str(path), group="design/")
     fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
     fields |= {
         name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS

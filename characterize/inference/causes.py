@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from characterize.inference.search import Task
+from characterize.inference.search import SearchTask
 from characterize.model import (
     LIGHT,
     MODES,
     PARAMETERS,
     PLACE,
     ForwardModel,
-    background,
-    basis,
+    background_planes,
     prior_rad,
-    unstated,
+    thin_plate_basis,
+    type_b_sigma,
 )
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import CDError, ResponseError, WavefrontError, maps, named
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens, Stop
 
 _STITCH_UM = 0.05
@@ -50,7 +50,7 @@ _OF_MASK = {*named(CDError), *named(ResponseError)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Change:
+class ImageChange:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
     amount, told: of the first, in words with a place for the number; empty where no
@@ -76,7 +76,9 @@ class Change:
     of_mask: bool = False
 
 
-def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+def systematic_changes(
+    task: SearchTask, x: Array, slopes: dict[str, Array]
+) -> Iterator[ImageChange]:
     """Every cause that is not among the fitted parameters; ``slopes``: of these.
 
     From differences of images that leave ``_ENOUGH`` of a field out: what causes are
@@ -93,16 +95,16 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
         words = "a side wall that leans about half height"
         # resonances are left out of it
-        yield Change(
+        yield ImageChange(
             words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True
         )
-    light = image - background(x, task.model.setting)
-    yield Change("vibration or blur along one direction", _along_one(light))
-    yield Change(
+    light = image - background_planes(x, task.model.setting)
+    yield ImageChange("vibration or blur along one direction", _along_one(light))
+    yield ImageChange(
         "pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)",
         _of_mosaic(light),
     )
-    yield Change(
+    yield ImageChange(
         "counts that are not in proportion to the light (a gamma)", _of_gamma(light)
     )
     if len(image) > 2:
@@ -115,7 +117,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
         sizes = np.array([_size(task, name) for name in held]) / _LIGHT_STEP
         frees = tuple(name for name in held if not _exactly(task, name))
-        yield Change(
+        yield ImageChange(
             "uneven illumination",
             uneven,
             _LIGHT_STEP,
@@ -127,7 +129,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         yield from _of_phase(task, x, image, slopes)
 
 
-def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
+def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
     """Parameters of the model that are held."""
     for row in (row for row in PARAMETERS if row.effect):
         name, amount = row.name, row.probe
@@ -151,7 +153,7 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
             words = row.effect.format(before[PLACE["glass_um"]])
             needs = ("glass_um",) if base else ()
             frees = () if _exactly(task, name) else (*needs, name)
-            yield Change(
+            yield ImageChange(
                 words,
                 change,
                 amount,
@@ -162,19 +164,21 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
             )
 
 
-def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[ImageChange]:
     """What changes from frame to frame."""
-    yield Change(LAMP, _each(light))
+    yield ImageChange(LAMP, _each(light))
     sideways = [_each(np.gradient(light, axis=a)) for a in (1, 2)]
-    yield Change("shifts from frame to frame", np.concatenate(sideways))
-    yield Change("vibration or blur in single frames", _each(_curvature(light)))
-    yield Change("a stage error in single frames", _each(slopes["stage_zero_um"]))
+    yield ImageChange("shifts from frame to frame", np.concatenate(sideways))
+    yield ImageChange("vibration or blur in single frames", _each(_curvature(light)))
+    yield ImageChange("a stage error in single frames", _each(slopes["stage_zero_um"]))
     if "wavelength_nm" in slopes:
         ramp = np.linspace(-1, 1, len(light))[:, None, None]
-        yield Change("a wavelength that drifts", (slopes["wavelength_nm"] * ramp)[None])
+        yield ImageChange(
+            "a wavelength that drifts", (slopes["wavelength_nm"] * ramp)[None]
+        )
 
 
-def _of_camera(task: Task, x: Array, light: Array) -> Iterator[Change]:
+def _of_camera(task: SearchTask, x: Array, light: Array) -> Iterator[ImageChange]:
     """Pixels that lie elsewhere: along turned axes, or farther apart along y.
 
     Pixels that are higher too blur by a share of their own width more, which is left
@@ -185,17 +189,17 @@ def _of_camera(task: Task, x: Array, light: Array) -> Iterator[Change]:
     turned, tall = (frames - upright for frames in moved)
     if np.abs(turned).max() > _ROUND * light.max():
         sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
-        yield Change(
+        yield ImageChange(
             "a camera that is turned",
             turned[None],
             _CAMERA_DEG,
             "{:.3g} deg against the lens",
             sigma,
         )
-    yield Change("pixels that are not as high as wide", tall[None])
+    yield ImageChange("pixels that are not as high as wide", tall[None])
 
 
-def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
+def _of_windows(task: SearchTask, slopes: dict[str, Array]) -> Iterator[ImageChange]:
     """Windows of one field angle moved along x and along y, at every angle but the
     first: decentre moves them all.
     """
@@ -211,7 +215,7 @@ def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
         for k, index in enumerate(aside):
             moved[k, :, index] = np.stack(sideways, 1)[index]
         told = "{:.3g} px at one of the angles"
-        yield Change(
+        yield ImageChange(
             WINDOWS,
             moved.reshape(-1, *sideways[0].shape),
             1.0,
@@ -220,7 +224,7 @@ def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
         )
 
 
-def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
+def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
     """An aperture stop beside its place: the part of the lens that the light meets
     moves, as by a lean of the lens.
     """
@@ -229,12 +233,12 @@ def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
         return
     for along in (0, 1):
         centre = np.add(stop.centre_um, _STOP_UM * np.eye(2)[along])
-        moved = behind(
+        moved = model_behind_stop(
             model,
             dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1]))),
         ).images(x)[0]
         told, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
-        yield Change(
+        yield ImageChange(
             f"an aperture stop off along {'xy'[along]}",
             (moved - image)[None],
             _STOP_UM,
@@ -243,7 +247,7 @@ def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
         )
 
 
-def behind(model: ForwardModel, stop: Stop) -> ForwardModel:
+def model_behind_stop(model: ForwardModel, stop: Stop) -> ForwardModel:
     """The model of the same lens behind another stop."""
     part = copy.copy(model)
     part.lens = dataclasses.replace(
@@ -256,8 +260,8 @@ def behind(model: ForwardModel, stop: Stop) -> ForwardModel:
 
 
 def _of_phase(
-    task: Task, x: Array, image: Array, slopes: dict[str, Array]
-) -> Iterator[Change]:
+    task: SearchTask, x: Array, image: Array, slopes: dict[str, Array]
+) -> Iterator[ImageChange]:
     """Phases that no parameter describes: half of the mask off, smooth ones, write
     fields.
     """
@@ -266,20 +270,22 @@ def _of_phase(
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
         told = "{:.3g} nm of the right half"
-        yield Change(
+        yield ImageChange(
             f"a write field off along {name}", moved[None], _STITCH_UM * 1e3, told
         )
     names = [f"residual_{k}" for k in range(MODES + 3)]
     bent = np.asarray(
-        model.with_residual(np.zeros(MODES + 3), smooth).images(x, names)[1]
+        model.with_residual(np.zeros(MODES + 3), smooth_phase_changes).images(x, names)[
+            1
+        ]
     )
     sized = bent[:MODES] * prior_rad()[:, None, None, None]
-    yield Change("a smooth phase that no parameter describes", sized)
+    yield ImageChange("a smooth phase that no parameter describes", sized)
     known = [slopes.get(name, np.zeros_like(image)) for name in named(WavefrontError)]
     every = np.concatenate([bent, np.stack(known)])
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
-    yield Change(
+    yield ImageChange(
         "write fields out of place",
         fields,
         sigma=sigma,
@@ -289,14 +295,14 @@ def _of_phase(
     )
 
 
-def _exactly(task: Task, name: str) -> bool:
+def _exactly(task: SearchTask, name: str) -> bool:
     """Whether a parameter is stated without an error: it stays as stated, whatever the
     residuals lean to.
     """
     return name in task.known and task.known[name].sigma == 0
 
 
-def _size(task: Task, name: str) -> float:
+def _size(task: SearchTask, name: str) -> float:
     """Standard deviation of a cause that is reckoned with: as it is stated, 0 where it
     is held as stated.
     """
@@ -309,7 +315,7 @@ def _size(task: Task, name: str) -> float:
             if name == "sidewall_deg"
             else known.sigma
         )
-    return unstated(name, task.model.lens)
+    return type_b_sigma(name, task.model.lens)
 
 
 def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
@@ -340,7 +346,7 @@ def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
 
 
 def write_fields(lens: Lens) -> Array:
-    """(fields, modes and known phases) of :func:`smooth` and the wave-front parameters
+    """(fields, modes and known phases) of :func:`smooth_phase_changes` and the wave-front parameters
     for 1 um along x, then y.
 
     Four fields across the lens each way. What is no smooth phase is left out: it
@@ -349,7 +355,11 @@ def write_fields(lens: Lens) -> Array:
     t = np.linspace(-1, 1, _GRID)
     u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 1] for part in np.meshgrid(t, t))
     shapes = np.concatenate(
-        [smooth(u, v, MODES + 3), maps(WavefrontError, u, v), np.ones((1, len(u)))]
+        [
+            smooth_phase_changes(u, v, MODES + 3),
+            maps(WavefrontError, u, v),
+            np.ones((1, len(u))),
+        ]
     )
     field = (
         np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)
@@ -364,9 +374,11 @@ def write_fields(lens: Lens) -> Array:
     )
 
 
-def smooth(u: Array, v: Array, count: int) -> Array:
+def smooth_phase_changes(u: Array, v: Array, count: int) -> Array:
     """Smooth phases that no parameter describes, then leans and defocus."""
-    return np.concatenate([basis(u, v, MODES), np.stack([u, v, u * u + v * v])])[:count]
+    return np.concatenate(
+        [thin_plate_basis(u, v, MODES), np.stack([u, v, u * u + v * v])]
+    )[:count]
 
 
 def _each(change: Array) -> Array:
@@ -419,7 +431,7 @@ def seen_at(model: ForwardModel, x: Array, places: Sequence[Array]) -> Array:
             middle, to where it lies.
     """
     s, dense = model.setting, _sampled(model, _DENSE)
-    close = dense.images(x)[0] - background(x, dense.setting)
+    close = dense.images(x)[0] - background_planes(x, dense.setting)
     pixels = np.stack(
         np.meshgrid(
             *(np.arange(n) - (n - 1) / 2 for n in (s.rows, s.columns)), indexing="ij"

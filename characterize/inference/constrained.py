@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import nlopt
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _KNOWN, _PLAIN = (
     1e-14,
@@ -23,7 +23,7 @@ _RELEASES = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ball:
+class BallConstraint:
     """Limit of the root sum of squares of some parameters: ``index`` of them,
     ``radius`` in their unit.
     """
@@ -45,7 +45,9 @@ class Ball:
         return (math.sqrt(along**2 + long * room) - along) / long
 
 
-def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
+def bounded_quadratic_step(
+    curvature: Array, gradient: Array, low: Array, high: Array
+) -> Array:
     """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those
     that stop it.
 
@@ -172,7 +174,7 @@ class _Bounded:
             self._free[first] = False
 
 
-class Led:
+class ProfiledQuadratic:
     """The quadratic sᵀCs + 2 gᵀs, one of s led and the others at their least between
     bounds (p,).
     """
@@ -210,7 +212,9 @@ class Led:
         if ((step < self._low) | (step > self._high))[rest].any():
             pull = self._gradient + self.curvature[:, i] * step[i]
             inner = self.curvature[np.ix_(rest, rest)]
-            step[rest] = between(inner, pull[rest], self._low[rest], self._high[rest])
+            step[rest] = bounded_quadratic_step(
+                inner, pull[rest], self._low[rest], self._high[rest]
+            )
         return step
 
     def way(self, sign: int, room: float, step: Array, held: Array) -> float:
@@ -230,14 +234,14 @@ class Led:
         return (sign * root - slope) / max(bend, 1e-300)
 
 
-def step(
+def constrained_step(
     curvature: Array,
     gradient: Array,
     x: Array,
     *,
     low: Array,
     high: Array,
-    ball: Ball | None = None,
+    ball: BallConstraint | None = None,
     tolerance: float = 1e-3,
 ) -> Array:
     """The s with least sᵀCs / 2 + gᵀs for which x + s lies between ``low`` and ``high``
@@ -277,7 +281,9 @@ def step(
     return np.asarray(np.clip(x + best / size, low, high) - x)
 
 
-def _limit(ball: Ball, x: Array, size: Array) -> Callable[[Array, Array], float]:
+def _limit(
+    ball: BallConstraint, x: Array, size: Array
+) -> Callable[[Array, Array], float]:
     def excess(s: Array, out: Array) -> float:
         inside = (x + s / size)[ball.index]
         if out.size:

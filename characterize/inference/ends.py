@@ -23,12 +23,18 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import constrained
-from characterize.inference.leastsquares import Prior, Solution
-from characterize.inference.posterior import PARABOLIC, REACH, Spot, Valley, secant
-from characterize.inference.search import Task
-from characterize.inference.walk import Walk
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import FitSolution, GaussianPrior
+from characterize.inference.posterior import (
+    PARABOLIC,
+    REACH,
+    LocalMode,
+    ResidualPoint,
+    broyden_update,
+)
+from characterize.inference.search import SearchTask
+from characterize.inference.walk import ProfileScan
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 # sigma of a last step, which is not tried: slopes that hold are right to a tenth of it
 _CLOSE = 0.25
@@ -66,7 +72,7 @@ Wanted = tuple[int, int, Begin | None]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Profile:
+class ProfileInterval:
     """One parameter: 95 % interval, and the rise of -2 ln L at ``value`` (points,) with
     the rest fitted.
 
@@ -83,7 +89,7 @@ class Profile:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class End:
+class ConfidenceLimit:
     """Of a profile.
 
     place: of the parameter. seen: (value, rise) of the profile on the way. met: (places
@@ -101,7 +107,9 @@ class End:
     done: bool = True
 
 
-def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
+def join_limits(
+    sides: list[ConfidenceLimit], mode: float, sigma: float, goal: float
+) -> ProfileInterval:
     """Of its two ends; ``sigma``: of the parabola at the mode."""
     low, high = (one.place for one in sides)
     points = [(mode, 0.0), *sides[0].seen, *sides[1].seen]
@@ -110,24 +118,24 @@ def joined(sides: list[End], mode: float, sigma: float, goal: float) -> Profile:
             (mode + s * sigma, s * s) for s in (-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5)
         ]
     value, rise = np.array(sorted(points)).T
-    return Profile(
+    return ProfileInterval(
         low,
         high,
         value,
         rise,
-        plain(low, high, mode, goal * sigma),
+        is_parabolic(low, high, mode, goal * sigma),
         (sides[0].done, sides[1].done),
     )
 
 
-def plain(low: float, high: float, middle: float, reach: float) -> bool:
+def is_parabolic(low: float, high: float, middle: float, reach: float) -> bool:
     """Whether an interval is nearly that of the parabola."""
     ratio = np.array([high - middle, middle - low]) / reach
     return bool(((ratio > PARABOLIC[0]) & (ratio < PARABOLIC[1])).all())
 
 
-def end(
-    valley: Valley,
+def find_limit(
+    valley: LocalMode,
     i: int,
     sign: int,
     goal: float,
@@ -137,7 +145,7 @@ def end(
     beyond: float = -math.inf,
     promised: float = math.inf,
     turns: int = _MOST_TURNS,
-) -> End:
+) -> ConfidenceLimit:
     """The farthest to one side where the misfit has risen by no more than ``goal``
     squared.
 
@@ -153,7 +161,7 @@ def end(
         a bent valley of hardly any slope, it is found. turns: at most.
     """
     here = (
-        Spot(valley.mode, valley.bottom, valley.slopes)
+        ResidualPoint(valley.mode, valley.bottom, valley.slopes)
         if begin is None
         else _there(valley, begin)
     )
@@ -184,14 +192,14 @@ def end(
             return way.ended(way.sure)
         if again:  # with slopes that hold here
             here, missed = (
-                Spot(here.x, here.rest, valley.slopes_at(here.x, here.rest)),
+                ResidualPoint(here.x, here.rest, valley.slopes_at(here.x, here.rest)),
                 0.0,
             )
             continue
         there, off = _moved(valley, here, step)
         way.steps, rise = way.steps + 1, way.saw(there)
         if rise < -_BELOW:
-            return End(
+            return ConfidenceLimit(
                 float(there.x[i]),
                 [(float(there.x[i]), 0.0)],
                 way.met,
@@ -221,11 +229,11 @@ class _Way:
 
     def __init__(
         self,
-        valley: Valley,
+        valley: LocalMode,
         i: int,
         sign: int,
         wanted: tuple[float, float],
-        begun: Spot | None,
+        begun: ResidualPoint | None,
     ) -> None:
         self._valley, self._i, self._sign, self._level, self._promised = (
             valley,
@@ -244,7 +252,7 @@ class _Way:
         if begun is not None:
             self.saw(begun)
 
-    def saw(self, there: Spot) -> float:
+    def saw(self, there: ResidualPoint) -> float:
         """Take note of a place; its rise."""
         middle, rise = float(self._valley.mode[self._i]), there.misfit - self.lowest
         if rise < self._level:
@@ -273,7 +281,7 @@ class _Way:
         way = self._promised - self._sign * float(self._valley.mode[self._i])
         return self._idle >= _IDLE and self._far > self._promised - _SHORT_OF * way
 
-    def ended(self, place: float | None) -> End:
+    def ended(self, place: float | None) -> ConfidenceLimit:
         """At a place within the bounds; without one, at the farthest inside that was
         met.
         """
@@ -281,7 +289,7 @@ class _Way:
         places = [float(self._valley.mode[i]), *(float(x[i]) for x, _ in self.met)]
         at = max(places, key=lambda x: self._sign * x) if place is None else place
         at = float(np.clip(at, prior.low[i], prior.high[i]))
-        return End(
+        return ConfidenceLimit(
             at,
             list(self.seen.items())[-3:],
             self.met,
@@ -303,28 +311,30 @@ def _at_most(place: float, way: float) -> float:
     return place + max((1 - _UNSURE) * way, (1 + _UNSURE) * way)
 
 
-def _moved(valley: Valley, here: Spot, step: Array) -> tuple[Spot, float]:
+def _moved(
+    valley: LocalMode, here: ResidualPoint, step: Array
+) -> tuple[ResidualPoint, float]:
     """After a step, slopes changed by the least that explains it (Broyden 1965), and by
     how many sigma it missed.
     """
     after = valley.residual(here.x + step)
     missed = after - here.rest - here.slopes @ step
-    return Spot(here.x + step, after, secant(here.slopes, step, missed)), float(
-        np.linalg.norm(missed)
-    )
+    return ResidualPoint(
+        here.x + step, after, broyden_update(here.slopes, step, missed)
+    ), float(np.linalg.norm(missed))
 
 
-def _there(valley: Valley, x: Array) -> Spot:
+def _there(valley: LocalMode, x: Array) -> ResidualPoint:
     rest = valley.residual(x)
-    return Spot(x, rest, valley.slopes_at(x, rest))
+    return ResidualPoint(x, rest, valley.slopes_at(x, rest))
 
 
 def _outwards(
-    here: Spot,
+    here: ResidualPoint,
     i: int,
     sign: int,
     allowed: float,
-    prior: Prior,
+    prior: GaussianPrior,
     limits: tuple[float, float],
 ) -> tuple[Array, float, float]:
     """By the straight model about a spot: ((p,) step to the farthest place whose misfit
@@ -336,7 +346,7 @@ def _outwards(
     What would leave its bounds stays on them.
     """
     curvature, gradient = here.slopes.T @ here.slopes, here.slopes.T @ here.rest
-    about = constrained.Led(
+    about = constrained.ProfiledQuadratic(
         curvature, gradient, i, low=prior.low - here.x, high=prior.high - here.x
     )
     rest = about.others(0.0)
@@ -353,9 +363,9 @@ def _outwards(
     return (step * (limits[0] / size) if size > limits[0] else step), least, size
 
 
-def valley_of(task: Task, at: Solution, rise: float) -> Valley:
+def valley_of(task: SearchTask, at: FitSolution, rise: float) -> LocalMode:
     """The misfit about a fit that is ``rise`` of -2 ln L above the best one."""
-    return Valley(
+    return LocalMode(
         task.problem(),
         task.data,
         at.value,
@@ -365,18 +375,22 @@ def valley_of(task: Task, at: Solution, rise: float) -> Valley:
     )
 
 
-class Search:
+class LimitSearch:
     """Ends of all parameters over all valleys that are known; ``valleys``: of the
     modes, the best first.
     """
 
     def __init__(
-        self, task: Task, mode: Solution, by: Walk | None, valleys: Sequence[Valley]
+        self,
+        task: SearchTask,
+        mode: FitSolution,
+        by: ProfileScan | None,
+        valleys: Sequence[LocalMode],
     ) -> None:
         self._task, self._mode, self._by = task, mode, by
         self._valleys = {_MODE - k: one for k, one in enumerate(valleys)}
         self._level = REACH**2 * max(1.0, mode.chi2_per_dof)
-        self._found: dict[tuple[int, int], End] = {}
+        self._found: dict[tuple[int, int], ConfidenceLimit] = {}
         self._tried: dict[tuple[int, int], float] = {}
         stops = enumerate(zip(by.value, by.rise, strict=True)) if by else ()
         self._met: list[tuple[int, Array | None, Array]] = [
@@ -401,7 +415,7 @@ class Search:
         own = [
             {k: copy.copy(self._valleys[k]) for k, *_ in begins} for *_, begins in asked
         ]
-        ends = threads.each(self._farthest, list(zip(asked, own, strict=True)))
+        ends = threads.run_each(self._farthest, list(zip(asked, own, strict=True)))
         for k, shared in self._valleys.items():
             known = len(shared.met)
             shared.met += tuple(
@@ -438,7 +452,7 @@ class Search:
                 out.append((i, sign, (k, begin, sign * float(x[i]))))
         return out
 
-    def profile(self, i: int) -> Profile:
+    def profile(self, i: int) -> ProfileInterval:
         """Of a parameter; of the walk between its ends, where there is one."""
         sides, sigma = (
             [self._found[i, sign] for sign in (-1, 1)],
@@ -446,7 +460,7 @@ class Search:
         )
         middle = float(self._mode.value[i])
         if self._by is None:
-            return joined(sides, middle, sigma, math.sqrt(self._level))
+            return join_limits(sides, middle, sigma, math.sqrt(self._level))
         low, high = (one.place for one in sides)
         inner = np.column_stack(self._by.profile_of(i, np.linspace(-1, 1, POINTS)))
         near = self._by.value[
@@ -459,8 +473,8 @@ class Search:
         )
         inner = inner[(inner[:, 0] >= least) & (inner[:, 0] <= most)]
         value, rise = np.array(sorted(np.concatenate([*seen, inner]).tolist())).T
-        parabolic = plain(low, high, middle, math.sqrt(self._level) * sigma)
-        return Profile(
+        parabolic = is_parabolic(low, high, middle, math.sqrt(self._level) * sigma)
+        return ProfileInterval(
             low, high, value, rise, parabolic, (sides[0].done, sides[1].done)
         )
 
@@ -495,8 +509,8 @@ class Search:
         return [one for one in out if abs(one[2] - along[0][2]) < near][:1] + along
 
     def _farthest(
-        self, asked: tuple[tuple[int, int, list[Begin]], dict[int, Valley]]
-    ) -> list[tuple[int, End]]:
+        self, asked: tuple[tuple[int, int, list[Begin]], dict[int, LocalMode]]
+    ) -> list[tuple[int, ConfidenceLimit]]:
         """Ends from all begins that reach beyond those found."""
         (i, sign, begins), valleys = asked
         goal, far, sure, out = math.sqrt(self._level), -math.inf, True, []
@@ -514,7 +528,7 @@ class Search:
                     "beyond": far + _SPARE * sigma,
                     "promised": reach,
                 }
-                out.append((k, end(valleys[k], i, sign, goal, **about)))
+                out.append((k, find_limit(valleys[k], i, sign, goal, **about)))
                 far, sure = (
                     max(far, sign * out[-1][1].place),
                     any(one.done for _, one in out),

@@ -9,41 +9,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import Capture, Gain, clean
+from characterize.captures import Capture, SensorNoise, to_electrons
 from characterize.inference import explore, knowable, missing, residual, search, verdict
-from characterize.inference.arrange import Arrangement, arrange, laid_words, rearranged
-from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
+from characterize.inference.arrange import (
+    FrameArrangement,
+    find_arrangement,
+    laid_words,
+    rearrange_frames,
+)
+from characterize.inference.asbuilt import AsBuilt, WithinModel, gaussian_draws
 from characterize.inference.explore import Posterior
-from characterize.inference.leastsquares import Solution
-from characterize.inference.missing import Finding, Lean, Looked, Unstated
+from characterize.inference.leastsquares import FitSolution
+from characterize.inference.missing import (
+    ResidualFinding,
+    ScoreTest,
+    ScoreTests,
+    UnmodelledShifts,
+)
 from characterize.inference.prepare import (
     check_depths,
     check_enough,
+    correct_quantization,
     data_of,
-    merged,
+    merge_exposures,
     quick_enough,
     roughly_known,
     setting_of,
-    stated,
-    unrounded,
+    stated_priors,
 )
-from characterize.inference.search import Task, with_values
+from characterize.inference.search import SearchTask, with_values
 from characterize.model import (
     NAMES,
     PARAMETERS,
     PLACE,
     ForwardModel,
-    Known,
-    slopes,
+    KnownValue,
+    log_response_slopes,
+    parameter_vector,
     thinplate,
-    unfitted,
-    usual,
-    vector,
+    unfitted_sizes,
+    usual_parameters,
 )
+from metalens.core import threads
+from metalens.core.arrays import Array
+from metalens.core.errors import FitRefused
 from metalens.fabrication import Sensitivity
-from metalens.ground import threads
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitRefused
 from metalens.lens import Lens
 
 LIKENESS = 0.45
@@ -61,7 +71,7 @@ _LEFT_OUT = 1.25
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class FitOptions:
     """How to fit.
 
     free: parameters to fit beyond the usual ones. known: metrology, as priors.
@@ -72,7 +82,7 @@ class Options:
     """
 
     free: tuple[str, ...] = ()
-    known: tuple[Known, ...] = ()
+    known: tuple[KnownValue, ...] = ()
     window: int = 48
     scan_um: float | None = None
     insist: bool = False
@@ -81,7 +91,7 @@ class Options:
 def fit(
     capture: Capture,
     lens: Lens,
-    options: Options | None = None,
+    options: FitOptions | None = None,
     *,
     response: Sensitivity | None = None,
 ) -> AsBuilt:
@@ -100,51 +110,53 @@ def fit(
     with (
         threads.one_blas_thread()
     ):  # matrices are small: a second thread of BLAS takes a core to wait on
-        return _fit(capture, lens, options or Options(), response)
+        return _fit(capture, lens, options or FitOptions(), response)
 
 
 def _fit(
-    capture: Capture, lens: Lens, options: Options, response: Sensitivity | None
+    capture: Capture, lens: Lens, options: FitOptions, response: Sensitivity | None
 ) -> AsBuilt:
-    capture, frames = merged(capture, clean(capture))
+    capture, frames = merge_exposures(capture, to_electrons(capture))
     setting, window = setting_of(capture, options.window)
     check_depths(setting.depth_um, lens)
     data = data_of(frames, window)
-    known = {k.name: k for k in (*stated(capture, lens), *options.known)}
-    sizes = unfitted(known, lens)
+    known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
+    sizes = unfitted_sizes(known, lens)
     check_enough(data, search.names_of(known, options.free))
     model = ForwardModel(
-        lens, setting, response or slopes(lens, wanted=_spoken_of(options))
+        lens, setting, response or log_response_slopes(lens, wanted=_spoken_of(options))
     )
-    start = vector({name: k.value for name, k in known.items()})
+    start = parameter_vector({name: k.value for name, k in known.items()})
     scan_um = (
         0.12 * float(np.median(setting.depth_um))
         if options.scan_um is None
         else options.scan_um
     )
-    found = arrange(
+    found = find_arrangement(
         model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens)
     )
     _check_likeness(found, lens)
-    whole = Task(model, data, start, known, found, options.free, sizes)
-    task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
+    whole = SearchTask(model, data, start, known, found, options.free, sizes)
+    task = search.choose_orientation(
+        [_as_laid(whole, one) for one in (found, *found.others)]
+    )
     cautions = [
         *frames.corrections,
         *laid_words(task.found or found),
-        *verdict.colours(lens, known),
+        *verdict.spectrum_text(lens, known),
     ]
     cautions += roughly_known(lens, model.response)
-    unbiased = search.starts(task, biases_nm=(0.0,))[0]
+    unbiased = search.starting_points(task, biases_nm=(0.0,))[0]
     task = dataclasses.replace(
         task, model=quick_enough(task.model, task.data, unbiased)
     )
     task, ends = _unrounded(
-        *search.placed(*_ends(task, frames.gain, cautions)), frames.gain
+        *search.place_windows(*_ends(task, frames.gain, cautions)), frames.gain
     )
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):
-        rest = residual.attempt(
+        rest = residual.fit_residual_phase(
             task.model,
             task.data,
             task.names,
@@ -154,7 +166,8 @@ def _fit(
         )
         if rest is not None:
             task = dataclasses.replace(
-                task, model=task.model.with_residual(rest.modes, thinplate.basis)
+                task,
+                model=task.model.with_residual(rest.modes, thinplate.thin_plate_basis),
             )
             ends, looked = [rest.solution], None
             cautions.append(
@@ -162,16 +175,16 @@ def _fit(
                 f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
             )
     _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
-    posterior = explore.explore(task, ends)
+    posterior = explore.explore_posterior(task, ends)
     if looked is None or posterior.best is not looked[0]:
-        looked = posterior.best, missing.look(task, posterior.best)
-    cautions += verdict.rounding(frames.gain, whole=frames.count_e > 0)
+        looked = posterior.best, missing.run_score_tests(task, posterior.best)
+    cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
     result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
     _refuse(result.problems, options, leans)
     return result
 
 
-def _reach_um(known: dict[str, Known], lens: Lens) -> float:
+def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
     """Half the range of distances that is looked at: two sigma of what is known, within
     the bounds.
     """
@@ -179,7 +192,9 @@ def _reach_um(known: dict[str, Known], lens: Lens) -> float:
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
-def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> None:
+def _refuse(
+    problems: Sequence[str], options: FitOptions, leans: list[ScoreTest]
+) -> None:
     """Refuse by the problems, with what the residuals lean to: where to look on the
     bench.
     """
@@ -187,20 +202,24 @@ def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> Non
         raise FitRefused(
             "fit refused: "
             + "; ".join(
-                dict.fromkeys([*problems, *(one.words for one in missing.words(leans))])
+                dict.fromkeys(
+                    [*problems, *(one.words for one in missing.score_test_text(leans))]
+                )
             )
         )
 
 
-def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solution]]:
+def _ends(
+    task: SearchTask, gain: SensorNoise, cautions: list[str]
+) -> tuple[SearchTask, list[FitSolution]]:
     """The valleys of the usual parameters, or of more where these do not explain the
     frames.
     """
-    task, ends = search.search(task)
-    if verdict.explained(ends[0], gain) or set(EXTRA) <= set(task.names):
+    task, ends = search.search_modes(task)
+    if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
         return task, ends
     more = dataclasses.replace(task, free=(*task.free, *EXTRA))
-    wide = search.wider(more, task.all_of(ends[0].value))
+    wide = search.widen_search(more, task.all_of(ends[0].value))
     if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
     cautions.append(
@@ -210,8 +229,8 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
 
 
 def _unrounded(
-    task: Task, ends: list[Solution], gain: Gain
-) -> tuple[Task, list[Solution]]:
+    task: SearchTask, ends: list[FitSolution], gain: SensorNoise
+) -> tuple[SearchTask, list[FitSolution]]:
     """The fit by the likelihood of rounded counts, where these are too coarse for their
     noise.
     """
@@ -219,10 +238,12 @@ def _unrounded(
         return task, ends
     counts = task.data
     for _ in range(_ROUNDS):
-        task = dataclasses.replace(task, data=unrounded(counts, ends[0].image))
+        task = dataclasses.replace(
+            task, data=correct_quantization(counts, ends[0].image)
+        )
         before, ends = (
             ends[0],
-            search.distinct([search.refine(task, end.value) for end in ends]),
+            search.distinct_modes([search.refine_fit(task, end.value) for end in ends]),
         )
         off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
         if np.abs(off).max() < _STAYS:
@@ -231,8 +252,8 @@ def _unrounded(
 
 
 def _with_what_is_there(
-    task: Task, ends: list[Solution], gain: Gain, cautions: list[str]
-) -> tuple[Task, list[Solution], tuple[Solution, Looked] | None]:
+    task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
+) -> tuple[SearchTask, list[FitSolution], tuple[FitSolution, ScoreTests] | None]:
     """The task with parameters of causes that are likely there (:func:`missing.to_fit`)
     and explain the frames better.
 
@@ -241,7 +262,7 @@ def _with_what_is_there(
     """
     if not gain.known:
         return task, ends, None
-    looked = missing.look(task, ends[0])
+    looked = missing.run_score_tests(task, ends[0])
     for _ in range(_CAUSES):
         if not ends[0].converged:
             break
@@ -249,7 +270,7 @@ def _with_what_is_there(
         if cause is None:
             break
         more = dataclasses.replace(task, free=(*task.free, *cause.frees))
-        wide = search.wider(more, task.all_of(ends[0].value))
+        wide = search.widen_search(more, task.all_of(ends[0].value))
         if wide is None or wide[1][0].merit > ends[0].merit:
             break
         fall = ends[0].merit - wide[1][0].merit
@@ -258,16 +279,18 @@ def _with_what_is_there(
             f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
         )
         task, ends = wide
-        looked = missing.look(task, ends[0])
+        looked = missing.run_score_tests(task, ends[0])
     return task, ends, (ends[0], looked)
 
 
-def _best_cause(task: Task, best: Solution, leans: list[Lean]) -> Lean | None:
+def _best_cause(
+    task: SearchTask, best: FitSolution, leans: list[ScoreTest]
+) -> ScoreTest | None:
     """The cause whose parameters lower the misfit most; None where none lowers it by
     half of what the residuals promise.
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
-    falls: list[tuple[float, Lean]] = []
+    falls: list[tuple[float, ScoreTest]] = []
     for cause in missing.to_fit(leans, stuck=stuck):
         fall = best.merit - search.merit_with(task, best, cause.frees)
         if fall > (_OUT_OF_BOUNDS if stuck else cause.chi2 / 2):
@@ -275,12 +298,12 @@ def _best_cause(task: Task, best: Solution, leans: list[Lean]) -> Lean | None:
     return max(falls, key=lambda pair: pair[0])[1] if falls else None
 
 
-def _spoken_of(options: Options) -> set[str]:
+def _spoken_of(options: FitOptions) -> set[str]:
     """Parameters that the options free or know."""
     return {*options.free, *(k.name for k in options.known)}
 
 
-def _check_likeness(found: Arrangement, lens: Lens) -> None:
+def _check_likeness(found: FrameArrangement, lens: Lens) -> None:
     if found.likeness < LIKENESS:
         raise FitRefused(
             f"fit refused: the frames look like no image of this lens (best correlation {found.likeness:.2f}); "
@@ -288,7 +311,7 @@ def _check_likeness(found: Arrangement, lens: Lens) -> None:
         )
 
 
-def _as_laid(task: Task, found: Arrangement) -> Task:
+def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
     """The task with its frames laid as found, and its windows held where the light then
     lies.
     """
@@ -298,18 +321,18 @@ def _as_laid(task: Task, found: Arrangement) -> Task:
     return dataclasses.replace(
         task,
         model=model,
-        data=task.data.arranged(lambda part: rearranged(part, found)),
+        data=task.data.arranged(lambda part: rearrange_frames(part, found)),
         found=found,
     )
 
 
 def _result(
     capture: Capture,
-    task: Task,
+    task: SearchTask,
     found: Posterior,
     cautions: list[str],
-    gain: Gain,
-    looked: Looked,
+    gain: SensorNoise,
+    looked: ScoreTests,
 ) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
     fitted, unseen = (
@@ -343,7 +366,9 @@ def _result(
         converged=solution.converged,
         reason=solution.reason,
         identifiable=tuple(
-            knowable.identifiable(names, solution.information, task.prior.sigma)
+            knowable.identifiable_combinations(
+                names, solution.information, task.prior.sigma
+            )
         ),
         degeneracies=_open(task, found, covariance, looked if gain.known else None),
         cautions=(
@@ -354,7 +379,7 @@ def _result(
         problems=(
             *_problems(task, solution, gain, looked.leans),
             *verdict.held_back(names, solution, task.prior),
-            *missing.decisive(findings),
+            *missing.decisive_findings(findings),
         ),
         low=value - np.hypot(value - within.low, more),
         high=value + np.hypot(within.high - value, more),
@@ -382,15 +407,17 @@ def _within(found: Posterior, covariance: Array, names: tuple[str, ...]) -> With
     return WithinModel(covariance, low, high, found.draws)
 
 
-def _drawn(task: Task, draws: Array, unstated: Unstated) -> Array:
+def _drawn(task: SearchTask, draws: Array, unstated: UnmodelledShifts) -> Array:
     """Draws with what cannot be told; none where there are none."""
     if not len(draws):
         return draws
-    moved = draws + spread(np.random.default_rng(2), len(draws), unstated.covariance)
+    moved = draws + gaussian_draws(
+        np.random.default_rng(2), len(draws), unstated.covariance
+    )
     return np.asarray(np.clip(moved, task.prior.low, task.prior.high))
 
 
-def _nominal(task: Task, fitted: dict[str, float]) -> Array:
+def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
     """(n, y, x) electrons as designed, with the fitted gain, background, place and
     blur.
     """
@@ -399,14 +426,14 @@ def _nominal(task: Task, fitted: dict[str, float]) -> Array:
         for k, v in fitted.items()
         if k.startswith(("log_gain", "background", "decentre", "crosstalk"))
     }
-    plain = task.model.with_residual(np.empty(0), thinplate.basis)
+    plain = task.model.with_residual(np.empty(0), thinplate.thin_plate_basis)
     return plain.images(with_values(task.start, bench))[0]
 
 
 def _verdicts(
-    task: Task, found: Posterior, unseen: float, unstated: Unstated
+    task: SearchTask, found: Posterior, unseen: float, unstated: UnmodelledShifts
 ) -> tuple[str, str]:
-    rows = usual(task.names, task.model.lens)
+    rows = usual_parameters(task.names, task.model.lens)
     known = verdict.process_verdict(
         rows, found.low, found.high, _told(task, found), unstated
     )
@@ -414,7 +441,9 @@ def _verdicts(
     return _psf_verdict(*errors, unseen, len(task.model.groups)), known
 
 
-def _findings(task: Task, solution: Solution, looked: Looked) -> list[Finding]:
+def _findings(
+    task: SearchTask, solution: FitSolution, looked: ScoreTests
+) -> list[ResidualFinding]:
     """What is in the frames and in no parameter: structure of the residuals, effects.
 
     Residuals are taken over the noise that they have where more than the noise model
@@ -423,8 +452,10 @@ def _findings(task: Task, solution: Solution, looked: Looked) -> list[Finding]:
     data, r = task.data, solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
     noise = np.sqrt(data.variance(solution.image))
     shared = data.shared(solution.image) / noise
-    structure = verdict.structure(np.where(data.saturated, 0.0, r), shared)
-    return [*structure, *missing.words(looked.leans)]
+    structure = verdict.correlated_residuals_text(
+        np.where(data.saturated, 0.0, r), shared
+    )
+    return [*structure, *missing.score_test_text(looked.leans)]
 
 
 def _extrapolation(unseen: float) -> list[str]:
@@ -438,16 +469,16 @@ def _extrapolation(unseen: float) -> list[str]:
 
 
 def _open(
-    task: Task, found: Posterior, covariance: Array, looked: Looked | None
+    task: SearchTask, found: Posterior, covariance: Array, looked: ScoreTests | None
 ) -> tuple[str, ...]:
     """What cannot be told apart: bent and double posteriors, pairs, and causes that
     nobody fitted.
     """
-    pairs = knowable.degeneracies(task.names, covariance, task.prior.sigma)
+    pairs = knowable.correlated_pairs(task.names, covariance, task.prior.sigma)
     return (
-        *explore.words(task, found),
+        *explore.posterior_text(task, found),
         *pairs,
-        *(missing.untold(looked.leans) if looked else ()),
+        *(missing.undetectable_effects(looked.leans) if looked else ()),
     )
 
 
@@ -455,7 +486,7 @@ def _named(names: tuple[str, ...]) -> Array:
     return np.array([not name.startswith(("log_gain", "background")) for name in names])
 
 
-def _told(task: Task, found: Posterior) -> Array:
+def _told(task: SearchTask, found: Posterior) -> Array:
     """(p,) width of the intervals over that of the prior."""
     return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
 
@@ -479,12 +510,12 @@ def _psf_verdict(
 
 
 def _problems(
-    task: Task, solution: Solution, gain: Gain, leans: list[Lean]
+    task: SearchTask, solution: FitSolution, gain: SensorNoise, leans: list[ScoreTest]
 ) -> list[str]:
     problems = [
-        *verdict.problems(task.names, solution, gain),
+        *verdict.fit_problems(task.names, solution, gain),
         *verdict.too_quiet(solution, gain),
-        *(missing.misplaced(leans) if gain.known else ()),
+        *(missing.misplaced_windows_text(leans) if gain.known else ()),
     ]
     clipped = float(task.data.saturated.mean())
     if problems and clipped > 0.1:
@@ -500,7 +531,7 @@ def _problems(
     return problems
 
 
-def _with_gain(names: tuple[str, ...], found: Posterior, gain: Gain) -> Array:
+def _with_gain(names: tuple[str, ...], found: Posterior, gain: SensorNoise) -> Array:
     """Covariance with the error of the sensor's gain, which scales everything that is
     counted in electrons.
     """

@@ -9,12 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference import posterior, walk
-from characterize.inference.ends import POINTS, Profile, Search, Wanted, valley_of
-from characterize.inference.leastsquares import Solution
-from characterize.inference.posterior import Valley
-from characterize.inference.search import Task, anchored, distinct, mirrored, refine
-from characterize.inference.walk import Walk
-from metalens.ground.arrays import Array
+from characterize.inference.ends import (
+    POINTS,
+    LimitSearch,
+    ProfileInterval,
+    Wanted,
+    valley_of,
+)
+from characterize.inference.leastsquares import FitSolution
+from characterize.inference.posterior import LocalMode
+from characterize.inference.search import (
+    SearchTask,
+    add_mirrored_starts,
+    correct_surrogate,
+    distinct_modes,
+    refine_fit,
+)
+from characterize.inference.walk import ProfileScan
+from metalens.core.arrays import Array
 
 REACH = posterior.REACH
 _RESTARTS = 2
@@ -39,35 +51,35 @@ class Posterior:
     profiles: of the parameters by name. covariance: (p, p) of the posterior.
     """
 
-    modes: tuple[Solution, ...]
+    modes: tuple[FitSolution, ...]
     share: Array
     low: Array
     high: Array
     parabolic: Array
     draws: Array
-    profiles: dict[str, Profile]
+    profiles: dict[str, ProfileInterval]
     covariance: Array
 
     @property
-    def best(self) -> Solution:
+    def best(self) -> FitSolution:
         """The valley of least misfit."""
         return self.modes[0]
 
 
-def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
+def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> Posterior:
     """Walks over the prior of what may have several valleys; profiles; what falls below
     its mode is followed first.
 
     Intervals, curves, draws and covariance hold the errors of dark and flat too, which
     all frames have in common.
     """
-    task, modes = anchored(task, ends[0]), list(ends)
+    task, modes = correct_surrogate(task, ends[0]), list(ends)
     for name in walk.WALKED:
-        modes = walk.valleys(task, modes, name) if name in task.names else modes
+        modes = walk.find_modes(task, modes, name) if name in task.names else modes
     if (
         modes[0] is not ends[0]
     ):  # the search has asked for the mirror images of its own best
-        modes = mirrored(task, modes)
+        modes = add_mirrored_starts(task, modes)
     for left in reversed(range(_RESTARTS + 1)):
         valleys = [valley_of(task, mode, mode.merit - modes[0].merit) for mode in modes]
         walks = _walks(task, modes, valleys[0])
@@ -76,7 +88,7 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
         )
         if better is None:
             break
-        modes = distinct([*modes, better])
+        modes = distinct_modes([*modes, better])
     bent = [
         name
         for name in walk.WALKED
@@ -86,7 +98,9 @@ def explore(task: Task, ends: Sequence[Solution]) -> Posterior:
     return _joined(task, modes, valleys, profiles, walks)
 
 
-def _walks(task: Task, modes: list[Solution], valley: Valley) -> dict[str, Walk]:
+def _walks(
+    task: SearchTask, modes: list[FitSolution], valley: LocalMode
+) -> dict[str, ProfileScan]:
     """Of what has several valleys, or one so bent that a profile would be lost in it."""
     names = [name for name in walk.WALKED if name in task.names]
     bent = [
@@ -97,19 +111,19 @@ def _walks(task: Task, modes: list[Solution], valley: Valley) -> dict[str, Walk]
     return {name: _walk(task, modes, name) for name in bent}
 
 
-def _walk(task: Task, modes: list[Solution], name: str) -> Walk:
-    return walk.walk(task, modes, name, widened=max(1.0, modes[0].chi2_per_dof))
+def _walk(task: SearchTask, modes: list[FitSolution], name: str) -> ProfileScan:
+    return walk.scan_profile(task, modes, name, widened=max(1.0, modes[0].chi2_per_dof))
 
 
 def _profiles(
-    task: Task,
-    valley: Valley,
-    mode: Solution,
-    walks: Mapping[str, Walk],
+    task: SearchTask,
+    valley: LocalMode,
+    mode: FitSolution,
+    walks: Mapping[str, ProfileScan],
     *,
     followed: bool,
-    others: Sequence[Valley] = (),
-) -> tuple[dict[str, Profile], Solution | None]:
+    others: Sequence[LocalMode] = (),
+) -> tuple[dict[str, ProfileInterval], FitSolution | None]:
     """Of all named parameters; second: a better mode that one led to, where that is
     ``followed``.
 
@@ -125,13 +139,15 @@ def _profiles(
         for one in walks.values()
         if one.rise.min() < -_LOWER
     ]
-    search = Search(task, mode, next(iter(walks.values()), None), [valley, *others])
+    search = LimitSearch(
+        task, mode, next(iter(walks.values()), None), [valley, *others]
+    )
     wanted: list[Wanted] = [(i, sign, None) for i in named for sign in (-1, 1)]
     while wanted:
         for first in range(0, len(wanted), 2 * _BESIDE):
             places += search.ends(wanted[first : first + 2 * _BESIDE])
             if places and followed:
-                other = refine(task, places[0])
+                other = refine_fit(task, places[0])
                 if other.merit < mode.merit - 0.05:
                     return {}, other
                 places, followed = [], False
@@ -140,11 +156,11 @@ def _profiles(
 
 
 def _joined(
-    task: Task,
-    modes: list[Solution],
-    valleys: list[Valley],
-    profiles: dict[str, Profile],
-    walks: Mapping[str, Walk],
+    task: SearchTask,
+    modes: list[FitSolution],
+    valleys: list[LocalMode],
+    profiles: dict[str, ProfileInterval],
+    walks: Mapping[str, ProfileScan],
 ) -> Posterior:
     best, names, profiles = modes[0], task.names, dict(profiles)
     spread = max(1.0, best.chi2_per_dof)
@@ -166,7 +182,7 @@ def _joined(
         name: _widened(one, best.value, wider, names.index(name))
         for name, one in profiles.items()
     }
-    share = posterior.shares(valleys)
+    share = posterior.mode_probabilities(valleys)
     covariance = valleys[0].covariance * spread + calibration
     draws = np.empty((0, len(names)))
     if not parabolic.all() or share[0] < 0.99:
@@ -184,11 +200,11 @@ def _joined(
 
 
 def _intervals(
-    task: Task,
-    modes: list[Solution],
-    valleys: list[Valley],
-    profiles: dict[str, Profile],
-    walks: Mapping[str, Walk],
+    task: SearchTask,
+    modes: list[FitSolution],
+    valleys: list[LocalMode],
+    profiles: dict[str, ProfileInterval],
+    walks: Mapping[str, ProfileScan],
 ) -> tuple[Array, Array, Array]:
     """(p,) ends over all profiles, modes and walks, and whether the parabola of the
     best has the same.
@@ -230,11 +246,13 @@ def _intervals(
     return low, high, parabolic
 
 
-def _whole(one: Walk, best: Solution, low: Array, high: Array) -> Profile:
+def _whole(
+    one: ProfileScan, best: FitSolution, low: Array, high: Array
+) -> ProfileInterval:
     """The profile that a walk is."""
     value, rise = one.profile()
     some = np.unique(np.linspace(0, len(value) - 1, POINTS).round().astype(int))
-    return Profile(
+    return ProfileInterval(
         float(low[one.index]),
         float(high[one.index]),
         value[some],
@@ -244,20 +262,23 @@ def _whole(one: Walk, best: Solution, low: Array, high: Array) -> Profile:
 
 
 def _drawn(
-    modes: list[Solution], valleys: list[Valley], walks: list[Walk], spread: float
+    modes: list[FitSolution],
+    valleys: list[LocalMode],
+    walks: list[ProfileScan],
+    spread: float,
 ) -> Array:
     """Draws about the modes; of the walks where there are any, and about those modes
     alone that lie on none.
     """
     if not walks:
-        return posterior.draws(valleys)
+        return posterior.draw_posterior(valleys)
     rng = np.random.default_rng(0)
     beside = [
         k
         for k, mode in enumerate(modes)
         if not any(one.passes(mode.value) for one in walks)
     ]
-    one = max(walks, key=Walk.log_mass)
+    one = max(walks, key=ProfileScan.log_mass)
     one_axis = np.log(2 * np.pi) / 2  # which a walk's mass holds and evidence does not
     log = [
         one.log_mass(),
@@ -267,14 +288,16 @@ def _drawn(
     count = rng.multinomial(posterior.DRAWS, share / share.sum())
     parts = [one.draws(int(count[0]), widened=spread, rng=rng)]
     parts += [
-        posterior.draws([valleys[k]], int(n))
+        posterior.draw_posterior([valleys[k]], int(n))
         for k, n in zip(beside, count[1:], strict=True)
         if n
     ]
     return np.asarray(rng.permutation(np.concatenate(parts)))
 
 
-def _widened(one: Profile, best: Array, wider: Array, i: int) -> Profile:
+def _widened(
+    one: ProfileInterval, best: Array, wider: Array, i: int
+) -> ProfileInterval:
     """A profile stretched about its mode by errors that its likelihood does not know:
     those of the calibration.
     """
@@ -287,7 +310,7 @@ def _widened(one: Profile, best: Array, wider: Array, i: int) -> Profile:
     )
 
 
-def _covariance(draws: Array, valley: Valley, sigma: Array) -> Array:
+def _covariance(draws: Array, valley: LocalMode, sigma: Array) -> Array:
     """Correlation of the draws, with the intervals' sigma; of the parabola's a fifth at
     least, which keeps it regular.
 
@@ -311,7 +334,7 @@ def _covariance(draws: Array, valley: Valley, sigma: Array) -> Array:
     )
 
 
-def words(task: Task, found: Posterior) -> list[str]:
+def posterior_text(task: SearchTask, found: Posterior) -> list[str]:
     """Bent and double posteriors, and ends that were not found, in words."""
     out = [
         f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, perhaps beyond"

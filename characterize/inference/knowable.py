@@ -5,10 +5,10 @@ degeneracies in words, densities.
 import numpy as np
 
 from characterize.model import PARAMETERS, PLACE
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
-def degeneracies(
+def correlated_pairs(
     names: tuple[str, ...], covariance: Array, sigma_prior: Array
 ) -> list[str]:
     """Pairs that are correlated beyond 0.9, and parameters that the frames tell little
@@ -41,13 +41,13 @@ def degeneracies(
     return words
 
 
-def identifiable(
+def identifiable_combinations(
     names: tuple[str, ...], information: Array, sigma_prior: Array
 ) -> list[str]:
     """Combinations (in typical units) that the frames alone fix better than prior
     knowledge, best first, in words.
     """
-    values, vectors = directions(names, information)
+    values, vectors = information_eigenvectors(names, information)
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     prior = np.where(np.isfinite(sigma_prior), sigma_prior / unit, np.inf)
     lines = []
@@ -69,7 +69,9 @@ def identifiable(
     return lines
 
 
-def directions(names: tuple[str, ...], information: Array) -> tuple[Array, Array]:
+def information_eigenvectors(
+    names: tuple[str, ...], information: Array
+) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of the information in units of each parameter's
     typical scale.
     """
@@ -78,7 +80,7 @@ def directions(names: tuple[str, ...], information: Array) -> tuple[Array, Array
     return np.maximum(values, 0), vectors
 
 
-def density(curve: Array, at: Array) -> Array:
+def profile_density(curve: Array, at: Array) -> Array:
     """(*shape) probability density exp(-rise / 2) at values of a parameter, from its
     profile (2, points) by value.
 

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import constrained
-from characterize.inference.constrained import Ball
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
+from characterize.inference.constrained import BallConstraint
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 
 # sigma of a step from which on images tell slopes: they are rounded by a thousandth of
 # one or two
@@ -32,7 +32,7 @@ Model = Callable[[Array, bool], tuple[Array, Array | None]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Data:
+class FitImages:
     """What is fitted, in electrons: images, masks, variance at zero light, shot-noise
     scale.
 
@@ -74,11 +74,11 @@ class Data:
             ]
         )
 
-    def planes(self, index: Array) -> "Data":
+    def planes(self, index: Array) -> "FitImages":
         """Some of the frames."""
         return self.arranged(lambda part: part[index])
 
-    def arranged(self, change: Callable[[Array], Array]) -> "Data":
+    def arranged(self, change: Callable[[Array], Array]) -> "FitImages":
         """The same of frames that are laid otherwise, or of some of them."""
         parts = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
         moved: dict[str, Any] = {
@@ -90,7 +90,7 @@ class Data:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Prior:
+class GaussianPrior:
     """Gaussian knowledge of the parameters: mean and sigma (inf: nothing known), (p,)
     each; hard bounds, (p,) each.
     """
@@ -101,14 +101,14 @@ class Prior:
     high: Array
 
     @classmethod
-    def none(cls, start: Array) -> "Prior":
+    def none(cls, start: Array) -> "GaussianPrior":
         """Nothing known: no pull, no bounds."""
         wide = np.full(len(start), np.inf)
         return cls(np.array(start, float), wide, -wide, wide)
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class SolverSettings:
     """When to stop, and how far an outlier is (sigma).
 
     secant: between exact Jacobians the last one is brought up to date by the images
@@ -130,11 +130,11 @@ class Settings:
     miss: float = math.inf
     finish: bool = True
     bounded: bool = False
-    ball: Ball | None = None
+    ball: BallConstraint | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
+class FitSolution:
     """Estimate with covariance.
 
     value: (p,). covariance: (p, p) inverse of the Fisher information with the priors'.
@@ -165,15 +165,15 @@ class Solution:
     slopes: Array
 
 
-def fit(
+def fit_levenberg_marquardt(
     model: Model,
-    data: Data,
+    data: FitImages,
     start: Array,
     *,
-    prior: Prior | None = None,
-    settings: Settings | None = None,
+    prior: GaussianPrior | None = None,
+    settings: SolverSettings | None = None,
     slopes: Array | None = None,
-) -> Solution:
+) -> FitSolution:
     """Levenberg-Marquardt from one start, with the Jacobian there or with ``slopes``
     (p, n, y, x) from places close by.
 
@@ -183,7 +183,7 @@ def fit(
     Raises:
         FitError: the model is not finite at the start, or no pixel is usable.
     """
-    settings, prior = settings or Settings(), prior or Prior.none(start)
+    settings, prior = settings or SolverSettings(), prior or GaussianPrior.none(start)
     x = np.clip(np.asarray(start, float), prior.low, prior.high)
     if not data.usable.any():
         raise FitError("no usable pixel in the fit window; check masks and crop")
@@ -252,10 +252,10 @@ class _State:
 
 def _linearise(
     model: Model,
-    data: Data,
+    data: FitImages,
     x: Array,
-    prior: Prior,
-    settings: Settings,
+    prior: GaussianPrior,
+    settings: SolverSettings,
     slopes: Array | None = None,
 ) -> _State:
     image, jacobian = model(x, slopes is None)
@@ -284,12 +284,12 @@ def _missed(state: _State, step: Array, image: Array) -> float:
 
 
 def _secant(
-    data: Data,
+    data: FitImages,
     state: _State,
     step: Array,
     image: Array,
-    prior: Prior,
-    settings: Settings,
+    prior: GaussianPrior,
+    settings: SolverSettings,
     *,
     moved: float,
 ) -> _State:
@@ -320,10 +320,10 @@ def _secant(
 
 
 def _state(
-    data: Data,
+    data: FitImages,
     at: tuple[Array, Array, Array],
-    prior: Prior,
-    settings: Settings,
+    prior: GaussianPrior,
+    settings: SolverSettings,
     *,
     travel: float = 0.0,
 ) -> _State:
@@ -357,10 +357,10 @@ def _state(
 
 def _step(
     model: Model,
-    data: Data,
+    data: FitImages,
     state: _State,
-    prior: Prior,
-    settings: Settings,
+    prior: GaussianPrior,
+    settings: SolverSettings,
     damping: float,
 ) -> tuple[Array, Array, float, bool]:
     """A step that lowers the misfit at the weights of ``state``: (step, image there,
@@ -394,7 +394,11 @@ def _step(
 
 
 def _inside(
-    state: _State, step: Array, damped: Array | None, prior: Prior, settings: Settings
+    state: _State,
+    step: Array,
+    damped: Array | None,
+    prior: GaussianPrior,
+    settings: SolverSettings,
 ) -> Array:
     """The step kept inside bounds and ball: clipped, or the best one there."""
     clipped = np.asarray(np.clip(state.x + step, prior.low, prior.high) - state.x)
@@ -404,7 +408,7 @@ def _inside(
 
     size = np.sqrt(np.maximum(np.diag(state.curvature), 1e-300))
     matrix = state.curvature if damped is None else damped * np.outer(size, size)
-    found = constrained.step(
+    found = constrained.constrained_step(
         matrix,
         state.gradient,
         state.x,
@@ -422,7 +426,12 @@ def _inside(
 
 
 def _merit(
-    data: Data, image: Array, x: Array, noise: Array, prior: Prior, settings: Settings
+    data: FitImages,
+    image: Array,
+    x: Array,
+    noise: Array,
+    prior: GaussianPrior,
+    settings: SolverSettings,
 ) -> float:
     size = np.abs(_residual(data, image, noise))
     loss = np.where(
@@ -432,7 +441,7 @@ def _merit(
     return float((loss * data.usable).sum() + (pull**2).sum())
 
 
-def _residual(data: Data, image: Array, noise: Array) -> Array:
+def _residual(data: FitImages, image: Array, noise: Array) -> Array:
     """(data - model) / sigma; at saturated pixels only as far as the model falls short."""
     residual = (data.electrons - image) / noise
     return np.where(data.saturated, np.maximum(residual, 0), residual)
@@ -443,12 +452,12 @@ def _robust(residual: Array, huber: float) -> Array:
 
 
 def _solution(
-    data: Data,
+    data: FitImages,
     state: _State,
-    prior: Prior,
-    settings: Settings,
+    prior: GaussianPrior,
+    settings: SolverSettings,
     ended: tuple[bool, str, int],
-) -> Solution:
+) -> FitSolution:
     counted = data.usable & ~data.saturated
     shown = state.residual * data.usable
     inlier = counted & (np.abs(state.residual) <= settings.huber)
@@ -456,8 +465,8 @@ def _solution(
     chi2 = float((state.residual[inlier] ** 2).sum()) / dof
     log_noise = float(2 * np.log(state.noise[counted]).sum())
     merit = _merit(data, state.image, state.x, state.noise, prior, settings) + log_noise
-    covariance = invert(state.curvature)
-    return Solution(
+    covariance = invert_information(state.curvature)
+    return FitSolution(
         state.x,
         covariance,
         state.information,
@@ -483,7 +492,7 @@ def _inlier_variance(huber: float) -> float:
     return 1 - 2 * huber * density / math.erf(huber / math.sqrt(2))
 
 
-def invert(matrix: Array) -> Array:
+def invert_information(matrix: Array) -> Array:
     """Inverse of a symmetric, possibly nearly singular information matrix, scaled so
     that units do not matter.
     """

@@ -25,12 +25,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from characterize.captures import shifted
+from characterize.captures import shift_frames
 from characterize.inference import causes
-from characterize.inference.leastsquares import Solution
-from characterize.inference.search import Task
-from characterize.model import PLACE, background
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import FitSolution
+from characterize.inference.search import SearchTask
+from characterize.model import PLACE, background_planes
+from metalens.core.arrays import Array
 
 # of one cause to be spoken of where there is none: one fit in 350 with the 28 of a
 # small lens
@@ -53,20 +53,20 @@ DECISIVE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ResidualFinding:
     """What the residuals hold beside noise, in words, and its significance in sigma."""
 
     words: str
     sigma: float
 
 
-def decisive(found: Sequence[Finding]) -> list[str]:
+def decisive_findings(found: Sequence[ResidualFinding]) -> list[str]:
     """Findings beyond ``DECISIVE`` sigma, in words: no fit with one passes its checks."""
     return [one.words for one in found if one.sigma > DECISIVE]
 
 
 @dataclass(frozen=True, slots=True)
-class Lean:
+class ScoreTest:
     """One cause: its words, chi-square by which the residuals lean along it, its
     degrees, and the chance of that.
 
@@ -87,7 +87,7 @@ class Lean:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Looked:
+class ScoreTests:
     """What was looked for beside the fit: leans, the most telling first, of every cause
     that can be told apart or is
     taken for something else; the fit, and the causes that are reckoned with as changes
@@ -96,17 +96,17 @@ class Looked:
     the frames to bound them.
     of_mask: those that stay with the lens when it leaves the bench."""
 
-    leans: list[Lean]
-    fit: "Fitted"
+    leans: list[ScoreTest]
+    fit: "FitAtMode"
     unstated: dict[str, Array]
     roughly: frozenset[str] = frozenset()
     of_mask: frozenset[str] = frozenset()
 
-    def reckoned(self) -> "Unstated":
+    def reckoned(self) -> "UnmodelledShifts":
         """What the causes may have done to the parameters; see :meth:`Fitted.likely`."""
         names, p = tuple(self.unstated), len(self.fit.names)
         if not names:
-            return Unstated.none(p)
+            return UnmodelledShifts.none(p)
         every = np.concatenate([self.unstated[name] for name in names])
         moved, second = self.fit.moved_by(every), np.eye(len(every))
         exact = np.concatenate(
@@ -130,13 +130,13 @@ class Looked:
             ]
         )
         bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
-        return Unstated(
+        return UnmodelledShifts(
             names, np.sqrt(np.maximum(by_cause, 0)), moved @ second @ moved.T, bench
         )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Unstated:
+class UnmodelledShifts:
     """What the captures cannot tell: causes, (c, p) root mean square shift of every
     parameter by each.
 
@@ -151,7 +151,7 @@ class Unstated:
     bench: Array
 
     @classmethod
-    def none(cls, p: int) -> "Unstated":
+    def none(cls, p: int) -> "UnmodelledShifts":
         """Every cause stated."""
         return cls((), np.zeros((0, p)), np.zeros((p, p)), np.zeros((p, p)))
 
@@ -161,7 +161,7 @@ class Unstated:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
-def look(task: Task, mode: Solution) -> Looked:
+def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     """Look for every cause that is not fitted, by the image and the slopes that a fit
     ended with.
     """
@@ -177,7 +177,7 @@ def look(task: Task, mode: Solution) -> Looked:
     spread = max(1.0, mode.chi2_per_dof)
     pull = (mode.value - task.prior.mean) * task.prior.sigma**-2.0
     over = math.sqrt(spread)
-    fit = Fitted(
+    fit = FitAtMode(
         task.names,
         fitted,
         known,
@@ -188,7 +188,9 @@ def look(task: Task, mode: Solution) -> Looked:
     found, unstated = [], {}
     roughly: set[str] = set()
     of_mask: set[str] = set()
-    for one in causes.changes(task, x, dict(zip(task.names, slopes, strict=True))):
+    for one in causes.systematic_changes(
+        task, x, dict(zip(task.names, slopes, strict=True))
+    ):
         change = (one.images * root).reshape(len(one.images), -1)
         if np.any(one.sigma):
             unstated[one.cause] = np.reshape(one.sigma, (-1, 1)) * change
@@ -215,17 +217,17 @@ def look(task: Task, mode: Solution) -> Looked:
         (one for one in found if one.degrees or one.taken),
         key=lambda one: (one.chance, -one.chi2),
     )
-    return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
+    return ScoreTests(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
-def expected(task: Task) -> Unstated:
+def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
     """What a fit of frames to come will reckon with: at the task's start, of frames
     that are as expected there.
     """
     image, slopes = task.model.images(task.start, task.names)
     p, value = len(task.names), task.start[[PLACE[name] for name in task.names]]
     none = np.zeros_like(image)
-    mode = Solution(
+    mode = FitSolution(
         value,
         np.eye(p),
         np.eye(p),
@@ -239,10 +241,10 @@ def expected(task: Task) -> Unstated:
         np.zeros(p),
         np.asarray(slopes),
     )
-    return look(task, mode).reckoned()
+    return run_score_tests(task, mode).reckoned()
 
 
-def to_fit(found: list[Lean], *, stuck: bool = False) -> list[Lean]:
+def to_fit(found: list[ScoreTest], *, stuck: bool = False) -> list[ScoreTest]:
     """Causes that free parameters describe and that may be fitted next, likeliest first.
 
     Those that the residuals lean to beyond chance; else those that are likelier there
@@ -257,7 +259,7 @@ def to_fit(found: list[Lean], *, stuck: bool = False) -> list[Lean]:
     return (some if stuck else told or likely)[:_TRIED]
 
 
-def words(found: list[Lean]) -> list[Finding]:
+def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
     """The cause that the residuals lean to most, with those that are as likely.
 
     Nothing where all is chance. Its significance is that of a normal variable which is
@@ -280,10 +282,10 @@ def words(found: list[Lean]) -> list[Finding]:
         f"{first.chi2:.0f} with {first.degrees} degrees of freedom){more}: intervals "
         f"hold only if it is absent; {cure}"
     )
-    return [Finding(said, float(stats.norm.isf(max(first.chance, 1e-300) / 2)))]
+    return [ResidualFinding(said, float(stats.norm.isf(max(first.chance, 1e-300) / 2)))]
 
 
-def misplaced(found: list[Lean]) -> list[str]:
+def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
     """Whether windows of single field angles lie off, in words: what they explain is
     half of what any cause does.
 
@@ -302,7 +304,7 @@ def misplaced(found: list[Lean]) -> list[str]:
     ]
 
 
-def untold(found: list[Lean]) -> list[str]:
+def undetectable_effects(found: list[ScoreTest]) -> list[str]:
     """Causes that are not fitted and cannot be told from what is, with what they would
     be taken for.
     """
@@ -310,7 +312,7 @@ def untold(found: list[Lean]) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fitted:
+class FitAtMode:
     """The fit at its mode: slopes (p, pixels) over the noise, their information with
     the priors, and the residuals.
 
@@ -326,23 +328,23 @@ class Fitted:
     shared: Array
     pull: Array
 
-    def lean(self, cause: str, changes: Array) -> Lean:
+    def lean(self, cause: str, changes: Array) -> ScoreTest:
         """Score test of (k, pixels) changes; directions of which the fit takes up all
         but a thousandth are left out.
         """
         size = np.sqrt((changes**2).sum(1))
         changes = changes[size > 0] / size[size > 0, None]
         if not len(changes):
-            return Lean(cause, 0.0, 0, 1.0)
+            return ScoreTest(cause, 0.0, 0, 1.0)
         left, score = self.left(changes)
         values, vectors = np.linalg.eigh(changes @ left.T)
         vectors = vectors[:, values > 1e-3]
         degrees = vectors.shape[1]
         if not degrees:
-            return Lean(cause, 0.0, 0, 1.0)
+            return ScoreTest(cause, 0.0, 0, 1.0)
         scatter = vectors.T @ (changes @ left.T + self.in_common(left)) @ vectors
         chi2 = float(score @ vectors @ np.linalg.solve(scatter, vectors.T @ score))
-        return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
+        return ScoreTest(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
     def left(self, changes: Array) -> tuple[Array, Array]:
         """(k, pixels) what the fit does not take up of changes G, and (k,) their scores
@@ -433,11 +435,13 @@ class Fitted:
         )
 
 
-def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean:
+def _ghost(
+    task: SearchTask, x: Array, image: Array, root: Array, fit: FitAtMode
+) -> ScoreTest:
     """The shift of the light at which a fainter copy of it explains most; its chance is
     that of the best of many.
     """
-    light = image - background(x, task.model.setting)
+    light = image - background_planes(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
     places = [
         (i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)
@@ -446,7 +450,7 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
     places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
     best = 0.0
     for shift in places:
-        copy = (shifted(light, shift) * root).reshape(1, -1)
+        copy = (shift_frames(light, shift) * root).reshape(1, -1)
         left, score = fit.left(copy)
         seen = float((copy * left).sum())
         if seen > 1e-3 * float((copy**2).sum()) and score[0] > 0:
@@ -454,12 +458,12 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
                 best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
             )
     chance = min(1.0, len(places) * float(stats.chi2.sf(best, 1)) / 2)
-    return Lean(
+    return ScoreTest(
         "a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance
     )
 
 
-def _patch(task: Task, x: Array, root: Array, fit: Fitted) -> Lean:
+def _patch(task: SearchTask, x: Array, root: Array, fit: FitAtMode) -> ScoreTest:
     """The place on the lens whose light, left out, explains most; its chance is that of
     the best of many.
 
@@ -480,7 +484,7 @@ def _patch(task: Task, x: Array, root: Array, fit: Fitted) -> Lean:
             best, place = max((best, place), (chi2, k))
     x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
     chance = min(1.0, len(u) * float(stats.chi2.sf(best, 1)) / 2)
-    return Lean(
+    return ScoreTest(
         f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the lens",
         best,
         1,

@@ -20,9 +20,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference import constrained
-from characterize.inference.leastsquares import Data, Model, Prior, Settings
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import (
+    FitImages,
+    GaussianPrior,
+    Model,
+    SolverSettings,
+)
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 REACH = 1.959964  # of a 95 % interval, in sigma
 PARABOLIC = (0.85, 1.18)  # end of an interval over that of the parabola
@@ -33,11 +38,11 @@ _SOLVES = 5
 # sigma of a step from which on images tell slopes: rounding by 0.002 makes these 2 %
 # longer
 _TELLING = 0.01
-_HUBER = Settings().huber
+_HUBER = SolverSettings().huber
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Spot:
+class ResidualPoint:
     """A place with its residual, and the slopes that are believed there."""
 
     x: Array
@@ -50,7 +55,7 @@ class Spot:
         return float(self.rest @ self.rest)
 
 
-class Valley:
+class LocalMode:
     """The misfit about a mode: -2 ln posterior less a constant, with the noise held.
 
     known: image and Jacobian at the mode, where they have been computed.
@@ -63,9 +68,9 @@ class Valley:
     def __init__(
         self,
         model: Model,
-        data: Data,
+        data: FitImages,
         mode: Array,
-        prior: Prior,
+        prior: GaussianPrior,
         *,
         known: tuple[Array, Array] | None = None,
         above: float = 0.0,
@@ -170,7 +175,7 @@ class Valley:
             if (self.inside(there) != there).any():
                 there = self.inside(
                     x
-                    + constrained.between(
+                    + constrained.bounded_quadratic_step(
                         curved, gradient, self.prior.low - x, self.prior.high - x
                     )
                 )
@@ -179,7 +184,7 @@ class Valley:
                 break
             after = self.residual(there) + shift
             lower = float(after @ after)
-            slopes = secant(slopes, step, after - rest - slopes @ step)
+            slopes = broyden_update(slopes, step, after - rest - slopes @ step)
             if lower < value:
                 x, rest, value = there, after, lower
             else:
@@ -223,14 +228,19 @@ class Valley:
         return np.asarray(rest.ravel() * self._root)
 
 
-def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Array:
+def draw_posterior(
+    valleys: Sequence[LocalMode], count: int = DRAWS, *, seed: int = 0
+) -> Array:
     """(count, p) draws of the posterior around its modes, each mode as often as its
     share of the probability.
     """
     rng = np.random.default_rng(seed)
-    chosen = [valleys[k] for k in rng.choice(len(valleys), count, p=shares(valleys))]
+    chosen = [
+        valleys[k]
+        for k in rng.choice(len(valleys), count, p=mode_probabilities(valleys))
+    ]
 
-    def one(of: tuple[Valley, Array]) -> Array:
+    def one(of: tuple[LocalMode, Array]) -> Array:
         valley, shift = of
         start = valley.inside(
             valley.mode - valley.covariance @ (valley.slopes.T @ shift)
@@ -238,21 +248,21 @@ def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Ar
         return valley.descend(start, shift=shift, rounds=4, least=0.1)[0]
 
     return np.array(
-        threads.each(
+        threads.run_each(
             one,
             [(valley, rng.standard_normal(len(valley.bottom))) for valley in chosen],
         )
     )
 
 
-def shares(valleys: Sequence[Valley]) -> Array:
+def mode_probabilities(valleys: Sequence[LocalMode]) -> Array:
     """(k,) probability of every mode by Laplace's rule, see :func:`log_evidence`."""
     log = np.array([log_evidence(valley) for valley in valleys])
     weight = np.exp(log - log.max())
     return np.asarray(weight / weight.sum())
 
 
-def log_evidence(valley: Valley) -> float:
+def log_evidence(valley: LocalMode) -> float:
     """ln of a mode's evidence over that of the best, but for a constant (Laplace).
 
     -rise / 2 + ln det(C) / 2 with the rise of -2 ln posterior, which holds the
@@ -263,7 +273,7 @@ def log_evidence(valley: Valley) -> float:
     return volume - valley.above / 2
 
 
-def secant(slopes: Array, step: Array, missed: Array) -> Array:
+def broyden_update(slopes: Array, step: Array, missed: Array) -> Array:
     """(n, p) slopes with the least change that explains by what the residual (n,)
     missed theirs (Broyden 1965).
 

@@ -9,12 +9,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import Capture, Frames, merge_brackets, told
-from characterize.inference.leastsquares import Data, Model
-from characterize.model import ForwardModel, Known, Setting, background, usual
+from characterize.captures import (
+    Capture,
+    ElectronFrames,
+    merge_brackets,
+    quantization_score,
+)
+from characterize.inference.leastsquares import FitImages, Model
+from characterize.model import (
+    ForwardModel,
+    FrameSetting,
+    KnownValue,
+    background_planes,
+    usual_parameters,
+)
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 from metalens.fabrication import Kinds, Sensitivity
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
@@ -25,7 +36,9 @@ _FEW_BEYOND, _ROUGH = 0.01, 0.1  # share of the pillars, of slopes
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
-def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
+def merge_exposures(
+    capture: Capture, frames: ElectronFrames
+) -> tuple[Capture, ElectronFrames]:
     """Exposures of one depth and angle as one frame each, by inverse variance.
 
     As they are where exposures are not known, or differ and nobody says what is counted
@@ -57,7 +70,9 @@ def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
     return kept, merged
 
 
-def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, slice]]:
+def setting_of(
+    capture: Capture, largest: int
+) -> tuple[FrameSetting, tuple[slice, slice]]:
     """The frames to predict, and the window (rows, columns) of at most ``largest``
     pixels that is fitted.
 
@@ -86,7 +101,7 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
     exposure = capture.exposure_s / capture.exposure_s.max() if _timed(capture) else 1.0
     n = len(capture.frames)
     rows, columns = (s.stop - s.start for s in window)
-    return Setting(
+    return FrameSetting(
         np.asarray(capture.position_um, float),
         np.asarray(capture.angle_rad, float),
         np.broadcast_to(np.asarray(exposure, float), n).copy(),
@@ -123,14 +138,14 @@ def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
-def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
+def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
     """What is fitted, cut to the window."""
     shape = frames.electrons.shape
     cut = (slice(None), *window)
     wide = frames.variance_e2, frames.scale, frames.common_floor
     floor, scale, dark = (np.broadcast_to(a, shape)[cut] for a in wide)
     seen = frames.electrons[cut], frames.usable[cut], frames.saturated[cut]
-    return Data(
+    return FitImages(
         *seen,
         floor,
         scale,
@@ -140,7 +155,7 @@ def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
     )
 
 
-def unrounded(data: Data, image: Array) -> Data:
+def correct_quantization(data: FitImages, image: Array) -> FitImages:
     """Rounded counts as the means and variances that say the same of light near
     ``image`` (n, y, x).
 
@@ -151,7 +166,7 @@ def unrounded(data: Data, image: Array) -> Data:
     """
     step, variance = data.count_e / data.scale, data.variance(image)
     noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
-    score, information = told((data.electrons - image) / step, noise)
+    score, information = quantization_score((data.electrons - image) / step, noise)
     floor = np.where(
         data.saturated,
         data.variance_e2,
@@ -168,7 +183,7 @@ def unrounded(data: Data, image: Array) -> Data:
     )
 
 
-def quick_enough(model: ForwardModel, data: Data, x: Array) -> ForwardModel:
+def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel:
     """The model with the fewest terms of its fields that change the misfit by nothing
     that counts.
 
@@ -217,7 +232,7 @@ class LeftOut:
 
 
 def lit_part(
-    model: ForwardModel, data: Data, x: Array, image: Array
+    model: ForwardModel, data: FitImages, x: Array, image: Array
 ) -> tuple[slice, slice]:
     """Rows and columns beside which there is next to nothing of what the light of all
     frames tells over its noise.
@@ -225,7 +240,7 @@ def lit_part(
     Args:
         x: all parameters, of ``image`` (n, y, x).
     """
-    light = np.maximum(image - background(x, model.setting), 0.0)
+    light = np.maximum(image - background_planes(x, model.setting), 0.0)
     told, out = (light**2 / data.variance(image) * data.usable).sum(0), []
     for axis in (1, 0):
         share = np.cumsum(told.sum(axis)) / max(float(told.sum()), 1e-300)
@@ -234,7 +249,7 @@ def lit_part(
     return out[0], out[1]
 
 
-def check_enough(data: Data, names: Sequence[str]) -> None:
+def check_enough(data: FitImages, names: Sequence[str]) -> None:
     """Refuse what cannot fix its parameters however good the frames are.
 
     Raises:
@@ -280,16 +295,16 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
             )
 
 
-def stated(capture: Capture, lens: Lens) -> list[Known]:
+def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     """Priors that the capture itself states: wavelength (as usual unless
     wavelength_sigma_nm), pinhole, glass.
     """
     offset, usual_nm = (
         (capture.wavelength_um - lens.wavelength_um) * 1e3,
-        usual(["wavelength_nm"], lens)[0].sigma,
+        usual_parameters(["wavelength_nm"], lens)[0].sigma,
     )
     known = [
-        Known(
+        KnownValue(
             "wavelength_nm",
             offset,
             float(capture.about.get("wavelength_sigma_nm", usual_nm)),
@@ -297,13 +312,13 @@ def stated(capture: Capture, lens: Lens) -> list[Known]:
     ]
     held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
     known += [
-        Known(name, _number(capture, name), 0.0)
+        KnownValue(name, _number(capture, name), 0.0)
         for name in held
         if name in capture.about
     ]
     if "pixel_sigma_um" in capture.about:
         known.append(
-            Known(
+            KnownValue(
                 "pixel_percent",
                 0.0,
                 100
@@ -341,7 +356,7 @@ def _beyond_table(lens: Lens) -> list[str]:
         return []
     kinds, reach_um = (
         Kinds.of(lens.diameters),
-        usual(("bias_nm",), lens)[0].sigma * 1e-3,
+        usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3,
     )
     near = np.zeros(len(kinds.count), bool)
     for size, axis in (

@@ -13,22 +13,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference import leastsquares
-from characterize.inference.leastsquares import Data, Prior, Settings, Solution
-from characterize.model import MODES, PLACE, ForwardModel, basis, prior_rad
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import (
+    FitImages,
+    FitSolution,
+    GaussianPrior,
+    SolverSettings,
+)
+from characterize.model import MODES, PLACE, ForwardModel, prior_rad, thin_plate_basis
+from metalens.core.arrays import Array
 
 MOST_RAD = 0.6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Attempt:
+class ResidualPhaseFit:
     """A fit with the residual phase, and what it did for frames that it had not seen.
 
     solution: of all frames, the ``modes`` after the physical parameters.
     before, after: chi-square of frames left out, per pixel, without and with the phase.
     """
 
-    solution: Solution
+    solution: FitSolution
     modes: Array
     before: float
     after: float
@@ -39,15 +44,15 @@ class Attempt:
         return float(np.linalg.norm(self.modes))
 
 
-def attempt(
+def fit_residual_phase(
     model: ForwardModel,
-    data: Data,
+    data: FitImages,
     names: Sequence[str],
     start: Array,
     *,
     base: Array,
-    prior: Prior,
-) -> Attempt | None:
+    prior: GaussianPrior,
+) -> ResidualPhaseFit | None:
     """The fit with a residual phase; None unless frames left out improve by more than
     chance allows.
 
@@ -62,25 +67,35 @@ def attempt(
     joint = _with_modes(prior)
     wide = np.concatenate([start, np.zeros(MODES)])
     scores = np.zeros(2)
-    settings = Settings(
+    settings = SolverSettings(
         iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
     for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         part, rest = data.planes(np.sort(seen)), data.planes(np.sort(hidden))
         here, there = model.only(np.sort(seen)), model.only(np.sort(hidden))
         for i, (begin, known) in enumerate(((start, prior), (wide, joint))):
-            found = leastsquares.fit(
-                problem(here, names, base), part, begin, prior=known, settings=settings
+            found = leastsquares.fit_levenberg_marquardt(
+                residual_phase_problem(here, names, base),
+                part,
+                begin,
+                prior=known,
+                settings=settings,
             )
-            scores[i] += _misfit(problem(there, names, base), rest, found.value)
+            scores[i] += _misfit(
+                residual_phase_problem(there, names, base), rest, found.value
+            )
     count = float((data.usable & ~data.saturated).sum())
     if scores[1] > scores[0] - max(4 * math.sqrt(2 * count), 0.02 * scores[0]):
         return None
     settings = dataclasses.replace(
         settings, iterations=40, step_tolerance=0.02, near=0.3, finish=True
     )
-    found = leastsquares.fit(
-        problem(model, names, base), data, wide, prior=joint, settings=settings
+    found = leastsquares.fit_levenberg_marquardt(
+        residual_phase_problem(model, names, base),
+        data,
+        wide,
+        prior=joint,
+        settings=settings,
     )
     p = len(names)
     physical = dataclasses.replace(
@@ -91,10 +106,12 @@ def attempt(
         beyond=found.beyond[:p],
         slopes=found.slopes[:p],
     )
-    return Attempt(physical, found.value[p:], scores[0] / count, scores[1] / count)
+    return ResidualPhaseFit(
+        physical, found.value[p:], scores[0] / count, scores[1] / count
+    )
 
 
-def problem(
+def residual_phase_problem(
     model: ForwardModel, names: Sequence[str], base: Array
 ) -> leastsquares.Model:
     """Images by the named parameters, and by the modes where values are left behind
@@ -105,14 +122,18 @@ def problem(
     def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
         x = base.copy()
         x[place] = values[:p]
-        of = model.with_residual(values[p:], basis) if len(values) > p else model
+        of = (
+            model.with_residual(values[p:], thin_plate_basis)
+            if len(values) > p
+            else model
+        )
         wanted = [*names, *(f"residual_{k}" for k in range(len(values) - p))]
         return of.images(x, wanted if jacobian else None)
 
     return images
 
 
-def _with_modes(prior: Prior) -> Prior:
+def _with_modes(prior: GaussianPrior) -> GaussianPrior:
     wide, zero = np.full(MODES, np.inf), np.zeros(MODES)
     parts = (
         (prior.mean, zero),
@@ -121,7 +142,7 @@ def _with_modes(prior: Prior) -> Prior:
         (prior.high, wide),
     )
     mean, sigma, low, high = (np.concatenate(part) for part in parts)
-    return Prior(mean, sigma, low, high)
+    return GaussianPrior(mean, sigma, low, high)
 
 
 def _without_modes(information: Array, p: int) -> Array:
@@ -135,7 +156,7 @@ def _without_modes(information: Array, p: int) -> Array:
     )
 
 
-def _misfit(model: leastsquares.Model, data: Data, value: Array) -> float:
+def _misfit(model: leastsquares.Model, data: FitImages, value: Array) -> float:
     image, _ = model(value, False)
     keep = data.usable & ~data.saturated
     return float(

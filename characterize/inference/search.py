@@ -9,25 +9,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from characterize.captures import between
+from characterize.captures import relative_orientation
 from characterize.inference import leastsquares, residual
-from characterize.inference.arrange import Arrangement, few_frames
-from characterize.inference.constrained import Ball
-from characterize.inference.leastsquares import Data, Prior, Settings, Solution
+from characterize.inference.arrange import FrameArrangement, few_frames
+from characterize.inference.constrained import BallConstraint
+from characterize.inference.leastsquares import (
+    FitImages,
+    FitSolution,
+    GaussianPrior,
+    SolverSettings,
+)
 from characterize.inference.prepare import LeftOut, lit_part
 from characterize.model import (
     NAMES,
     PARAMETERS,
     PLACE,
     ForwardModel,
-    Known,
-    usual,
-    vector,
+    KnownValue,
+    parameter_vector,
+    usual_parameters,
 )
+from metalens.core import threads
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import coarser
-from metalens.ground import threads
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens
 
 WAVES_RAD = 0.9
@@ -39,7 +44,7 @@ _ALONG_NM, _ASIDE_UM = (
 )  # bias by which starts are moved along the valley; where windows begin at most
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
-_ONWARD = Settings(
+_ONWARD = SolverSettings(
     iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False
 )
 # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
@@ -47,21 +52,21 @@ _WORTH = 10.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Task:
+class SearchTask:
     """What is searched: the model and its data, all start values, what is known, how
     the frames lie, what is free.
 
     found: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes
     (``characterize.model.UNFITTED``).
-    left_out: what is added to images and slopes of the model; see :func:`anchored`.
+    left_out: what is added to images and slopes of the model; see :func:`correct_surrogate`.
     """
 
     model: ForwardModel
-    data: Data
+    data: FitImages
     start: Array
-    known: dict[str, Known]
-    found: Arrangement | None
+    known: dict[str, KnownValue]
+    found: FrameArrangement | None
     free: tuple[str, ...] = ()
     unfitted: dict[str, float] = field(default_factory=dict)
     left_out: LeftOut | None = None
@@ -72,7 +77,7 @@ class Task:
         return names_of(self.known, self.free)
 
     @property
-    def prior(self) -> Prior:
+    def prior(self) -> GaussianPrior:
         """Of the fitted parameters."""
         return prior_of(self.names, self.known, self.model.lens)
 
@@ -80,11 +85,11 @@ class Task:
         """Images of all frames, or roughly of some."""
         model = self.model if frames is None else self.model.only(frames)
         if self.left_out is None:
-            return residual.problem(
+            return residual.residual_phase_problem(
                 model if frames is None else model.quick(), self.names, self.start
             )
         return self.left_out.added(
-            residual.problem(model, self.names, self.start), frames
+            residual.residual_phase_problem(model, self.names, self.start), frames
         )
 
     def all_of(self, value: Array) -> Array:
@@ -94,7 +99,7 @@ class Task:
         )
 
 
-def anchored(task: Task, at: Solution) -> Task:
+def correct_surrogate(task: SearchTask, at: FitSolution) -> SearchTask:
     """The task by a quick model put right at a fit, where there is light: a third of
     the work for an image, or less.
 
@@ -117,7 +122,7 @@ def anchored(task: Task, at: Solution) -> Task:
     )
 
 
-def oriented(tasks: Sequence[Task]) -> Task:
+def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     """Of tasks that differ by how the frames lie the one that a short fit to some of
     them makes likeliest.
 
@@ -128,7 +133,9 @@ def oriented(tasks: Sequence[Task]) -> Task:
     if len(tasks) == 1:
         return tasks[0]
     few = few_frames(tasks[0].model.setting)
-    tries = [_short(task, few, starts(task, biases_nm=(0.0,)))[0] for task in tasks]
+    tries = [
+        _short(task, few, starting_points(task, biases_nm=(0.0,)))[0] for task in tasks
+    ]
     merits = np.array([one.merit for one in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
@@ -137,7 +144,7 @@ def oriented(tasks: Sequence[Task]) -> Task:
                 tries[k].value,
                 tasks[k].prior,
             )
-            merits[k] = leastsquares.fit(
+            merits[k] = leastsquares.fit_levenberg_marquardt(
                 tasks[k].problem(few), part, begin, prior=prior, settings=_ONWARD
             ).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
@@ -148,7 +155,7 @@ def oriented(tasks: Sequence[Task]) -> Task:
         if merit < merits[best] + _PROMISING
     ]
     turns = {
-        between(found[best].orientation, o.orientation)
+        relative_orientation(found[best].orientation, o.orientation)
         for o in near
         if o.reordered == found[best].reordered
     }
@@ -159,7 +166,9 @@ def oriented(tasks: Sequence[Task]) -> Task:
     )
 
 
-def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solution]]:
+def search_modes(
+    task: SearchTask, *, begins: Sequence[Array] = ()
+) -> tuple[SearchTask, list[FitSolution]]:
     """The valleys that explain the frames, best first, the others within
     ``MODES_WITHIN`` of it; and the task with its
     windows held where the best has them.
@@ -172,9 +181,9 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solu
     the end too.
     """
     few = few_frames(task.model.setting)
-    plain = starts(task)
+    plain = starting_points(task)
     first = _short(task, few, list(begins) or [*plain, *_leaning(plain[0])])
-    task = held(task, first[0].value)
+    task = hold_windows(task, first[0].value)
     near = _nearer(task, first[0].value)
     best = _long(task, near.value, near.slopes)
     tries = sorted(
@@ -182,13 +191,14 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solu
     )
     floor = min(tries[0].merit, first[0].merit)
     promising = [t.value for t in tries if t.merit < floor + _PROMISING]
-    about = anchored(task, best)
-    return task, mirrored(
-        about, distinct([best, *followed(about, best, promising[: 2 * _MOST])])
+    about = correct_surrogate(task, best)
+    return task, add_mirrored_starts(
+        about,
+        distinct_modes([best, *follow_starts(about, best, promising[: 2 * _MOST])]),
     )
 
 
-def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
+def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
     """The ends, and where their biases reversed lead: frames near focus look much alike
     with a gradient of either sign.
 
@@ -198,31 +208,33 @@ def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
         best = ends[0]
         begins = [
             b
-            for b in reversals(task, best)
+            for b in bias_reversals(task, best)
             if all(_apart(b, end) > 2.0 for end in ends)
         ]
-        ends = distinct([*ends, *followed(task, best, begins)])
+        ends = distinct_modes([*ends, *follow_starts(task, best, begins)])
         if ends[0].merit > best.merit - 1:
             break
     return ends
 
 
-def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
+def follow_starts(
+    task: SearchTask, best: FitSolution, begins: Sequence[Array]
+) -> list[FitSolution]:
     """Where some starts lead: a few steps on all frames, and to the end what promises
     as much as the best.
 
     At most ``_MOST`` ends, none that leads to the best itself or to another.
     """
-    settings = Settings(
+    settings = SolverSettings(
         iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False
     )
-    ends: list[Solution] = []
+    ends: list[FitSolution] = []
     for begin in begins:
         if len(ends) == _MOST:
             break
         if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
             continue
-        one = leastsquares.fit(
+        one = leastsquares.fit_levenberg_marquardt(
             task.problem(), task.data, begin, prior=task.prior, settings=settings
         )
         if one.merit < best.merit + MODES_WITHIN + _WORTH and all(
@@ -232,7 +244,7 @@ def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Soluti
     return ends
 
 
-def reversals(task: Task, best: Solution) -> list[Array]:
+def bias_reversals(task: SearchTask, best: FitSolution) -> list[Array]:
     """Starts with the sign of some biases turned round, all other parameters going
     along as the parabola says.
 
@@ -242,13 +254,13 @@ def reversals(task: Task, best: Solution) -> list[Array]:
     that does, and these together.
     """
     value, covariance = best.value, best.covariance
-    rows = usual(task.names, task.model.lens)
+    rows = usual_parameters(task.names, task.model.lens)
     whole = [i for i, row in enumerate(rows) if row.reversible]
     places = [i for i in whole if task.names[i] != "bias_nm"]
     off = (
         float(
             value[whole]
-            @ leastsquares.invert(covariance[np.ix_(whole, whole)])
+            @ leastsquares.invert_information(covariance[np.ix_(whole, whole)])
             @ value[whole]
         )
         if whole
@@ -264,12 +276,12 @@ def reversals(task: Task, best: Solution) -> list[Array]:
     return out
 
 
-def refine(task: Task, value: Array) -> Solution:
+def refine_fit(task: SearchTask, value: Array) -> FitSolution:
     """A fit to the end from values of the fitted parameters."""
     return _long(task, value)
 
 
-def held(task: Task, value: Array) -> Task:
+def hold_windows(task: SearchTask, value: Array) -> SearchTask:
     """The task with its windows held where values of the fitted parameters have them.
 
     Frames begin where the light lies, up to a pixel off the decentre (a prism of the
@@ -286,42 +298,46 @@ def held(task: Task, value: Array) -> Task:
     )
 
 
-def placed(task: Task, ends: list[Solution]) -> tuple[Task, list[Solution]]:
+def place_windows(
+    task: SearchTask, ends: list[FitSolution]
+) -> tuple[SearchTask, list[FitSolution]]:
     """The task with its windows held where the best end has them, and the ends followed
     there.
     """
-    there = held(task, ends[0].value)
+    there = hold_windows(task, ends[0].value)
     if there is task:
         return task, ends
     best = _long(there, ends[0].value, ends[0].slopes)
-    about = anchored(there, best)
-    return there, distinct(
+    about = correct_surrogate(there, best)
+    return there, distinct_modes(
         [best, *(_long(about, end.value, end.slopes) for end in ends[1:])]
     )
 
 
-def wider(task: Task, begin: Array) -> tuple[Task, list[Solution]] | None:
+def widen_search(
+    task: SearchTask, begin: Array
+) -> tuple[SearchTask, list[FitSolution]] | None:
     """A search with more parameters from where the usual ones led; None where they lead
     out of the model's range.
     """
     try:
-        return search(task, begins=[begin])
+        return search_modes(task, begins=[begin])
     except FitError:
         return None
 
 
-def merit_with(task: Task, best: Solution, frees: Sequence[str]) -> float:
+def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> float:
     """-2 ln posterior of a short fit with further parameters, from where the best is;
     infinite where they lead out of the model's range.
     """
     more = dataclasses.replace(task, free=(*task.free, *frees), left_out=None)
     x = task.all_of(best.value)
     begin = with_values(x, _opened(more, x))[[PLACE[name] for name in more.names]]
-    settings = Settings(
+    settings = SolverSettings(
         iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
     try:
-        found = leastsquares.fit(
+        found = leastsquares.fit_levenberg_marquardt(
             more.problem(), more.data, begin, prior=more.prior, settings=settings
         )
     except FitError:
@@ -329,9 +345,9 @@ def merit_with(task: Task, best: Solution, frees: Sequence[str]) -> float:
     return found.merit
 
 
-def distinct(ends: Sequence[Solution]) -> list[Solution]:
+def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
     """Ends that are not the same, best first, within ``MODES_WITHIN`` of the best."""
-    kept: list[Solution] = []
+    kept: list[FitSolution] = []
     for one in sorted(ends, key=lambda e: e.merit):
         near = one.merit < kept[0].merit + MODES_WITHIN if kept else True
         if near and all(_apart(one.value, other) > 1.0 for other in kept):
@@ -339,19 +355,23 @@ def distinct(ends: Sequence[Solution]) -> list[Solution]:
     return kept
 
 
-def _apart(value: Array, end: Solution) -> float:
+def _apart(value: Array, end: FitSolution) -> float:
     """Distance in sigma of the end's own parabola."""
     step = value - end.value
-    return float(math.sqrt(max(step @ leastsquares.invert(end.covariance) @ step, 0.0)))
+    return float(
+        math.sqrt(
+            max(step @ leastsquares.invert_information(end.covariance) @ step, 0.0)
+        )
+    )
 
 
-def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
+def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSolution]:
     place = [PLACE[name] for name in task.names]
-    waves = Ball(
+    waves = BallConstraint(
         np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]),
         WAVES_RAD,
     )
-    short = Settings(
+    short = SolverSettings(
         iterations=4,
         step_tolerance=1.0,
         secant=True,
@@ -362,19 +382,19 @@ def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     )
     part, seen = task.problem(few), task.data.planes(few)
 
-    def one(begin: Array) -> Solution:
+    def one(begin: Array) -> FitSolution:
         opened = with_values(begin, _opened(task, begin))
-        return leastsquares.fit(
+        return leastsquares.fit_levenberg_marquardt(
             part, seen, opened[place], prior=task.prior, settings=short
         )
 
-    return sorted(threads.each(one, begins), key=lambda t: t.merit)
+    return sorted(threads.run_each(one, begins), key=lambda t: t.merit)
 
 
-def _long(task: Task, value: Array, slopes: Array | None = None) -> Solution:
+def _long(task: SearchTask, value: Array, slopes: Array | None = None) -> FitSolution:
     """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
-    settings = Settings(iterations=80, secant=True)
-    return leastsquares.fit(
+    settings = SolverSettings(iterations=80, secant=True)
+    return leastsquares.fit_levenberg_marquardt(
         task.problem(),
         task.data,
         value,
@@ -384,22 +404,22 @@ def _long(task: Task, value: Array, slopes: Array | None = None) -> Solution:
     )
 
 
-def _nearer(task: Task, value: Array) -> Solution:
+def _nearer(task: SearchTask, value: Array) -> FitSolution:
     """Near the lowest place on all frames, by a quick model put right where a short fit
     ended.
     """
-    at = leastsquares.fit(
+    at = leastsquares.fit_levenberg_marquardt(
         task.problem(),
         task.data,
         value,
         prior=task.prior,
-        settings=Settings(iterations=0),
+        settings=SolverSettings(iterations=0),
     )
-    images = anchored(task, at).problem()
-    settings = Settings(
+    images = correct_surrogate(task, at).problem()
+    settings = SolverSettings(
         iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
-    return leastsquares.fit(
+    return leastsquares.fit_levenberg_marquardt(
         images,
         task.data,
         at.value,
@@ -409,7 +429,7 @@ def _nearer(task: Task, value: Array) -> Solution:
     )
 
 
-def _opened(task: Task, x: Array) -> dict[str, float]:
+def _opened(task: SearchTask, x: Array) -> dict[str, float]:
     """Sizes that have no slope at 0 start off it."""
     off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5, "glass_um": 50.0}
     return {
@@ -419,28 +439,30 @@ def _opened(task: Task, x: Array) -> dict[str, float]:
     }
 
 
-def names_of(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
+def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ...]:
     """What is fitted: the usual, what is asked for, what is known with an error."""
     for name in free:
-        vector({name: 0.0})
+        parameter_vector({name: 0.0})
     wanted = {p.name for p in PARAMETERS if p.free} | set(free)
     wanted |= {k.name for k in known.values() if k.sigma > 0}
     wanted -= {k.name for k in known.values() if k.sigma == 0 and k.name not in free}
     return tuple(name for name in NAMES if name in wanted)
 
 
-def prior_of(names: Sequence[str], known: dict[str, Known], lens: Lens) -> Prior:
+def prior_of(
+    names: Sequence[str], known: dict[str, KnownValue], lens: Lens
+) -> GaussianPrior:
     """Priors of the fitted parameters: metrology where there is, else what is usual for
     such a lens.
     """
-    table = usual(names, lens)
+    table = usual_parameters(names, lens)
     entries = [known.get(name) for name in names]
     mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
     sigma = [
         k.sigma if k and k.sigma > 0 else p.sigma
         for k, p in zip(entries, table, strict=True)
     ]
-    return Prior(
+    return GaussianPrior(
         np.array(mean),
         np.array(sigma),
         np.array([p.low for p in table]),
@@ -456,7 +478,7 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def window_um(found: Arrangement, model: ForwardModel) -> tuple[float, float]:
+def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, float]:
     """(x, y) of the window's middle from the chief ray, as the light lies in the
     frames.
     """
@@ -468,7 +490,9 @@ def window_um(found: Arrangement, model: ForwardModel) -> tuple[float, float]:
     return x, y
 
 
-def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
+def starting_points(
+    task: SearchTask, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)
+) -> list[Array]:
     """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain,
     background off the frames.
     """
@@ -518,7 +542,7 @@ def _leaning(plain: Array) -> list[Array]:
     ]
 
 
-def _twins(task: Task, best: Solution) -> list[Array]:
+def _twins(task: SearchTask, best: FitSolution) -> list[Array]:
     """What was found with its even aberrations reversed, and moved along the valley of
     the bias to either side.
     """

@@ -11,17 +11,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from characterize.captures import Gain
+from characterize.captures import SensorNoise
 from characterize.inference import residual
 from characterize.inference.explore import Posterior
-from characterize.inference.leastsquares import Prior, Solution
-from characterize.inference.missing import Finding, Unstated
-from characterize.inference.posterior import Valley
-from characterize.inference.search import WAVES_RAD, Task
-from characterize.model import ForwardModel, Known, Parameter, thinplate
+from characterize.inference.leastsquares import FitSolution, GaussianPrior
+from characterize.inference.missing import ResidualFinding, UnmodelledShifts
+from characterize.inference.posterior import LocalMode
+from characterize.inference.search import WAVES_RAD, SearchTask
+from characterize.model import FitParameter, ForwardModel, KnownValue, thinplate
+from metalens.core import threads
+from metalens.core.arrays import Array
 from metalens.fabrication import coarser
-from metalens.ground import threads
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
@@ -35,14 +35,14 @@ _ONE_COLOUR_NM = (
 _STRUCTURE = 4.5
 
 
-def explained(solution: Solution, gain: Gain) -> bool:
+def is_chi_square_consistent(solution: FitSolution, gain: SensorNoise) -> bool:
     """Whether chi-square is that of noise: within 15 %, or four of its own sigma where
     pixels or flats are few.
     """
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
 
 
-def rounding(gain: Gain, *, whole: bool) -> list[str]:
+def quantization_text(gain: SensorNoise, *, whole: bool) -> list[str]:
     """How counts too coarse for their noise were fitted, in words; empty for others.
 
     Args:
@@ -59,7 +59,7 @@ def rounding(gain: Gain, *, whole: bool) -> list[str]:
     return []
 
 
-def too_quiet(solution: Solution, gain: Gain) -> list[str]:
+def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
     """Whether frames have less noise than the noise model says, in words.
 
     Chi-square may be as far below 1 as above; half of it where no gain is known.
@@ -77,26 +77,28 @@ def too_quiet(solution: Solution, gain: Gain) -> list[str]:
     ]
 
 
-def _allowed(solution: Solution, gain: Gain) -> float:
+def _allowed(solution: FitSolution, gain: SensorNoise) -> float:
     chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
     return max(MISFIT - 1, min(chance, 0.5))
 
 
-def left_over(solution: Solution) -> bool:
+def left_over(solution: FitSolution) -> bool:
     """Whether the frames hold more than noise, but not so much that they are of
     something else.
     """
     return 3 * chance_of(solution) < solution.chi2_per_dof - 1 < 30
 
 
-def chance_of(solution: Solution) -> float:
+def chance_of(solution: FitSolution) -> float:
     """Standard deviation of chi-square per degree of freedom over the pixels that
     count.
     """
     return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
 
 
-def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str]:
+def fit_problems(
+    names: tuple[str, ...], solution: FitSolution, gain: SensorNoise
+) -> list[str]:
     """Checks of a finished fit, each with the cause it points to; bounds are judged by
     :func:`held_back`.
     """
@@ -110,7 +112,7 @@ def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str
             "for intervals that hold; expose longer, or average frames"
         )
     outliers = float((np.abs(solution.residual_sigma) > 6).mean())
-    if gain.known and not explained(solution, gain):
+    if gain.known and not is_chi_square_consistent(solution, gain):
         frame = int(np.argmax((solution.residual_sigma**2).mean((1, 2))))
         words.append(
             f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, not 1: the model does not explain "
@@ -135,7 +137,9 @@ def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str
     return words
 
 
-def held_back(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[str]:
+def held_back(
+    names: tuple[str, ...], solution: FitSolution, prior: GaussianPrior
+) -> list[str]:
     """:func:`at_bounds` in words."""
     return [
         f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread"
@@ -144,7 +148,7 @@ def held_back(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[
 
 
 def at_bounds(
-    names: tuple[str, ...], solution: Solution, prior: Prior
+    names: tuple[str, ...], solution: FitSolution, prior: GaussianPrior
 ) -> list[tuple[str, float]]:
     """Parameters that a bound holds back, one which is not the natural zero of a blur.
 
@@ -169,7 +173,7 @@ def at_bounds(
     ]
 
 
-def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
+def spectrum_text(lens: Lens, known: Mapping[str, KnownValue]) -> list[str]:
     """Whether pillars were solved for the colours of a stated spectrum, in words;
     beyond, ``designed`` holds them.
     """
@@ -185,7 +189,9 @@ def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
     ]
 
 
-def structure(residual_sigma: Array, shared: Array | None = None) -> list[Finding]:
+def correlated_residuals_text(
+    residual_sigma: Array, shared: Array | None = None
+) -> list[ResidualFinding]:
     """Correlations between residuals that chi-square does not show.
 
     For noise, the mean product of neighbours scatters about 0 by one over the root of
@@ -197,7 +203,7 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[Findin
             or saturated.
         shared: (2, n, y, x) standard deviations of such errors over the noise, by dark
             and by flat, see
-            :meth:`characterize.inference.leastsquares.Data.shared`.
+            :meth:`characterize.inference.leastsquares.FitImages.shared`.
     """
     r = np.clip(residual_sigma, -6, 6)
     dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
@@ -213,7 +219,7 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[Findin
             f"({sides.max():.1f} sigma): more is there than the parameters describe; "
             "see the residual map"
         )
-        found.append(Finding(words, float(sides.max())))
+        found.append(ResidualFinding(words, float(sides.max())))
     if len(r) > 1:
         frames = _from_frame_to_frame(
             r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2)
@@ -223,7 +229,7 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[Findin
                 f"residuals go together from frame to frame ({frames:.1f} sigma): the "
                 "same is missed in each"
             )
-            found.append(Finding(words, frames))
+            found.append(ResidualFinding(words, frames))
     levels = r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1))
     at = int(np.argmax(np.abs(levels)))
     if abs(levels[at]) > _STRUCTURE + 0.5:
@@ -231,7 +237,7 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[Findin
             f"frame {at} is brighter or darker than the model by "
             f"{abs(levels[at]):.1f} sigma: exposure or lamp"
         )
-        found.append(Finding(words, float(abs(levels[at]))))
+        found.append(ResidualFinding(words, float(abs(levels[at]))))
     return found
 
 
@@ -264,7 +270,11 @@ def _together(one: Array, other: Array) -> Array:
 
 
 def process_verdict(
-    rows: Sequence[Parameter], low: Array, high: Array, told: Array, unstated: Unstated
+    rows: Sequence[FitParameter],
+    low: Array,
+    high: Array,
+    told: Array,
+    unstated: UnmodelledShifts,
 ) -> str:
     """Which causes the frames fix, and which come from prior knowledge or only with
     others.
@@ -311,7 +321,7 @@ def process_verdict(
     )
 
 
-def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
+def predicted_error(task: SearchTask, found: Posterior) -> tuple[float, float]:
     """Expected NRMSE of the as-built images: at the captured depths, and half-way
     between them.
     """
@@ -320,15 +330,15 @@ def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
         _shown(task, found),
     )  # differences of images, to a few percent
     return _spread(task, model, found.best.value, values), _spread(
-        task, between(model), found.best.value, values
+        task, models_between_depths(model), found.best.value, values
     )
 
 
-def predicted_aside(task: Task, found: Posterior) -> tuple[float, float] | None:
+def predicted_aside(task: SearchTask, found: Posterior) -> tuple[float, float] | None:
     """As :func:`predicted_error` at the captured depths: half-way between neighbouring
     field angles, and half a step
     beyond the outermost; None of frames at one angle."""
-    angles = aside(task.model.setting.angle_rad)
+    angles = largest_angle_gap(task.model.setting.angle_rad)
     if angles is None:
         return None
     values = _shown(task, found)
@@ -339,7 +349,7 @@ def predicted_aside(task: Task, found: Posterior) -> tuple[float, float] | None:
     return between_them, beyond
 
 
-def aside(angle_rad: Array) -> tuple[Array, Array] | None:
+def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
     """(x, y) half-way between the two neighbours that lie farthest apart among field
     angles (n, 2), and as far beyond
     the outermost as half of its step from its neighbour; None where all are one."""
@@ -367,11 +377,11 @@ def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     return (
         ForwardModel(model.lens, there, model.response)
         .about(model.grid.middle_um)
-        .with_residual(model.modes, thinplate.basis)
+        .with_residual(model.modes, thinplate.thin_plate_basis)
     )
 
 
-def _shown(task: Task, found: Posterior) -> Array:
+def _shown(task: SearchTask, found: Posterior) -> Array:
     """(draws, p) of the posterior, within the bounds."""
     if len(found.draws):
         values = found.draws[:_SHOWN]
@@ -384,9 +394,9 @@ def _shown(task: Task, found: Posterior) -> Array:
     return np.clip(values, task.prior.low, task.prior.high)
 
 
-def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> float:
+def _spread(task: SearchTask, model: ForwardModel, best: Array, values: Array) -> float:
     """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
-    images = residual.problem(model, task.names, task.start)
+    images = residual.residual_phase_problem(model, task.names, task.start)
     dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
 
     def light(x: Array) -> Array:
@@ -402,11 +412,11 @@ def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> floa
         return float(((one - mean) ** 2).sum())
 
     return float(
-        np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum())
+        np.sqrt(sum(threads.run_each(away, values)) / len(values) / (mean**2).sum())
     )
 
 
-def between(model: ForwardModel) -> ForwardModel:
+def models_between_depths(model: ForwardModel) -> ForwardModel:
     """The model half-way, in 1/z, between neighbouring depths at each angle; the
     farthest frame moves inwards.
     """
@@ -422,7 +432,7 @@ def between(model: ForwardModel) -> ForwardModel:
     return part
 
 
-def left_out(task: Task, mode: Solution) -> float:
+def left_out(task: SearchTask, mode: FitSolution) -> float:
     """Chi-square a pixel of frames left out, every second depth and then the others,
     over that of the full fit.
 
@@ -438,22 +448,28 @@ def left_out(task: Task, mode: Solution) -> float:
         for seen, hidden in itertools.permutations((order[::2], order[1::2]))
     ]
     total, count = np.sum(
-        threads.each(functools.partial(_unseen, task, mode), halves), 0
+        threads.run_each(functools.partial(_unseen, task, mode), halves), 0
     )
     return float(total / max(count, 1))
 
 
-def _unseen(task: Task, mode: Solution, part: tuple[Array, Array]) -> tuple[float, int]:
+def _unseen(
+    task: SearchTask, mode: FitSolution, part: tuple[Array, Array]
+) -> tuple[float, int]:
     """(chi-square, pixels) of the second frames by what the first say."""
     seen, hidden = part
-    images = residual.problem(task.model.only(seen), task.names, task.start)
+    images = residual.residual_phase_problem(
+        task.model.only(seen), task.names, task.start
+    )
     known = mode.image[seen], mode.slopes[:, seen]
-    valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
+    valley = LocalMode(
+        images, task.data.planes(seen), mode.value, task.prior, known=known
+    )
     value, _ = valley.descend(mode.value, rounds=6)
     rest = task.data.planes(hidden)
-    image = residual.problem(task.model.only(hidden), task.names, task.start)(
-        value, False
-    )[0]
+    image = residual.residual_phase_problem(
+        task.model.only(hidden), task.names, task.start
+    )(value, False)[0]
     keep = rest.usable & ~rest.saturated
     slopes = mode.slopes[:, hidden][:, keep]
     known_e2 = np.einsum(

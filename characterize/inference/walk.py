@@ -20,10 +20,16 @@ from scipy import interpolate
 
 from characterize.inference import leastsquares
 from characterize.inference.arrange import few_frames
-from characterize.inference.leastsquares import Data, Model, Prior, Settings, Solution
-from characterize.inference.search import Task, distinct, followed
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from characterize.inference.leastsquares import (
+    FitImages,
+    FitSolution,
+    GaussianPrior,
+    Model,
+    SolverSettings,
+)
+from characterize.inference.search import SearchTask, distinct_modes, follow_starts
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 WALKED = ("bias_nm",)
 REACH = 2.5  # prior sigma to either side of what is thought
@@ -32,19 +38,19 @@ REACH = 2.5  # prior sigma to either side of what is thought
 SHOWN = 14.0
 _WIDEST = 0.35  # of the prior sigma: a step at most
 _VALLEYS, _AGAIN, _BRANCHES = 3, 3, 2
-_NEAR = Settings(
+_NEAR = SolverSettings(
     iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False
 )
-_FAR = Settings(
+_FAR = SolverSettings(
     iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False
 )
 _FINE, _COARSE, _ON_IT = 1201, 101, 3.0
-_HUBER = Settings().huber
-Part = tuple[Model, Data]
+_HUBER = SolverSettings().huber
+Part = tuple[Model, FitImages]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Walk:
+class ProfileScan:
     """Where the others go as one parameter is walked.
 
     index: of the parameter. value: (k, p) all parameters, the walked one's rising.
@@ -59,22 +65,22 @@ class Walk:
     rise: Array
     spread: Array
     shown: float = SHOWN
-    stops: tuple[Solution, ...] = ()
+    stops: tuple[FitSolution, ...] = ()
 
     @classmethod
     def of(
         cls,
-        task: Task,
-        stops: Sequence[Solution],
+        task: SearchTask,
+        stops: Sequence[FitSolution],
         index: int,
         *,
         least: float = 0.0,
         shown: float = SHOWN,
-    ) -> "Walk":
+    ) -> "ProfileScan":
         """By its stops, in any order; of two at one place the lower. Their merits are
         those of :func:`_measured`.
         """
-        order: list[Solution] = []
+        order: list[FitSolution] = []
         for one in sorted(stops, key=lambda s: (s.value[index], s.merit)):
             if not order or one.value[index] > order[-1].value[index]:
                 order.append(one)
@@ -207,7 +213,9 @@ class Walk:
         others = np.flatnonzero(np.arange(len(value)) != self.index)
         away = (value - middle)[others]
         return bool(
-            away @ leastsquares.invert(spread[np.ix_(others, others)]) @ away
+            away
+            @ leastsquares.invert_information(spread[np.ix_(others, others)])
+            @ away
             < _ON_IT**2
         )
 
@@ -239,7 +247,9 @@ def _half_volume(spread: Array, index: int) -> Array:
     return np.asarray(np.linalg.slogdet(spread[:, others[:, None], others])[1] / 2)
 
 
-def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
+def find_modes(
+    task: SearchTask, modes: Sequence[FitSolution], name: str
+) -> list[FitSolution]:
     """The modes with those that a walk over the prior of one parameter leads to, best
     first.
 
@@ -259,20 +269,20 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
             here, image=best.image[few], slopes=best.slopes[:, few]
         )
         side = functools.partial(_side, task, part, here, i, step=step, settings=_FAR)
-        sides = threads.each(side, _ends(task, best, i))
-        seen = Walk.of(task, [*sides[0], *sides[1], here], i)
+        sides = threads.run_each(side, _ends(task, best, i))
+        seen = ProfileScan.of(task, [*sides[0], *sides[1], here], i)
         begins = [
             seen.value[k] for k in seen.minima() if seen.value[k, i] != best.value[i]
         ]
-        kept = distinct([*kept, *followed(task, best, begins[:_VALLEYS])])
+        kept = distinct_modes([*kept, *follow_starts(task, best, begins[:_VALLEYS])])
         if kept[0].merit > best.merit - 1:
             break
     return kept
 
 
-def walk(
-    task: Task, modes: Sequence[Solution], name: str, *, widened: float = 1.0
-) -> Walk:
+def scan_profile(
+    task: SearchTask, modes: Sequence[FitSolution], name: str, *, widened: float = 1.0
+) -> ProfileScan:
     """Through the valleys of the modes, on all frames, as far as they are no higher
     than ``SHOWN`` above the best.
 
@@ -286,10 +296,10 @@ def walk(
     ]
     sigma = max(float(np.sqrt(one.covariance[i, i])) for one in modes)
     step, shown = min(sigma, _WIDEST * _wide(task, lows[0], i)), SHOWN * widened
-    stops: list[Solution] = []
+    stops: list[FitSolution] = []
     for mode in lows:
         low, high = _ends(task, mode, i)
-        if stops and Walk.of(task, stops, i).passes(
+        if stops and ProfileScan.of(task, stops, i).passes(
             mode.value
         ):  # as finely about this one as about the first
             low, high = (
@@ -301,11 +311,11 @@ def walk(
         side = functools.partial(
             _side, task, part, mode, i, step=step, settings=_NEAR, most=most
         )
-        stops += itertools.chain.from_iterable(threads.each(side, (low, high)))
-    return Walk.of(task, stops, i, least=lows[0].merit, shown=shown)
+        stops += itertools.chain.from_iterable(threads.run_each(side, (low, high)))
+    return ProfileScan.of(task, stops, i, least=lows[0].merit, shown=shown)
 
 
-def _wide(task: Task, mode: Solution, i: int) -> float:
+def _wide(task: SearchTask, mode: FitSolution, i: int) -> float:
     """Sigma of the prior, or what stands for it where there is none."""
     known = float(task.prior.sigma[i])
     return (
@@ -315,7 +325,7 @@ def _wide(task: Task, mode: Solution, i: int) -> float:
     )
 
 
-def _ends(task: Task, mode: Solution, i: int) -> tuple[float, float]:
+def _ends(task: SearchTask, mode: FitSolution, i: int) -> tuple[float, float]:
     """What the prior leaves possible, and the mode."""
     prior, here = task.prior, float(mode.value[i])
     middle = float(prior.mean[i]) if np.isfinite(prior.sigma[i]) else here
@@ -326,16 +336,16 @@ def _ends(task: Task, mode: Solution, i: int) -> tuple[float, float]:
 
 
 def _side(
-    task: Task,
+    task: SearchTask,
     part: Part,
-    mode: Solution,
+    mode: FitSolution,
     i: int,
     end: float,
     *,
     step: float,
-    settings: Settings,
+    settings: SolverSettings,
     most: float = math.inf,
-) -> list[Solution]:
+) -> list[FitSolution]:
     """Stops from the mode to one end, or to the first that is higher than ``most``.
 
     Two steps at a time with a Jacobian, then the stop that was left out, with the mean
@@ -356,8 +366,13 @@ def _side(
 
 
 def _stop(
-    task: Task, part: Part, here: Solution, i: int, goal: float, settings: Settings
-) -> Solution:
+    task: SearchTask,
+    part: Part,
+    here: FitSolution,
+    i: int,
+    goal: float,
+    settings: SolverSettings,
+) -> FitSolution:
     """The others fitted with one parameter at ``goal``, from where they are or where
     the parabola sends them.
 
@@ -379,13 +394,13 @@ def _stop(
 
 
 def _amid(
-    task: Task,
+    task: SearchTask,
     part: Part,
-    ends: tuple[Solution, Solution],
+    ends: tuple[FitSolution, FitSolution],
     i: int,
     goal: float,
-    settings: Settings,
-) -> Solution:
+    settings: SolverSettings,
+) -> FitSolution:
     """As :func:`_stop`, between two stops, from the straight line between them and with
     slopes in proportion.
     """
@@ -398,7 +413,7 @@ def _amid(
     )
 
 
-def _holding(prior: Prior, i: int, goal: float) -> Prior:
+def _holding(prior: GaussianPrior, i: int, goal: float) -> GaussianPrior:
     """A prior that leaves one parameter at ``goal``."""
     low, high = prior.low.copy(), prior.high.copy()
     low[i] = high[i] = goal
@@ -406,14 +421,14 @@ def _holding(prior: Prior, i: int, goal: float) -> Prior:
 
 
 def _fitted(
-    task: Task,
+    task: SearchTask,
     part: Part,
     begin: Array,
-    known: Prior,
-    settings: Settings,
+    known: GaussianPrior,
+    settings: SolverSettings,
     slopes: Array | None = None,
-) -> Solution:
-    found = leastsquares.fit(
+) -> FitSolution:
+    found = leastsquares.fit_levenberg_marquardt(
         *part, begin, prior=known, settings=settings, slopes=slopes
     )
     return dataclasses.replace(
@@ -421,21 +436,23 @@ def _fitted(
     )
 
 
-def _held(task: Task, stop: Solution, i: int) -> Array:
+def _held(task: SearchTask, stop: FitSolution, i: int) -> Array:
     """(p, p) covariance of the others with one parameter held."""
     p = len(stop.value)
     others = np.flatnonzero(np.arange(p) != i)
     out, known = np.zeros((p, p)), stop.information + np.diag(task.prior.sigma**-2.0)
-    out[np.ix_(others, others)] = leastsquares.invert(known[np.ix_(others, others)])
+    out[np.ix_(others, others)] = leastsquares.invert_information(
+        known[np.ix_(others, others)]
+    )
     return out
 
 
-def _misfit(task: Task, part: Part, x: Array) -> float:
+def _misfit(task: SearchTask, part: Part, x: Array) -> float:
     """The misfit at (p,) parameters."""
     return _measured(task, part[1], x, part[0](x, False)[0])
 
 
-def _measured(task: Task, data: Data, x: Array, image: Array) -> float:
+def _measured(task: SearchTask, data: FitImages, x: Array, image: Array) -> float:
     """Quasi-deviance of the pixels, outliers linear, and the prior's part: its slope is
     the score that a fit sets to 0.
 

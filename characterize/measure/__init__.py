@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from characterize.measure import frames as frames
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from characterize.measure import picture as picture
     from characterize.measure import sem as sem
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "frames": "",

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, optimize, special
 
-from characterize.captures import Capture, clean
+from characterize.captures import Capture, to_electrons
 from characterize.measure import metrics
-from characterize.measure.metrics import Spot
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from characterize.measure.metrics import SpotMetrics
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 from metalens.lens import Lens
 
 _FINE = 15  # samples a pixel side under the ideal spot
@@ -33,7 +33,7 @@ Field = tuple[float, float]  # angle along x and y, degrees
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class FrameMetrics:
     """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a
     design. peak_e: background off.
 
@@ -47,7 +47,7 @@ class Frame:
     depth_um: float
     angle_deg: float
     angle_y_deg: float
-    spot: Spot
+    spot: SpotMetrics
     mtf50_x_per_um: float
     mtf50_y_per_um: float
     strehl: float
@@ -62,7 +62,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Quality:
+class CaptureQuality:
     """All frames, and what they say together.
 
     best_depth_um: {field angles (x, y) in degrees: source depth of the sharpest spot}:
@@ -75,7 +75,7 @@ class Quality:
     light: (n, y, x) electrons above background. step_um: of a pixel.
     """
 
-    frames: tuple[Frame, ...]
+    frames: tuple[FrameMetrics, ...]
     best_depth_um: dict[Field, float]
     distortion: dict[Field, float]
     light: Array
@@ -83,9 +83,9 @@ class Quality:
     notes: tuple[str, ...]
 
 
-def measure(
+def measure_frames(
     capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan
-) -> Quality:
+) -> CaptureQuality:
     """Quality of the frames as they are.
 
     Args:
@@ -100,7 +100,7 @@ def measure(
         raise CaptureError(
             "pixel_um is missing: give the sensor's pixel in capture.toml"
         )
-    frames = clean(capture)
+    frames = to_electrons(capture)
     step = capture.pixel_um
     shots = zip(frames.electrons, frames.usable, _places(capture), strict=True)
     light = np.stack([_above(*shot) for shot in shots])
@@ -118,23 +118,23 @@ def measure(
         for field, depth in best.items()
         if _at_an_end(rows, field, depth)
     ]
-    return Quality(
+    return CaptureQuality(
         tuple(rows), best, _distortion(rows, capture, design), light, step, tuple(notes)
     )
 
 
 def _row(
     capture: Capture, i: int, image: Array, design: Lens | None, reference_e: float
-) -> Frame:
+) -> FrameMetrics:
     step = capture.pixel_um
-    spot = metrics.spot(image, step_um=step)
+    spot = metrics.measure_spot(image, step_um=step)
     circle = 3 * spot.fwhm_um
     share = math.nan
     if math.isfinite(reference_e) and math.isfinite(circle):
         share = metrics.focusing_efficiency(
             image, reference_e, step_um=step, aperture_um=circle
         )
-    return Frame(
+    return FrameMetrics(
         capture.names[i],
         float(capture.position_um[i]),
         float(np.degrees(capture.angle_rad[i, 0])),
@@ -149,7 +149,7 @@ def _row(
     )
 
 
-def airy(
+def airy_pattern(
     design: Lens,
     capture: Capture,
     shape: tuple[int, ...],
@@ -192,7 +192,9 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
     core = image[tuple(slice(i - half, i + half + 1) for i in middle)]
 
     def unlike(at: Array) -> float:
-        ideal = airy(design, capture, core.shape, place_px=(float(at[0]), float(at[1])))
+        ideal = airy_pattern(
+            design, capture, core.shape, place_px=(float(at[0]), float(at[1]))
+        )
         return -float((ideal * core).sum() / np.linalg.norm(ideal))
 
     start = np.array([peak[1] - middle[1], peak[0] - middle[0]], float)
@@ -207,8 +209,8 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
         float(f) + m - (n - 1) / 2
         for f, m, n in zip(found, middle[::-1], image.shape[::-1], strict=True)
     )
-    ideal = airy(design, capture, image.shape, place_px=(x, y))
-    return metrics.strehl(image, ideal - np.median(_rim(ideal)))
+    ideal = airy_pattern(design, capture, image.shape, place_px=(x, y))
+    return metrics.strehl_ratio(image, ideal - np.median(_rim(ideal)))
 
 
 def _places(capture: Capture) -> list[str]:
@@ -279,7 +281,7 @@ def _rim(image: Array) -> Array:
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
-def _best(rows: list[Frame]) -> dict[Field, float]:
+def _best(rows: list[FrameMetrics]) -> dict[Field, float]:
     """Depth of the highest peak share at each angle, by a parabola in 1/z through the
     best three.
     """
@@ -297,7 +299,7 @@ def _best(rows: list[Frame]) -> dict[Field, float]:
     return out
 
 
-def _at_an_end(rows: list[Frame], field: Field, depth_um: float) -> bool:
+def _at_an_end(rows: list[FrameMetrics], field: Field, depth_um: float) -> bool:
     """Whether the sharpest depth of an angle is the first or last of its frames."""
     depths = [r.depth_um for r in rows if r.field == field]
     return min(abs(depth_um / end - 1) for end in (min(depths), max(depths))) < _SAME
@@ -309,7 +311,7 @@ def _open_end(field: Field, depth_um: float) -> str:
 
 
 def _distortion(
-    rows: list[Frame], capture: Capture, design: Lens | None
+    rows: list[FrameMetrics], capture: Capture, design: Lens | None
 ) -> dict[Field, float]:
     """Only where the window stands still (``window = "fixed"`` in capture.toml) and the
     design gives the distance.

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage, optimize
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 _WEAK = 0.25  # amplitude of a lattice's wave over the strongest of all
 _LONGER = 2.5  # the longer side of a rectangular cell over the pitch, at most
@@ -18,7 +18,7 @@ _APART_DEG = 25.0  # least angle between the two waves of a lattice
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lattice:
+class ImageLattice:
     """Places origin + i a + j b, in pixels as (row, column); a is the vector nearer to
     +x.
     """
@@ -74,7 +74,7 @@ class Lattice:
         return place[keep], np.stack([j, i], 1)[keep]
 
 
-def find(flat: Array, pitch_px: float | None = None) -> Lattice:
+def find_lattice(flat: Array, pitch_px: float | None = None) -> ImageLattice:
     """The lattice of bright pillars in a levelled picture.
 
     Args:
@@ -100,7 +100,7 @@ def find(flat: Array, pitch_px: float | None = None) -> Lattice:
         if abs(one[1]) * np.linalg.norm(other) >= abs(other[1]) * np.linalg.norm(one)
         else (other, one)
     )
-    return Lattice(origin, a * np.sign(a[1] or 1.0), b * np.sign(b[0] or 1.0))
+    return ImageLattice(origin, a * np.sign(a[1] or 1.0), b * np.sign(b[0] or 1.0))
 
 
 def _waves(seen: Array, pitch_px: float | None) -> tuple[Array, Array]:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage, optimize
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
-from metalens.psf import brightest, encircled_power, fwhm
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
+from metalens.psf import encircled_power, find_peak, fwhm
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mtf:
+class EdgeMtf:
     """Modulation against spatial frequency along one direction; 1 at zero.
 
     frequency_per_um: (f,) from 0. modulation: (f,).
@@ -41,7 +41,7 @@ class Mtf:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class SpotMetrics:
     """Width numbers of one PSF.
 
     fwhm_um: full width at half maximum of the radial mean about the peak.
@@ -62,7 +62,7 @@ class Spot:
     centroid_um: tuple[float, float]
 
 
-def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> Mtf:
+def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> EdgeMtf:
     """MTF along x or y of a sampled PSF (background taken off): |FFT of the line
     spread| / its zero frequency.
 
@@ -74,10 +74,10 @@ def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> Mtf:
         raise CaptureError("MTF of a PSF without light; take off less background")
     size = 8 * len(line)
     spectrum = np.abs(fft.rfft(line, size))
-    return Mtf(fft.rfftfreq(size, step_um), spectrum / spectrum[0])
+    return EdgeMtf(fft.rfftfreq(size, step_um), spectrum / spectrum[0])
 
 
-def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> Mtf:
+def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> EdgeMtf:
     """Slanted-edge MTF (ISO 12233): edge found by line centroids, profile oversampled,
     derivative windowed.
 
@@ -123,12 +123,12 @@ def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> Mtf:
         np.sinc(frequency * pixel_um / oversample) ** 2
     )  # difference of neighbours, and bins
     keep_f = frequency <= 1 / pixel_um
-    return Mtf(
+    return EdgeMtf(
         frequency[keep_f], (spectrum / spectrum[0] / np.maximum(fold, 0.1))[keep_f]
     )
 
 
-def strehl(psf: Array, ideal: Array) -> float:
+def strehl_ratio(psf: Array, ideal: Array) -> float:
     """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled
     alike.
 
@@ -140,7 +140,7 @@ def strehl(psf: Array, ideal: Array) -> float:
     )
 
 
-def spot(psf: Array, *, step_um: float) -> Spot:
+def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
     """Widths of a PSF whose background is taken off.
 
     Raises:
@@ -151,7 +151,7 @@ def spot(psf: Array, *, step_um: float) -> Spot:
         raise CaptureError("a PSF without light; take off less background")
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     widths, (cx, cy) = _second_moments(light, x, y)
-    return Spot(
+    return SpotMetrics(
         fwhm(light, step_um),
         _encircled(light, x - cx, y - cy, 0.8) * step_um,
         (widths[0] * step_um, widths[1] * step_um),
@@ -195,7 +195,7 @@ def focusing_efficiency(
         exposure_ratio: exposure of the image over that of the reference.
     """
     light = np.asarray(image_e, float)
-    row, column, _ = brightest(light)
+    row, column, _ = find_peak(light)
     power = encircled_power(light, (row, column), aperture_um / 2 / step_um)
     return float(power / np.sum(reference_e) / exposure_ratio)
 

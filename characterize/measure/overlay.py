@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from characterize.measure.lattice import Lattice
-from characterize.measure.sem import Diameters
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from characterize.measure.lattice import ImageLattice
+from characterize.measure.sem import MeasuredDiameters
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 from metalens.lens import DiameterMap
 
 Table = list[
@@ -25,7 +25,7 @@ SCALE = 0.005  # of the lattice against the mask's: 1 nm on a pillar of 200
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Overlay:
+class MaskOverlay:
     """Measured pillars beside the design.
 
     designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0,
@@ -44,7 +44,7 @@ class Overlay:
     outlier: Array
 
 
-def overlay(found: Diameters, design: DiameterMap) -> Overlay:
+def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay:
     """Lay measured pillars on the design: the shift of whole sites where design and
     measurement differ most evenly.
 
@@ -92,7 +92,7 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
     ordered = np.sort(scatter[np.isfinite(scatter)])
     sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
     row, column = row - int(first[0]), column - int(first[1])
-    return Overlay(
+    return MaskOverlay(
         designed,
         error,
         row,
@@ -103,7 +103,7 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
     )
 
 
-def _steps(lattice: Lattice, design: DiameterMap) -> Array:
+def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
     """(2, 2) rows and columns of the mask's map that a step along j, and one along i,
     of a picture's lattice goes.
     """
@@ -127,7 +127,9 @@ def _steps(lattice: Lattice, design: DiameterMap) -> Array:
     return np.asarray(steps, int)
 
 
-def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
+def lattice_scale(
+    found: MeasuredDiameters, pixel_nm: float, design: DiameterMap
+) -> float:
     """Lattice constant in the picture over that of the mask: by how much the stated
     pixel is too large.
 
@@ -145,7 +147,7 @@ def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
     return float(np.sqrt(abs(np.linalg.det(turn)) / design.site_um2) * pixel_nm / 1e3)
 
 
-def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
+def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
     """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of
     the pillars, outliers left out.
 
@@ -175,7 +177,7 @@ def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
     return rows
 
 
-def numbered(found: Diameters, laid: Overlay) -> Diameters:
+def register_to_mask(found: MeasuredDiameters, laid: MaskOverlay) -> MeasuredDiameters:
     """The same pillars with the mask's own row and column as their site."""
     return dataclasses.replace(found, site=laid.site)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from characterize.captures import capture
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError
 
 # share of pixels whose colours are one grey: the rest is writing in the picture
 _ALIKE = 0.9
@@ -18,7 +18,7 @@ _FLAT, _NOISY = (
 )  # share of a row's pixels of one value: of a strip, from; of a picture, to
 
 
-def read(path: Path) -> Array:
+def read_picture(path: Path) -> Array:
     """(y, x) the one picture of a TIFF, PNG or HDF5 file; of colours that are alike,
     red.
 
@@ -33,7 +33,7 @@ def read(path: Path) -> Array:
     if len(images) != 1:
         raise CaptureError(f"{path}: {len(images)} pictures; need one")
     if images.ndim == 3:
-        return np.asarray(capture.sound(images, path)[0])
+        return np.asarray(capture.check_images(images, path)[0])
     colours = images[0, ..., :3]
     grey = (colours == colours[..., :1]).all(-1).mean()
     if grey < _ALIKE:

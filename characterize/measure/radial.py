@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy import ndimage, special
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 RAYS = 72
 # radius over blur from which on a disc has a flat top: its middle is lowered by
@@ -22,12 +22,12 @@ _TURNS, _SETTLED = (
 _MOST_GAIN = 5.0  # a disc as narrow as its blur has no width of its own
 
 
-def smoothing(pitch: float) -> float:
+def ray_smoothing(pitch: float) -> float:
     """Standard deviation in pixels by which rays are smoothed along themselves."""
     return max(1.0, pitch / 150)
 
 
-def plateaus(reach: Array, rays: Array) -> tuple[float, float, int]:
+def rim_and_gap_levels(reach: Array, rays: Array) -> tuple[float, float, int]:
     """(level of the rim, of the gap, where the rim is brightest) about the steepest
     fall of the mean over the rays.
 
@@ -50,7 +50,7 @@ def plateaus(reach: Array, rays: Array) -> tuple[float, float, int]:
     return float(mean[rim]), outer, rim
 
 
-def falls(reach: Array, rays: Array, half: float, rim: int) -> Array:
+def edge_crossings(reach: Array, rays: Array, half: float, rim: int) -> Array:
     """(ray,) where each first falls below a level beyond the rim; nan where it does
     not.
     """
@@ -77,12 +77,12 @@ def drawn_in(
         edge: (ray,) where the fitted edge crosses each; its mean square radius is
             ``radius``.
     """
-    inner, outer, _ = plateaus(reach, rays)
+    inner, outer, _ = rim_and_gap_levels(reach, rays)
     variance = _variance(_steepness(reach, rays, edge, inner - outer)) - smooth**2
     return max(variance, 0.0) / (2 * radius)
 
 
-def blur(reach: Array, rays: Array, smooth: float) -> float:
+def blur_variance(reach: Array, rays: Array, smooth: float) -> float:
     """Variance s² of the blur about a disc that is not wide beside it, by the mean over
     its rays; nan about others.
 
@@ -100,7 +100,7 @@ def blur(reach: Array, rays: Array, smooth: float) -> float:
     solid = mean[: max(int(0.3 * half / reach[1]), 1)].mean() - outer > _SOLID * (
         inner - outer
     )
-    if not solid or wide(half, variance, smooth):
+    if not solid or is_wide_disc(half, variance, smooth):
         return math.nan
     radius = half
     for _ in range(_TURNS):
@@ -115,7 +115,7 @@ def blur(reach: Array, rays: Array, smooth: float) -> float:
     return variance
 
 
-def wide(
+def is_wide_disc(
     radius: float, variance: float, smooth: float, *, times: float = _WIDE
 ) -> bool:
     """Whether a disc is wider than so many blurs; by default, so wide that its middle
@@ -124,7 +124,7 @@ def wide(
     return radius > times * math.hypot(math.sqrt(variance), smooth)
 
 
-def unblurred(
+def deblur_radius(
     reach: Array, radius: float, variance: float, smooth: float
 ) -> tuple[float, float]:
     """(radius of the disc that is read at a radius in a blur, its change with what is
@@ -178,6 +178,6 @@ def _reading(
     if smooth:
         profile = ndimage.gaussian_filter1d(profile, smooth / reach[1], mode="nearest")
     ray = profile[:, None]
-    inner, outer, rim = plateaus(reach, ray)
-    found = falls(reach, ray, (inner + outer) / 2, rim)
+    inner, outer, rim = rim_and_gap_levels(reach, ray)
+    found = edge_crossings(reach, ray, (inner + outer) / 2, rim)
     return float(found[0]), _steepness(reach, ray, found, inner - outer), inner, outer

@@ -21,11 +21,11 @@ import numpy as np
 from scipy import ndimage
 
 from characterize.measure import radial
-from characterize.measure.lattice import Lattice, find
+from characterize.measure.lattice import ImageLattice, find_lattice
 from characterize.measure.radial import RAYS
-from characterize.model import Known
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DAMAGE, CaptureError
+from characterize.model import KnownValue
+from metalens.core.arrays import Array
+from metalens.core.errors import DAMAGE, CaptureError
 
 _ROUND = (
     2 / 3
@@ -69,7 +69,7 @@ class Micrograph:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Diameters:
+class MeasuredDiameters:
     """Pillars found in a micrograph.
 
     row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is
@@ -91,7 +91,7 @@ class Diameters:
     missing: Array
     collapsed: Array
     site: Array
-    lattice: Lattice
+    lattice: ImageLattice
     oval: Array
 
     @property
@@ -122,7 +122,7 @@ class Diameters:
         """
         return float(3 * self._good_nm.std()) if self._good_nm.size else math.nan
 
-    def bias(self, designed_nm: Array | float) -> Known:
+    def bias(self, designed_nm: Array | float) -> KnownValue:
         """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with
         its standard error.
         """
@@ -132,14 +132,14 @@ class Diameters:
             raise CaptureError(
                 f"{len(good)} good pillars: need three or more for a bias"
             )
-        return Known(
+        return KnownValue(
             "bias_nm",
             float(good.mean()),
             float(max(good.std(ddof=1) / math.sqrt(len(good)), 0.05)),
         )
 
 
-def measure(image: Array, about: Micrograph) -> Diameters:
+def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
     """Diameters of all whole pillars on the lattice of a top-down micrograph, rims
     brighter than the gaps.
 
@@ -153,7 +153,7 @@ def measure(image: Array, about: Micrograph) -> Diameters:
         )
     pitch = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
     rough = _flattened(picture, pitch or min(picture.shape) / 4)
-    lattice = find(rough, pitch)
+    lattice = find_lattice(rough, pitch)
     flat = _flattened(picture, lattice.pitch_px) if pitch is None else rough
     found = _on(flat, lattice, about)
     if (
@@ -169,7 +169,7 @@ def measure(image: Array, about: Micrograph) -> Diameters:
     )
 
 
-def _others(lattice: Lattice) -> list[Lattice]:
+def _others(lattice: ImageLattice) -> list[ImageLattice]:
     """The same lattice with pillars where its gaps are."""
     a, b = lattice.a / 2, lattice.b / 2
     return [
@@ -179,8 +179,8 @@ def _others(lattice: Lattice) -> list[Lattice]:
 
 
 def _on(
-    flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0
-) -> Diameters:
+    flat: Array, lattice: ImageLattice, about: Micrograph, *, most: int = 0
+) -> MeasuredDiameters:
     """Pillars on a lattice that is known, in a levelled picture; of some ``most``
     sites, evenly from all, if stated.
     """
@@ -215,7 +215,7 @@ def _on(
     )
     collapsed = collapsed & ~oval
     diameter = np.where(missing | collapsed | oval, np.nan, diameter)
-    return Diameters(
+    return MeasuredDiameters(
         row,
         column,
         diameter,
@@ -311,7 +311,7 @@ def _rays(
         column + reach[:, None] * np.cos(angle),
     )
     rays = ndimage.map_coordinates(flat, points, order=1, mode="nearest")
-    smooth = radial.smoothing(pitch) / fine
+    smooth = radial.ray_smoothing(pitch) / fine
     return (
         reach,
         angle,
@@ -329,11 +329,11 @@ def _sharper(
     wider than a few blurs tells its
     own, whose noise offsets that of the levels of its rim and gap.
     """
-    radius, sigma, smooth = radius.copy(), sigma.copy(), radial.smoothing(pitch)
+    radius, sigma, smooth = radius.copy(), sigma.copy(), radial.ray_smoothing(pitch)
 
     def told(k: int) -> float:
         reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
-        return radial.blur(reach, rays, smooth)
+        return radial.blur_variance(reach, rays, smooth)
 
     there = np.flatnonzero(np.isfinite(radius)).tolist()
     own = {k: told(k) for k in there[:: max(len(there) // _TRIED, 1)]}
@@ -343,7 +343,7 @@ def _sharper(
     usual = float(np.nanmedian(blurs))
     for k in there:
         blur = usual
-        if radial.wide(radius[k], usual, smooth, times=_TELLS):
+        if radial.is_wide_disc(radius[k], usual, smooth, times=_TELLS):
             mine = own[k] if k in own else told(k)
             blur = mine if math.isfinite(mine) else usual
         found = _edges(flat, place[k, 0], place[k, 1], pitch, blur)
@@ -355,7 +355,7 @@ def _sharper(
 def _step(flat: Array, row: float, column: float, pitch: float) -> float:
     """Height of the fall from a pillar's rim to the gap, in the mean over all rays."""
     reach, _, rays = _rays(flat, row, column, pitch)
-    inner, outer, _ = radial.plateaus(reach, rays)
+    inner, outer, _ = radial.rim_and_gap_levels(reach, rays)
     return inner - outer
 
 
@@ -400,8 +400,8 @@ def _edges(
     their edges elsewhere.
     """
     reach, angle, rays = _rays(flat, row, column, pitch)
-    inner, outer, rim = radial.plateaus(reach, rays)
-    found = radial.falls(reach, rays, (inner + outer) / 2, rim)
+    inner, outer, rim = radial.rim_and_gap_levels(reach, rays)
+    found = radial.edge_crossings(reach, rays, (inner + outer) / 2, rim)
     good = np.isfinite(found)
     if inner - outer < 0.2 or good.sum() < RAYS // 2:
         return None
@@ -425,12 +425,12 @@ def _edges(
         0.5 * (mean + 0.5 * pitch)
     )
     edge, radius = terms @ np.array([mean, dy, dx, *oval]), math.sqrt(mean**2 + wide)
-    smooth, noise = radial.smoothing(pitch), math.sqrt(noise * (own + shared))
+    smooth, noise = radial.ray_smoothing(pitch), math.sqrt(noise * (own + shared))
     taken = radial.drawn_in(reach, rays, edge, radius, smooth)
     true, unsure = radius + taken, _UNSURE * taken
-    if blur is not None and not radial.wide(radius, blur, smooth):
+    if blur is not None and not radial.is_wide_disc(radius, blur, smooth):
         (true, gain), plain = (
-            radial.unblurred(reach, radius, blur, smooth),
+            radial.deblur_radius(reach, radius, blur, smooth),
             blur / (2 * radius),
         )
         noise, unsure = (

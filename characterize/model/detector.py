@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, special
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import Lens
 
 _ROOM_UM = 20.0  # for decentre
@@ -21,23 +21,25 @@ _LEAST_DISC = 0.3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sums:
+class SeparableBlur:
     """A blur that acts along each axis by itself, or a sum of such: pairs of (rows, y)
     and (columns, x) weights.
     """
 
     pairs: tuple[tuple[Array, Array], ...]
 
-    def times(self, factor: float) -> "Sums":
+    def times(self, factor: float) -> "SeparableBlur":
         """All weights times a factor, in their precision."""
-        return Sums(tuple((y * y.dtype.type(factor), x) for y, x in self.pairs))
+        return SeparableBlur(
+            tuple((y * y.dtype.type(factor), x) for y, x in self.pairs)
+        )
 
 
-Blur = Array | Sums
+Blur = Array | SeparableBlur
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class DetectorGrid:
     """Fine samples under the pixels of a window, with a margin that keeps blur from
     wrapping around.
 
@@ -94,7 +96,7 @@ class Grid:
             + 2 * off
         )
 
-    def part(self, rows: slice, columns: slice, margin: int) -> "Grid":
+    def part(self, rows: slice, columns: slice, margin: int) -> "DetectorGrid":
         """Of neighbouring rows and columns, with so many pixels at most around them."""
         some = range(self.rows)[rows], range(self.columns)[columns]
         moved = (
@@ -132,7 +134,7 @@ class Grid:
         """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through
         ``transfer``, at pixel centres.
         """
-        if isinstance(transfer, Sums):
+        if isinstance(transfer, SeparableBlur):
             return np.asarray(sum(y @ (intensity @ x.T) for y, x in transfer.pairs))
         shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
         blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
@@ -142,14 +144,16 @@ class Grid:
         )
         return np.asarray(blurred[..., y, x])
 
-    def sums(self, sigma_um: float, kind: Any = float) -> tuple[Sums, Sums]:
+    def sums(
+        self, sigma_um: float, kind: Any = float
+    ) -> tuple[SeparableBlur, SeparableBlur]:
         """Square pixel and Gaussian blur as sums along each axis, and their derivative
         by ``sigma_um``: two small
         products in place of two transforms, the same to rounding."""
         (y, by_y), (x, by_x) = (
             self._along(count, sigma_um, kind) for count in (self.rows, self.columns)
         )
-        return Sums(((y, x),)), Sums(((by_y, x), (y, by_x)))
+        return SeparableBlur(((y, x),)), SeparableBlur(((by_y, x), (y, by_x)))
 
     def _along(self, pixels: int, sigma_um: float, kind: Any) -> tuple[Array, Array]:
         """(pixels, fine samples) weights of pixel and blur along one axis, and their
@@ -164,15 +168,15 @@ class Grid:
         )
         parts = [
             fft.ifft(np.sinc(f * self.wide_um) * at * part).real
-            for part in gauss(f, np.zeros(1), sigma_um)
+            for part in gaussian_transfer(f, np.zeros(1), sigma_um)
         ]
         return parts[0][place % count].astype(kind), parts[1][place % count].astype(
             kind
         )
 
 
-def transfers(
-    grid: Grid,
+def detector_transfers(
+    grid: DetectorGrid,
     crosstalk_px: float,
     sizes_um: Array,
     shrink: Array,
@@ -195,11 +199,14 @@ def transfers(
         blur, by_blur = grid.sums(crosstalk_px * wide_um, kind)
         return blur, {"crosstalk_px": by_blur.times(wide_um)}
     fy, fx = grid.frequencies()
-    smooth, by_sigma = gauss(fy, fx, crosstalk_px * wide_um)
-    square = pixel(fy, fx, wide_um)
-    shared, image = square * smooth, [disc(fy, fx, size) for size in sizes_um]
+    smooth, by_sigma = gaussian_transfer(fy, fx, crosstalk_px * wide_um)
+    square = pixel_transfer(fy, fx, wide_um)
+    shared, image = square * smooth, [disc_transfer(fy, fx, size) for size in sizes_um]
     some = np.maximum(sizes_um, _LEAST_DISC * wide_um)
-    seen = np.stack([disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
+    seen = (
+        np.stack([disc_transfer(fy, fx, size)[1] for size in some])
+        * shrink[:, None, None]
+    )
     whole = np.stack([value for value, _ in image])
     slopes: dict[str, Blur] = {
         "crosstalk_px": square * by_sigma * wide_um * whole,
@@ -212,7 +219,7 @@ def transfers(
 
 
 @functools.lru_cache(maxsize=4)
-def _half_step(grid: Grid) -> Array:
+def _half_step(grid: DetectorGrid) -> Array:
     """Transfer that moves the light by half a fine sample, where no fine sample sits at
     a pixel's centre.
     """
@@ -227,7 +234,7 @@ def fine_enough(pixel_um: float, highest: float) -> int:
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
 
-def oversampling(lens: Lens, pixel_um: float) -> int:
+def required_oversampling(lens: Lens, pixel_um: float) -> int:
     """Samples along a pixel's side that are fine enough for the light of a lens."""
     sine = lens.diameters.radius_um / math.hypot(
         lens.diameters.radius_um, lens.reduced_um
@@ -235,19 +242,19 @@ def oversampling(lens: Lens, pixel_um: float) -> int:
     return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
 
 
-def pixel(fy: Array, fx: Array, pixel_um: float) -> Array:
+def pixel_transfer(fy: Array, fx: Array, pixel_um: float) -> Array:
     """Transfer of a square pixel: sinc(fx p) sinc(fy p)."""
     return np.asarray(np.sinc(fx * pixel_um) * np.sinc(fy * pixel_um))
 
 
-def gauss(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Array]:
+def gaussian_transfer(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Array]:
     """Transfer exp(-2 pi² f² sigma²) of a Gaussian blur, and its derivative by sigma."""
     q = 4 * np.pi**2 * (fx**2 + fy**2)
     value = np.exp(-q * sigma_um**2 / 2)
     return value, -q * sigma_um * value
 
 
-def disc(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
+def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
     """Transfer 2 J1(u) / u, u = pi f D, of an evenly lit disc, and its derivative by D:
     -2 J2(u) / D.
     """
@@ -259,7 +266,7 @@ def disc(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
     )
 
 
-def ball(fy: Array, fx: Array, diameter_um: float) -> Array:
+def ball_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:
     """Transfer 3 (sin u - u cos u) / u³, u = pi f D, of an evenly glowing ball seen in
     projection.
     """

@@ -12,28 +12,34 @@ from typing import Any
 import numpy as np
 
 from characterize.model import detector, moments
-from characterize.model.glass import Bench, Films, source_paths
-from characterize.model.kernel import real_of, turns
-from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
+from characterize.model.glass import BenchGeometry, FilmStack, source_paths
+from characterize.model.kernel import phasors, real_of
+from characterize.model.moments import LIT, WHOLE, Cut, LightBases, LightFactor
 from characterize.model.parameters import PLACE
-from characterize.model.pillars import Pillars, Range, change, incidence_rad, of_lens
-from characterize.model.reduced import Reduced
+from characterize.model.pillars import (
+    ChangeRange,
+    PillarResponse,
+    incidence_rad,
+    of_lens,
+    pillar_change_of,
+)
+from characterize.model.reduced import CompressedLens
 from characterize.model.setting import (
     BENDING,
     LIGHT,
-    Group,
-    Setting,
-    Spectrum,
-    background,
-    brightness,
-    dimming,
+    AngleGroup,
+    FrameSetting,
+    SpectralLine,
+    background_planes,
+    brightness_slopes,
     light_maps,
+    pixel_brightness,
     true_depth,
 )
-from characterize.model.window import Operators
+from characterize.model.window import WindowOperators
+from metalens.core import threads
+from metalens.core.arrays import Array
 from metalens.fabrication import CDError, ResponseError, Sensitivity, named, of_kind
-from metalens.ground import threads
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 GEOMETRY = (
@@ -79,47 +85,47 @@ class ForwardModel:
     def __init__(
         self,
         lens: Lens,
-        setting: Setting,
+        setting: FrameSetting,
         response: Sensitivity,
         *,
-        span: Range | None = None,
+        span: ChangeRange | None = None,
     ) -> None:
         self.lens, self.setting, s = lens, setting, setting
         self.reference_um = float(
             2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max())
         )
         over, self._over = (
-            detector.oversampling(lens, share * setting.pixel_um)
+            detector.required_oversampling(lens, share * setting.pixel_um)
             for share in (1.0, _FEWER)
         )
-        self.grid = detector.Grid(
+        self.grid = detector.DetectorGrid(
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
         self._lit = EVERY, EVERY
         self._kept: dict[
-            tuple[Reduced, Callable[[Array, Array, int], Array], int], Array
+            tuple[CompressedLens, Callable[[Array, Array, int], Array], int], Array
         ] = {}
-        self._pillars: dict[float, Pillars] = {}
-        self.films = Films.of(lens.layers, lens.wavelength_um)
+        self._pillars: dict[float, PillarResponse] = {}
+        self.films = FilmStack.of(lens.layers, lens.wavelength_um)
         self.area_um2 = (
             float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
         )
         self.stage_centre_um = float(setting.depth_um.mean())
-        self.spectrum = Spectrum.of(
+        self.spectrum = SpectralLine.of(
             lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance
         )
         self.groups = [
             self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)
         ]
 
-    def _group(self, angle_rad: Array) -> Group:
+    def _group(self, angle_rad: Array) -> AngleGroup:
         """Of the frames at one field angle."""
         setting = self.setting
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
-        bench = Bench(
+        bench = BenchGeometry(
             self.lens.sensor_distance_um,
             self.lens.wavelength_um,
             self.reference_um,
@@ -135,7 +141,7 @@ class ForwardModel:
                 self.lens, self.response, span=self._span, angle_rad=incidence
             )
         pillars = self._pillars[incidence]
-        reduced = Reduced(
+        reduced = CompressedLens(
             self.lens,
             pillars,
             bench,
@@ -143,7 +149,9 @@ class ForwardModel:
             depths_um=depths,
             tolerance=setting.tolerance,
         )
-        return Group.of(index, pillars, reduced).shaded(self.lens, setting.depth_um)
+        return AngleGroup.of(index, pillars, reduced).shaded(
+            self.lens, setting.depth_um
+        )
 
     def only(self, frames: Array) -> "ForwardModel":
         """The model of some of the frames, in rising order of their index; it shares
@@ -221,7 +229,7 @@ class ForwardModel:
         part.groups = [group.quick(window_um) for group in self.groups]
         return part
 
-    def _sparser(self) -> detector.Grid:
+    def _sparser(self) -> detector.DetectorGrid:
         """Samples for differences of images: of derivatives they miss less than a third
         of ``_SLOPE_TOLERANCE``.
         """
@@ -259,7 +267,7 @@ class ForwardModel:
         return part
 
     def _shapes(
-        self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]
+        self, group: AngleGroup, count: int, basis: Callable[[Array, Array, int], Array]
     ) -> Array:
         """(count, q, p) of a basis on the nodes of a group; kept, since a search asks
         again for every step.
@@ -280,14 +288,14 @@ class ForwardModel:
         light, slopes = self._light(x, wanted)
         s, films, about = self.setting, self.films, {"centre_um": self.stage_centre_um}
         scale = (
-            brightness(x, s, reference_um=self.reference_um, films=films, **about)[
-                :, None, None
-            ]
+            pixel_brightness(
+                x, s, reference_um=self.reference_um, films=films, **about
+            )[:, None, None]
             / self.area_um2
         )
         sampled = scale * light
         if wanted is None:
-            return sampled + background(x, s), None
+            return sampled + background_planes(x, s), None
         out = np.zeros((len(wanted), *light.shape))
         plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
         if "pixel_percent" in wanted:
@@ -300,10 +308,10 @@ class ForwardModel:
         }
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale * slopes[name]
-        for name, rate in dimming(x, s, films=films, **about).items():
+        for name, rate in brightness_slopes(x, s, films=films, **about).items():
             if name in wanted:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
-        return sampled + background(x, s), out
+        return sampled + background_planes(x, s), out
 
     def _off_pitch(
         self, x: Array, wanted: Sequence[str] | None
@@ -365,13 +373,13 @@ class ForwardModel:
         return light, slopes
 
     def _group_light(
-        self, x: Array, group: Group, offset_nm: float, names: list[str]
+        self, x: Array, group: AngleGroup, offset_nm: float, names: list[str]
     ) -> Light:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
-        operators, phasor, lens = threads.beside(
+        operators, phasor, lens = threads.run_concurrently(
             lambda: self._operators(x, group),
-            lambda: turns(self._phase(x, group), group.reduced.kind),
+            lambda: phasors(self._phase(x, group), group.reduced.kind),
             lambda: self._pupil(x, group, bool(names)),
         )
         lit = lens[0] * phasor
@@ -385,7 +393,10 @@ class ForwardModel:
             **dict(zip(ANSWERING, lens[2], strict=False)),
             "wave": lens[3],
         }
-        factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
+        factors, bases = (
+            dict(self._factors(x, group, names)),
+            LightBases(lit, phasor, by),
+        )
         out = self._quick(x, (operators, coarse), group, bases, factors)
         conjugate, power, rough = (
             field.conj(),
@@ -426,10 +437,10 @@ class ForwardModel:
     def _quick(
         self,
         x: Array,
-        seen: tuple[Operators, Array],
-        group: Group,
-        bases: Bases,
-        factors: dict[str, Factor],
+        seen: tuple[WindowOperators, Array],
+        group: AngleGroup,
+        bases: LightBases,
+        factors: dict[str, LightFactor],
     ) -> dict[str, Array]:
         """Derivatives that are had from those of the field: what smooth factors make of
         a point, on small pixels.
@@ -441,7 +452,7 @@ class ForwardModel:
             if turned is not None and small
             else None
         )
-        if turned is None or not isinstance(blur, detector.Sums):
+        if turned is None or not isinstance(blur, detector.SeparableBlur):
             return {}
 
         def field(base: str, light: Array) -> Array:
@@ -451,7 +462,7 @@ class ForwardModel:
                 else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
             )
 
-        return moments.rates(
+        return moments.light_derivatives(
             turned,
             grid,
             blur,
@@ -463,26 +474,26 @@ class ForwardModel:
         )
 
     def _factors(
-        self, x: Array, group: Group, names: list[str]
-    ) -> Iterator[tuple[str, Factor]]:
+        self, x: Array, group: AngleGroup, names: list[str]
+    ) -> Iterator[tuple[str, LightFactor]]:
         """(name, what one unit does to the light on the nodes) of all parameters that
         change it.
         """
         for name in names:
             if name in WIDENING:
-                yield name, Factor.fixed("bias", group.widening[WIDENING[name]])
+                yield name, LightFactor.fixed("bias", group.widening[WIDENING[name]])
             elif name in ANSWERING:
-                yield name, Factor.fixed(name, np.ones_like(group.reduced.u))
+                yield name, LightFactor.fixed(name, np.ones_like(group.reduced.u))
             elif (turning := group.turning(name)) is not None:
-                yield name, Factor.fixed(LIT, 1j * turning)
+                yield name, LightFactor.fixed(LIT, 1j * turning)
             elif name in GEOMETRY:
                 moves, um = _WINDOW.get(name, ("", 1.0))
                 added = "wave" if name == "wavelength_nm" else ""
                 slope = functools.partial(self._phase_slope, x, group, name)
-                yield name, Factor(LIT, slope, moves, um, added)
+                yield name, LightFactor(LIT, slope, moves, um, added)
 
     def _pupil(
-        self, x: Array, group: Group, slopes: bool
+        self, x: Array, group: AngleGroup, slopes: bool
     ) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units
         of the answering causes, and by
@@ -492,17 +503,17 @@ class ForwardModel:
         inside = np.abs(bias) < reach
         bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
         weight = group.pillars.weights(bias)
-        values = group.pillars.coefficients(change(x), self._lean_um)
+        values = group.pillars.coefficients(pillar_change_of(x), self._lean_um)
         pupil = group.reduced.combined(weight, values)
         if not slopes:
             return pupil, pupil, pupil, pupil
         rows = (row for _, row in of_kind(ResponseError))
-        slopes_of = zip(group.pillars.slopes(change(x)), rows, strict=True)
+        slopes_of = zip(group.pillars.slopes(pillar_change_of(x)), rows, strict=True)
         by = [group.reduced.combined(weight, c * row.unit) for c, row in slopes_of]
         up = x.copy()
         up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
         by_wave = (
-            group.pillars.coefficients(change(up), self._lean_um) - values
+            group.pillars.coefficients(pillar_change_of(up), self._lean_um) - values
         ) / _WAVE_STEP_NM
         rate = group.pillars.rates(bias, weight) * inside
         return (
@@ -512,7 +523,7 @@ class ForwardModel:
             group.reduced.combined(weight, by_wave),
         )
 
-    def _phase(self, x: Array, group: Group, cut: Cut = WHOLE) -> Array:
+    def _phase(self, x: Array, group: AngleGroup, cut: Cut = WHOLE) -> Array:
         """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken
         off, aberrations; light.
         """
@@ -529,7 +540,7 @@ class ForwardModel:
             chief[0] + x[PLACE["decentre_x_um"]] - held[0],
             chief[1] + x[PLACE["decentre_y_um"]] - held[1],
         )
-        films = Films.of(self.lens.layers, wavelength_um)
+        films = FilmStack.of(self.lens.layers, wavelength_um)
         exit_path = films.sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
         out = source_paths(
@@ -557,7 +568,7 @@ class ForwardModel:
             )
         )
 
-    def _phase_slope(self, x: Array, group: Group, name: str, cut: Cut) -> Array:
+    def _phase_slope(self, x: Array, group: AngleGroup, name: str, cut: Cut) -> Array:
         """Derivative of i times :meth:`_phase` by a geometric parameter: central
         difference of a smooth function.
         """
@@ -569,7 +580,7 @@ class ForwardModel:
             * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
         )
 
-    def _operators(self, x: Array, group: Group) -> Operators:
+    def _operators(self, x: Array, group: AngleGroup) -> WindowOperators:
         nominal = group.reduced.bench
         return group.reduced.operators(
             wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
@@ -579,7 +590,7 @@ class ForwardModel:
             turned_um=self._sparser().axes_um(),
         )
 
-    def _growth(self, x: Array, group: Group) -> dict[str, Array]:
+    def _growth(self, x: Array, group: AngleGroup) -> dict[str, Array]:
         """(frames,) relative growth of the source's image with the parameters that
         change its magnification.
         """
@@ -589,7 +600,7 @@ class ForwardModel:
             "stage_zero_um": -1 / far,
         }
 
-    def _reduced(self, x: Array, group: Group) -> tuple[Array, Array]:
+    def _reduced(self, x: Array, group: AngleGroup) -> tuple[Array, Array]:
         """(frames,) distances to sensor and source in air that bend paraxial light as
         much.
         """
@@ -606,9 +617,9 @@ class ForwardModel:
     def _transfer(
         self,
         x: Array,
-        group: Group,
+        group: AngleGroup,
         names: list[str],
-        grid: detector.Grid | None = None,
+        grid: detector.DetectorGrid | None = None,
     ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
         """Transfer of pixel, crosstalk and source disc, and its derivatives; see
         :func:`detector.transfers`.
@@ -620,7 +631,7 @@ class ForwardModel:
             x[PLACE["pinhole_um"]] * shrink,
             real_of(group.reduced.kind),
         )
-        return detector.transfers(
+        return detector.detector_transfers(
             grid or self.grid,
             blur,
             sizes,

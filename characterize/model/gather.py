@@ -7,43 +7,47 @@ import math
 import numba
 import numpy as np
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
+from metalens.core import legendre
+from metalens.core.arrays import Array
 from metalens.lens import DiameterMap, Stop
 
 
-def even(count: int, pull: float, low: float, high: float) -> Array:
+def even_nodes(count: int, pull: float, low: float, high: float) -> Array:
     """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre
     nodes t (Kosloff and Tal-Ezer 1993).
 
     A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at
     the ends; pulled apart, 0.7 n.
     """
-    t = np.arcsin(pull * legendre.nodes(count)[0]) / math.asin(pull)
+    t = np.arcsin(pull * legendre.gauss_legendre_nodes(count)[0]) / math.asin(pull)
     return np.asarray((low + high) / 2 + (high - low) / 2 * t)
 
 
-def at(count: int, pull: float, span: tuple[float, float], values: Array) -> Array:
-    """(*values, count) interpolation from :func:`even` places."""
+def even_interpolation(
+    count: int, pull: float, span: tuple[float, float], values: Array
+) -> Array:
+    """(*values, count) interpolation from :func:`even_nodes` places."""
     low, high = span
     t = (2 * values - low - high) / (high - low)
-    return np.asarray(legendre.interpolation(count, np.sin(math.asin(pull) * t) / pull))
+    return np.asarray(
+        legendre.interpolation_matrix(count, np.sin(math.asin(pull) * t) / pull)
+    )
 
 
-def pull(count: int, tolerance: float) -> float:
-    """Of :func:`even`: how near its branch may come to the ends of the nodes, for a
+def node_stretch(count: int, tolerance: float) -> float:
+    """Of :func:`even_nodes`: how near its branch may come to the ends of the nodes, for a
     wave as steep as they hold.
     """
     return 1 / math.cosh((math.log(1e5 / tolerance) + count / 60) / count)
 
 
-def density(count: int, tolerance: float) -> float:
-    """Of :func:`even` places in the middle over that of Gauss-Legendre nodes."""
-    pulled = pull(count, tolerance)
+def node_density(count: int, tolerance: float) -> float:
+    """Of :func:`even_nodes` places in the middle over that of Gauss-Legendre nodes."""
+    pulled = node_stretch(count, tolerance)
     return math.asin(pulled) / pulled
 
 
-def mirrored(
+def is_mirror_symmetric(
     diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None
 ) -> bool:
     """Whether pillars, the path of a chief ray and the shadow of a stop are alike to
@@ -63,7 +67,7 @@ def mirrored(
     )
 
 
-def folded(weights: Array, first: int) -> Array:
+def fold_weights(weights: Array, first: int) -> Array:
     """(n, m) weights of places of which those from ``first``, the middle one, on are
     asked for: each with its mirror
     image's. As they are where that is 0."""
@@ -74,7 +78,7 @@ def folded(weights: Array, first: int) -> Array:
     return out
 
 
-def lit(table: Array, place: Array, turns: Array) -> Array:
+def gather_light(table: Array, place: Array, turns: Array) -> Array:
     """(columns, rows, 2 r) real parts, then imaginary parts, of table[:, place] times
     turns.
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
-from metalens.ground.paths import sensor_path
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
+from metalens.core.paths import sensor_path
 from metalens.lens import Layers, media
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
@@ -26,7 +26,7 @@ Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class BenchGeometry:
     """Where source, lens and sensor stand for one field angle.
 
     tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
@@ -40,7 +40,7 @@ class Bench:
 
 
 @dataclass(frozen=True, slots=True)
-class Films:
+class FilmStack:
     """Plane-parallel films of a lens at one wavelength.
 
     front: between source and lens, air apart. behind: between lens and sensor in the
@@ -53,7 +53,7 @@ class Films:
     filling: float = 1.0
 
     @classmethod
-    def of(cls, layers: Layers, wavelength_um: float) -> "Films":
+    def of(cls, layers: Layers, wavelength_um: float) -> "FilmStack":
         """Those of a lens file; films of no thickness are left out.
 
         Raises:
@@ -128,7 +128,7 @@ class Films:
         )
         return share * tangents[0], share * tangents[1]
 
-    def rays(self, distance_um: float, reach2_um2: float) -> "Rays":
+    def rays(self, distance_um: float, reach2_um2: float) -> "RaySeries":
         """Those from lens to sensor up to this reach²."""
         return _rays(
             self,
@@ -154,11 +154,11 @@ class Films:
         return np.asarray(rays.chord(reach2) - rays.chord(start))
 
 
-AIR = Films()
+AIR = FilmStack()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rays:
+class RaySeries:
     """Rays through plane-parallel media up to a reach, as Chebyshev series in reach²,
     to rounding.
 
@@ -189,7 +189,7 @@ class Rays:
 
 
 @functools.lru_cache(maxsize=256)
-def _rays(films: Films, distance_um: float, most_um2: float) -> Rays:
+def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
     pairs, order = (
         films.pairs(distance_um),
         (films.filling, *(n for n, _ in films.behind)),
@@ -206,7 +206,7 @@ def _rays(films: Films, distance_um: float, most_um2: float) -> Rays:
     chord, bend, level = (
         chebyshev.chebtrim(one, _ROUNDING * np.abs(one).max()) for one in found.T
     )
-    return Rays(most_um2, (chord, bend, level), along_um)
+    return RaySeries(most_um2, (chord, bend, level), along_um)
 
 
 @functools.cache
@@ -223,7 +223,7 @@ def source_paths(
     depth_um: Array,
     tangents: tuple[float, float],
     values: Array,
-    films: Films = AIR,
+    films: FilmStack = AIR,
 ) -> Array:
     """(frames, *shape) path to (x, y) on the lens from sources at ``depth_um``
     (frames,), um, less that to its centre.

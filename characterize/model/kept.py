@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from metalens.ground import store
-from metalens.ground.arrays import Array
+from metalens.core import store
+from metalens.core.arrays import Array
 
 MOST = 64  # files of one title; the least recently used go first
 _ENDING = ".npz"
 
 
-def folder() -> Path | None:
+def cache_folder() -> Path | None:
     """Where they are: ``metalens`` in $XDG_CACHE_HOME, or in ~/.cache; None for
     somebody without a home.
     """
@@ -43,7 +43,7 @@ def folder() -> Path | None:
     )
 
 
-def kept(
+def cached_arrays(
     title: str,
     about: str,
     packages: Sequence[str],
@@ -57,7 +57,7 @@ def kept(
             text.
         packages: names of the packages whose source files enter too.
     """
-    place = folder()
+    place = cache_folder()
     if place is None:
         return make()
     told = "\n".join(
@@ -86,7 +86,7 @@ def _read(path: Path) -> Mapping[str, Array] | None:
 def _write(path: Path, title: str, arrays: Mapping[str, Array]) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with store.replacing(path) as part, open(part, "wb") as file:
+        with store.replace_atomically(path) as part, open(part, "wb") as file:
             np.savez(file, **dict(arrays))  # type: ignore[arg-type]  # the stub takes its own flags for all names
         ours = sorted(
             path.parent.glob(f"{title}_*{_ENDING}"), key=lambda p: p.stat().st_mtime

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from scipy.special import spherical_jn
 
-from characterize.model.glass import AIR, Films
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
-from metalens.ground.paths import longer
+from characterize.model.glass import AIR, FilmStack
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
+from metalens.core.paths import hypot_minus_length
 
 # least tolerance of a field that single precision holds: :func:`least_tolerance` of
 # 4000 columns is 4e-5
@@ -35,7 +35,7 @@ Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Kernel:
+class CompressedKernel:
     """d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) of one wavelength and distance.
 
     Through films r is the path of the ray, and d / r² is √(passed / spread) of
@@ -54,7 +54,7 @@ class Kernel:
     nominal_um: float
     distance_um: float
     tangents: tuple[float, float] = (0.0, 0.0)
-    films: Films = AIR
+    films: FilmStack = AIR
     nodes_um: float | None = None
 
     def path(
@@ -67,7 +67,7 @@ class Kernel:
         more = X * X + Y * Y + 2 * (X * dx + Y * dy)
         if self.films.none_behind:
             r_w = np.sqrt(dx**2 + dy**2 + d**2)
-            path = longer(r_w, more)
+            path = hypot_minus_length(r_w, more)
             return np.asarray(path), np.asarray(r_w + path)
         near2 = np.asarray(dx**2 + dy**2)
         far2 = near2 + more
@@ -110,7 +110,7 @@ class Kernel:
         """
         return self._off(off_um).path(_middle(self.p), q, 0.0, Y)[0]
 
-    def _off(self, off_um: float) -> "Kernel":
+    def _off(self, off_um: float) -> "CompressedKernel":
         return (
             dataclasses.replace(self, distance_um=self.distance_um + off_um)
             if off_um
@@ -139,7 +139,7 @@ class Kernel:
         by_x, by_y = self._steep(p, q, X, Y)
         return by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
 
-    def moved(self, name: str, share: float) -> "Kernel":
+    def moved(self, name: str, share: float) -> "CompressedKernel":
         """With the ``distance`` or the wavelength (``wave``) longer by a share of
         itself.
         """
@@ -169,7 +169,7 @@ class Kernel:
         size, r = self.amplitude(ray)
         fade = (1 / r).astype(real_of(kind)) - np.dtype(kind).type(1j * self.k)
         return np.asarray(
-            size.astype(real_of(kind)) * fade * turns(self.k * path, kind)
+            size.astype(real_of(kind)) * fade * phasors(self.k * path, kind)
         )
 
     def counts(
@@ -183,7 +183,7 @@ class Kernel:
         r = 0, at imaginary X of about the distance, and at p² + q² = 1: there terms
         fall as exp(-n / branch).
         """
-        more = digits(tolerance)
+        more = extra_digits(tolerance)
         t = np.linspace(-1, 1, _COARSE)
         Y, X, q, p = np.meshgrid(
             wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True
@@ -210,7 +210,7 @@ class Kernel:
         return np.asarray(self.path(a, b, X, Y)[0] - self.by_x(a, X) - self.by_y(b, Y))
 
 
-def turns(phase: Array, kind: Any = np.complex64) -> Array:
+def phasors(phase: Array, kind: Any = np.complex64) -> Array:
     """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex
     one makes light fade.
     """
@@ -225,12 +225,12 @@ def turns(phase: Array, kind: Any = np.complex64) -> Array:
     return out
 
 
-def digits(tolerance: float) -> float:
+def extra_digits(tolerance: float) -> float:
     """ln of how much more is asked than the usual 5e-4; 0 where less is."""
     return max(0.0, math.log(_USUAL / tolerance))
 
 
-def precision(tolerance: float) -> Any:
+def complex_precision(tolerance: float) -> Any:
     """Complex numbers that hold a field to ``tolerance``.
 
     Raises:
@@ -249,7 +249,7 @@ def real_of(kind: Any) -> Any:
 
 
 def least_tolerance(table: Array) -> float:
-    """Tolerance that :func:`factors` can tell from rounding in the table's own
+    """Tolerance that :func:`low_rank_factors` can tell from rounding in the table's own
     precision.
 
     A block of the range less what is found of it is a sum over a column, rounded to eps
@@ -260,7 +260,7 @@ def least_tolerance(table: Array) -> float:
     return float(np.finfo(table.dtype).eps) * math.sqrt(max(table.shape)) / _STOP
 
 
-def factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
+def low_rank_factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
     """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but
     for ``tolerance`` of its norm.
 

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from characterize.model import thinplate
-from characterize.model.parameters import PLACE, state
+from characterize.model.parameters import PLACE, process_state_of
 from characterize.model.pillars import incidence_rad
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import (
     CDError,
     Kinds,
@@ -21,9 +24,6 @@ from metalens.fabrication import (
     perturbations,
     transmission,
 )
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
 
 _TABLE = 1 << 16
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from metalens.psf import PsfStack, View
 
 
-def pillars(
+def as_built_transmission(
     lens: Lens,
     response: Sensitivity,
     x: Array,
@@ -56,7 +56,7 @@ def pillars(
     Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9
     for 50 rad/um.
     """
-    d, made = lens.diameters, state(x)
+    d, made = lens.diameters, process_state_of(x)
     bias = _on_pillars(d, made.bias_um) + noise_um
     if lens.pairs is not None:
         t = _of_two_sizes(lens, response, bias, made.answers())
@@ -96,7 +96,7 @@ def _of_one_size(
     lens: Lens, response: Sensitivity, x: Array, bias_um: Array, angle_rad: float
 ) -> Array:
     """(y, x) t by the proxy of the lens; what is no pillar is that of some."""
-    d, made = lens.diameters, state(x)
+    d, made = lens.diameters, process_state_of(x)
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
@@ -116,9 +116,9 @@ def _on_pillars(
     """(y, x) values at every pillar of a polynomial in (u, v): exact from one node more
     than its degree in each.
     """
-    node = legendre.nodes(_NODES)[0]
+    node = legendre.gauss_legendre_nodes(_NODES)[0]
     axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
-    along_x, along_y = (legendre.interpolation(len(node), axis) for axis in axes)
+    along_x, along_y = (legendre.interpolation_matrix(len(node), axis) for axis in axes)
     return np.asarray(along_y @ low_order(*np.meshgrid(node, node)) @ along_x.T)
 
 
@@ -126,11 +126,11 @@ def built_lens(design: Lens, x: Array) -> Lens:
     """The design with the as-built diameters, wavelength and distance; they are clipped
     to the proxy's domain.
 
-    Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and
+    Height, index, sidewall and wave-front errors are no diameters: :func:`as_built_transmission` and
     :func:`psf_stack` hold them.
     """
     d = design.diameters
-    bias = _on_pillars(d, state(x).bias_um)
+    bias = _on_pillars(d, process_state_of(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
     longer = (
@@ -173,7 +173,7 @@ def psf_stack(
 
     parts = []
     for angle in view.angles_rad:
-        t = pillars(
+        t = as_built_transmission(
             lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes
         )
         parts.append(

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model.detector import Grid, Sums
-from characterize.model.kernel import Kernel
-from characterize.model.window import STEP, Turned, weighted
-from metalens.ground import legendre, threads
-from metalens.ground.arrays import Array
+from characterize.model.detector import DetectorGrid, SeparableBlur
+from characterize.model.kernel import CompressedKernel
+from characterize.model.window import STEP, DerivativeOperators, real_complex_product
+from metalens.core import legendre, threads
+from metalens.core.arrays import Array
 
 LIT = "lit"
 Cut = tuple[Any, ...]
@@ -39,7 +39,7 @@ _COARSE_PIXEL = (
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Factor:
+class LightFactor:
     """What one unit of a parameter does to the light on the nodes: (frames or 1, q, p)
     ``values`` times one base.
 
@@ -56,13 +56,13 @@ class Factor:
     added: str = ""
 
     @classmethod
-    def fixed(cls, base: str, values: Array) -> "Factor":
+    def fixed(cls, base: str, values: Array) -> "LightFactor":
         """The same for all frames: (q, p) ``values``."""
         return cls(base, lambda cut: values[cut][None])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Bases:
+class LightBases:
     """Light on the nodes that factors act on: ``lit`` (frames, q, p), and ``slopes``
     {name: (q, p)} of the lens, each
     times the ``phasor`` of every frame."""
@@ -87,7 +87,7 @@ class Bases:
             )
         )
 
-    def changed(self, factor: Factor) -> Array:
+    def changed(self, factor: LightFactor) -> Array:
         """(frames, q, p) derivative of the light on the nodes, without the window's own
         move.
         """
@@ -101,21 +101,21 @@ class Bases:
         return np.asarray(out + self.of(factor.added) if factor.added else out)
 
 
-def fine_enough(grid: Grid, radius_um: float) -> bool:
+def fine_enough(grid: DetectorGrid, radius_um: float) -> bool:
     """Whether pixels are small enough that coefficients do not change across one, on a
     lens of this radius.
     """
     return grid.pixel_um < _COARSE_PIXEL * radius_um
 
 
-def rates(
-    turned: Turned,
-    grid: Grid,
-    blur: Sums,
+def light_derivatives(
+    turned: DerivativeOperators,
+    grid: DetectorGrid,
+    blur: SeparableBlur,
     lens: tuple[Array, Array, Array],
-    bases: Bases,
+    bases: LightBases,
     field: Callable[[str, Array], Array],
-    factors: Mapping[str, Factor],
+    factors: Mapping[str, LightFactor],
     missed: float = MISSED,
 ) -> dict[str, Array]:
     """(frames, rows, columns) derivatives of the light by name; those that no
@@ -154,21 +154,21 @@ def rates(
     }
 
 
-def _summed(table: Array, factor: Factor, seen: Mapping[str, Array]) -> Array:
+def _summed(table: Array, factor: LightFactor, seen: Mapping[str, Array]) -> Array:
     images = seen[factor.base][:, : table.shape[1]]
     out = 2 * np.einsum("fcyx,fcyx->fyx", *np.broadcast_arrays(table, images)).real
     return np.asarray(out + 2 * seen[factor.added][:, 0].real if factor.added else out)
 
 
-def powers(degree: int) -> list[tuple[int, int]]:
+def monomial_powers(degree: int) -> list[tuple[int, int]]:
     """(a, b) of t^a s^b, the total degree rising."""
     return [(n - b, b) for n in range(degree + 1) for b in range(n + 1)]
 
 
 def _seen(
-    turned: Turned,
-    grid: Grid,
-    blur: Sums,
+    turned: DerivativeOperators,
+    grid: DetectorGrid,
+    blur: SeparableBlur,
     bases: Mapping[str, Array],
     needed: Mapping[str, int],
 ) -> dict[str, Array]:
@@ -179,12 +179,13 @@ def _seen(
     ways, frames = turned.ways(most), len(bases["lit"])
     out = {
         base: np.empty(
-            (frames, len(powers(degree)), grid.rows, grid.columns), bases["lit"].dtype
+            (frames, len(monomial_powers(degree)), grid.rows, grid.columns),
+            bases["lit"].dtype,
         )
         for base, degree in needed.items()
     }
     order = {
-        degree: [powers(degree).index(one) for one in _by_rows(degree)]
+        degree: [monomial_powers(degree).index(one) for one in _by_rows(degree)]
         for degree in needed.values()
     }
     turns = {
@@ -195,23 +196,29 @@ def _seen(
     def some(first: int, last: int) -> None:
         for i in range(first, last):
             light = bases[LIT][i]
-            conjugate = weighted(ways[0][0], weighted(ways[1][0], light.T).T).conj()
+            conjugate = real_complex_product(
+                ways[0][0], real_complex_product(ways[1][0], light.T).T
+            ).conj()
             for base, degree in needed.items():
                 found = _through(blur, conjugate, bases[base][i], ways, degree)
                 out[base][i, order[degree]] = found * turns[degree][:, None, None]
 
     with threads.one_blas_thread():
-        threads.split(frames, some)
+        threads.run_split(frames, some)
     return out
 
 
 def _by_rows(degree: int) -> list[tuple[int, int]]:
-    """:func:`powers` in the order of :func:`_through`."""
+    """:func:`monomial_powers` in the order of :func:`_through`."""
     return [(a, b) for b in range(degree + 1) for a in range(degree + 1 - b)]
 
 
 def _through(
-    blur: Sums, conjugate: Array, field: Array, ways: tuple[Array, Array], degree: int
+    blur: SeparableBlur,
+    conjugate: Array,
+    field: Array,
+    ways: tuple[Array, Array],
+    degree: int,
 ) -> Array:
     """(powers, rows, columns) conj(E) times the derivatives of a field (Y, X), in the
     order of :func:`_by_rows`.
@@ -223,7 +230,7 @@ def _through(
     fine, counts = x.shape[1], [degree + 1 - b for b in range(degree + 1)]
     places = fine * np.concatenate([[0], np.cumsum(counts)])
     across = (
-        weighted(x.reshape(-1, x.shape[2]), field.T)
+        real_complex_product(x.reshape(-1, x.shape[2]), field.T)
         .reshape(-1, field.shape[0])
         .T.copy()
     )
@@ -252,10 +259,10 @@ def _through(
 
 
 def _tables(
-    turned: Turned,
-    grid: Grid,
+    turned: DerivativeOperators,
+    grid: DetectorGrid,
     lens: tuple[Array, Array, Array],
-    factors: Mapping[str, Factor],
+    factors: Mapping[str, LightFactor],
     missed: float,
 ) -> dict[str, tuple[int, Array]]:
     """{name: (degree, (frames or 1, powers, rows, columns) coefficients)} of those
@@ -265,15 +272,15 @@ def _tables(
     cut = np.ix_(some, some)
     keep = lens[2][cut]
     p, q = (part[cut][keep] for part in lens[:2])
-    axes = [legendre.mapped(_PLACES, *end) for end in grid.ends_um()]
+    axes = [legendre.mapped_nodes(_PLACES, *end) for end in grid.ends_um()]
     to_y, to_x = (
-        legendre.interpolation(_PLACES, np.linspace(-1, 1, n))
+        legendre.interpolation_matrix(_PLACES, np.linspace(-1, 1, n))
         for n in (grid.rows, grid.columns)
     )
     places = np.repeat(axes[0], _PLACES)[:, None], np.tile(axes[1], _PLACES)[:, None]
     seen = _directions(turned, p, q, places)
     shapes = np.linalg.qr(
-        np.stack([seen[0] ** a * seen[1] ** b for a, b in powers(_DEGREE)], -1)
+        np.stack([seen[0] ** a * seen[1] ** b for a, b in monomial_powers(_DEGREE)], -1)
     )
     values = {
         name: factor.values(cut)[:, keep].astype(complex)
@@ -294,7 +301,7 @@ def _tables(
 
 
 def _directions(
-    turned: Turned, p: Array, q: Array, places: tuple[Array, Array]
+    turned: DerivativeOperators, p: Array, q: Array, places: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """(t, s) of the nodes (n,) seen from places (Y, X), (k, 1) each, of the window: (k,
     n), between -1 and 1.
@@ -305,7 +312,11 @@ def _directions(
 
 
 def _moves(
-    turned: Turned, factor: Factor, p: Array, q: Array, places: tuple[Array, Array]
+    turned: DerivativeOperators,
+    factor: LightFactor,
+    p: Array,
+    q: Array,
+    places: tuple[Array, Array],
 ) -> Array:
     """(k, n) what the window's own move adds at every place, the slope of the kernel's
     logarithm; (1, 1) where none.
@@ -325,7 +336,7 @@ def _moves(
 
 
 def _logarithm(
-    kernel: Kernel, p: Array, q: Array, places: tuple[Array, Array]
+    kernel: CompressedKernel, p: Array, q: Array, places: tuple[Array, Array]
 ) -> Array:
     path, ray = kernel.path(p, q, places[1], places[0])
     return np.asarray(
@@ -370,7 +381,7 @@ def _fitted(
         (np.abs(amounts) ** 2).sum((0, 2))
     )
     for degree in range(_DEGREE + 1):
-        count = len(powers(degree))
+        count = len(monomial_powers(degree))
         if left[count - 1] <= missed**2 * size:
             return degree, np.linalg.solve(
                 triangle[:, :count, :count], amounts[:, :count]

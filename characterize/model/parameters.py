@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, nearest_name_hint
 from metalens.fabrication import (
     PERTURBATIONS,
     CDError,
@@ -23,13 +25,11 @@ from metalens.fabrication import (
     larger,
     named,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, nearest
 from metalens.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FitParameter:
     """One number that describes lens or bench.
 
     scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without
@@ -64,7 +64,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Unfitted:
+class UnfittedEffect:
     """What bench or mask may add that no parameter describes: never fitted, reckoned
     with in the intervals.
 
@@ -77,14 +77,14 @@ class Unfitted:
     sigma: float
 
 
-def _of(row: Perturbation) -> Parameter:
-    shared = (field.name for field in dataclasses.fields(Parameter))
+def _of(row: Perturbation) -> FitParameter:
+    shared = (field.name for field in dataclasses.fields(FitParameter))
     entries = {name: getattr(row, name) for name in shared if name != "start"}
-    return Parameter(**entries)
+    return FitParameter(**entries)
 
 
-def _light(name: str, meaning: str) -> Parameter:
-    return Parameter(
+def _light(name: str, meaning: str) -> FitParameter:
+    return FitParameter(
         name,
         meaning,
         0.1,
@@ -98,9 +98,9 @@ def _light(name: str, meaning: str) -> Parameter:
 
 
 _OF_LENS = {row.name: _of(row) for row in PERTURBATIONS}
-PARAMETERS: tuple[Parameter, ...] = (
+PARAMETERS: tuple[FitParameter, ...] = (
     *(_OF_LENS[name] for name in (*named(CDError), *named(ResponseError))),
-    Parameter(
+    FitParameter(
         "wavelength_nm",
         "wavelength minus stated",
         0.3,
@@ -109,7 +109,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         5.0,
         measured_by="the wavelength (spectrometer)",
     ),
-    Parameter(
+    FitParameter(
         "bandwidth_nm",
         "standard deviation of the spectrum",
         0.5,
@@ -123,7 +123,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         extra=True,
         measured_by="the spectrum",
     ),
-    Parameter(
+    FitParameter(
         "distance_um",
         "lens to sensor, minus design",
         2.0,
@@ -132,7 +132,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         400.0,
         measured_by="a wider range of depths",
     ),
-    Parameter(
+    FitParameter(
         "decentre_x_um",
         "window centre minus chief ray on the sensor",
         1.0,
@@ -141,7 +141,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         60.0,
         measured_by="the place of the axis on the sensor",
     ),
-    Parameter(
+    FitParameter(
         "decentre_y_um",
         "window centre minus chief ray on the sensor",
         1.0,
@@ -150,7 +150,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         60.0,
         measured_by="the place of the axis on the sensor",
     ),
-    Parameter(
+    FitParameter(
         "tilt_x_deg",
         "tilt of the lens about the y axis",
         0.2,
@@ -163,7 +163,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         extra=True,
         measured_by="frames at opposite field angles",
     ),
-    Parameter(
+    FitParameter(
         "tilt_y_deg",
         "tilt of the lens about the x axis",
         0.2,
@@ -176,7 +176,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         extra=True,
         measured_by="frames at opposite field angles",
     ),
-    Parameter(
+    FitParameter(
         "source_x_um",
         "source off the stage's axis",
         5.0,
@@ -187,7 +187,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         effect="a source off the axis of the stage along x",
         probe=5.0,
     ),
-    Parameter(
+    FitParameter(
         "source_y_um",
         "source off the stage's axis",
         5.0,
@@ -198,14 +198,14 @@ PARAMETERS: tuple[Parameter, ...] = (
         effect="a source off the axis of the stage along y",
         probe=5.0,
     ),
-    Parameter(
+    FitParameter(
         "stage_zero_um",
         "true source depth minus stated (with the substrate's plate shift)",
         50.0,
         1000.0,
         measured_by="the zero of the stage, or a wider range of depths",
     ),
-    Parameter(
+    FitParameter(
         "stage_scale",
         "true stage step over stated, minus 1",
         1e-3,
@@ -214,7 +214,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         0.05,
         measured_by="the stage against a gauge",
     ),
-    Parameter(
+    FitParameter(
         "glass_um",
         "plane glass of index 1.51 between source and lens",
         20.0,
@@ -227,7 +227,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         probe=100.0,
         measured_by="the thickness of the glass",
     ),
-    Parameter(
+    FitParameter(
         "glass_tilt_x_deg",
         "tilt of that glass about the y axis",
         1.0,
@@ -238,7 +238,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         effect="a tilt of {:g} um of glass about y",
         probe=5.0,
     ),
-    Parameter(
+    FitParameter(
         "glass_tilt_y_deg",
         "tilt of that glass about the x axis",
         1.0,
@@ -262,7 +262,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         "light_r",
         "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2",
     ),
-    Parameter(
+    FitParameter(
         "pinhole_um",
         "diameter of the source",
         1.0,
@@ -276,7 +276,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         extra=True,
         measured_by="the pinhole, or frames at more distant depths",
     ),
-    Parameter(
+    FitParameter(
         "crosstalk_px",
         "standard deviation of pixel crosstalk and vibration",
         0.1,
@@ -285,7 +285,7 @@ PARAMETERS: tuple[Parameter, ...] = (
         3.0,
         start=0.2,
     ),
-    Parameter(
+    FitParameter(
         "pixel_percent",
         "true pixel pitch over the stated one, less 1",
         0.3,
@@ -298,39 +298,39 @@ PARAMETERS: tuple[Parameter, ...] = (
         extra=True,
         measured_by="the pixel pitch",
     ),
-    Parameter(
+    FitParameter(
         "log_gain",
         "logarithm of the electrons through the aperture in a frame at the reference depth",
         0.02,
         measured_by="the power",
     ),
-    Parameter(
+    FitParameter(
         "background_e",
         "background at the window's centre, in the longest exposure",
         2.0,
     ),
-    Parameter(
+    FitParameter(
         "background_x_e", "background at the right edge less that at the centre", 2.0
     ),
-    Parameter(
+    FitParameter(
         "background_y_e", "background at the lower edge less that at the centre", 2.0
     ),
 )
-UNFITTED: tuple[Unfitted, ...] = (
-    Unfitted(
+UNFITTED: tuple[UnfittedEffect, ...] = (
+    UnfittedEffect(
         "stitching_nm",
         "shift of each write field of the mask, four across the lens",
         60.0,
     ),
-    Unfitted(
+    UnfittedEffect(
         "camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0
     ),
-    Unfitted(
+    UnfittedEffect(
         "window_px",
         "window of a field angle off the chief ray there, each way, beside the common decentre",
         0.3,
     ),
-    Unfitted(
+    UnfittedEffect(
         "stop_um",
         "aperture stop of the lens beside its place in the design, each way",
         3.0,
@@ -347,7 +347,7 @@ _CAUSES = [PLACE[row.name] for row in PERTURBATIONS]
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownValue:
     """What metrology says of a parameter: spectrometer (wavelength), AFM (height), SEM
     (bias), ellipsometer (index).
 
@@ -364,7 +364,7 @@ class Known:
     def __post_init__(self) -> None:
         if self.name not in PLACE and self.name not in _UNFITTED:
             raise ConfigError(
-                f"unknown parameter {self.name!r}{nearest(self.name, (*NAMES, *_UNFITTED))}"
+                f"unknown parameter {self.name!r}{nearest_name_hint(self.name, (*NAMES, *_UNFITTED))}"
             )
         if self.name in _UNFITTED and not (
             self.value == 0 and math.isfinite(self.sigma)
@@ -379,7 +379,7 @@ class Known:
             )
 
 
-def usual(names: Sequence[str], lens: Lens) -> list[Parameter]:
+def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
     """The rows of some parameters for a lens: what is in nm, and decentre, grow with
     long waves (``made.coarser``).
 
@@ -404,17 +404,17 @@ def usual(names: Sequence[str], lens: Lens) -> list[Parameter]:
     ]
 
 
-def unstated(name: str, lens: Lens) -> float:
+def type_b_sigma(name: str, lens: Lens) -> float:
     """Standard deviation of a parameter, or of what none describes, that is reckoned
     with where nobody states it.
     """
     if name in PLACE:
-        return usual([name], lens)[0].unstated
+        return usual_parameters([name], lens)[0].unstated
     row = next(row for row in UNFITTED if row.name == name)
     return row.sigma * larger(name, lens.wavelength_um)
 
 
-def _times(row: Parameter, factor: float) -> Parameter:
+def _times(row: FitParameter, factor: float) -> FitParameter:
     sizes = {
         name: factor * getattr(row, name)
         for name in ("scale", "sigma", "low", "high", "plausible")
@@ -422,7 +422,7 @@ def _times(row: Parameter, factor: float) -> Parameter:
     return dataclasses.replace(row, **sizes)
 
 
-def unfitted(known: dict[str, Known], lens: Lens) -> dict[str, float]:
+def unfitted_sizes(known: dict[str, KnownValue], lens: Lens) -> dict[str, float]:
     """Stated sizes of what is never fitted, by name; they are taken out of ``known``.
 
     Raises:
@@ -437,7 +437,7 @@ def unfitted(known: dict[str, Known], lens: Lens) -> dict[str, float]:
     }
 
 
-def vector(values: Mapping[str, float] | None = None) -> Array:
+def parameter_vector(values: Mapping[str, float] | None = None) -> Array:
     """(parameters,) starts, with some set by name.
 
     Raises:
@@ -450,11 +450,13 @@ def vector(values: Mapping[str, float] | None = None) -> Array:
                 f"{name} is never fitted: it belongs in [[known]] of --metrology alone"
             )
         if name not in PLACE:
-            raise ConfigError(f"unknown parameter {name!r}{nearest(name, NAMES)}")
+            raise ConfigError(
+                f"unknown parameter {name!r}{nearest_name_hint(name, NAMES)}"
+            )
         out[PLACE[name]] = value
     return out
 
 
-def state(x: Array) -> State:
+def process_state_of(x: Array) -> State:
     """The made lens that all parameters mean; what belongs to the bench is left out."""
     return State(x[_CAUSES])

@@ -9,6 +9,8 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import kept, solving
 from metalens.cell import Cell, index
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
     Kinds,
     PairSensitivities,
@@ -22,8 +24,6 @@ from metalens.fabrication import (
     pair_sensitivities,
     sensitivity,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, FitError, MaterialError
 from metalens.lens import Lens
 
 _NODES, _MOST = 25, 14
@@ -39,7 +39,7 @@ _SOURCES = (
 )
 
 
-def slopes(
+def log_response_slopes(
     lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()
 ) -> Sensitivity:
     """d ln t by the answering causes of :mod:`metalens.fabrication.perturbations` over the diameters
@@ -79,7 +79,7 @@ def slopes(
     )
     try:
         return _unpacked(
-            kept.kept(
+            kept.cached_arrays(
                 "pillars",
                 about,
                 _SOURCES,
@@ -109,7 +109,7 @@ def _of_pairs(lens: Lens) -> Sensitivity:
     def solve() -> dict[str, Array]:
         return _packed(Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light]))
 
-    return _unpacked(kept.kept("pillars", about, _SOURCES, solve))
+    return _unpacked(kept.cached_arrays("pillars", about, _SOURCES, solve))
 
 
 def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
@@ -182,10 +182,10 @@ def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
 
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
-    """:func:`slopes` by the solvers."""
+    """:func:`log_response_slopes` by the solvers."""
     if not lens.cell.round:
         return sensitivity(lens)
-    table = solving.solved(lens) if _upright(lens.cell) else None
+    table = solving.solved_transmission(lens) if _upright(lens.cell) else None
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())
     low, high = (low, high) if high > low else (low - 1e-3, high + 1e-3)

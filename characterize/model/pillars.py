@@ -15,8 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from characterize.model.parameters import PLACE, state
+from characterize.model.parameters import PLACE, process_state_of
 from metalens.cell import Cell
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import (
     Answer,
     Kinds,
@@ -32,9 +35,6 @@ from metalens.fabrication import (
     of_kind,
     transmission,
 )
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 
@@ -48,7 +48,7 @@ _ROWS = [row for _, row in of_kind(ResponseError)]
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class PillarChange:
     """Change of the pillars that is the same all over the lens: the answering causes in
     base units, and the wavelength.
 
@@ -60,7 +60,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
+class ChangeRange:
     """Largest change of each kind that a low-rank basis must hold; beyond it the fit is
     refused.
 
@@ -74,7 +74,7 @@ class Range:
     wavelength_um: float = 0.006
 
     @classmethod
-    def of(cls, wavelength_um: float) -> "Range":
+    def of(cls, wavelength_um: float) -> "ChangeRange":
         """Of lenses for a wavelength: lengths are larger where it is longer
         (``made.coarser``).
         """
@@ -84,7 +84,7 @@ class Range:
         )
         return cls(more * cls().bias_um, answers, more * cls().wavelength_um)
 
-    def within(self, cell: Cell) -> "Range":
+    def within(self, cell: Cell) -> "ChangeRange":
         """Without what pillars of this cell cannot have."""
         none = lacking(cell)
         kept = (
@@ -94,7 +94,7 @@ class Range:
         return dataclasses.replace(self, answers=tuple(kept))
 
 
-class Pillars:
+class PillarResponse:
     """Transmission of pillars under change, exact and in its low-rank basis.
 
     basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,)
@@ -114,11 +114,11 @@ class Pillars:
         lens: Lens,
         response: Sensitivity,
         *,
-        span: Range | None = None,
+        span: ChangeRange | None = None,
         tolerance: float = 3e-5,
         angle_rad: float = 0.0,
     ) -> None:
-        span = (span or Range.of(lens.wavelength_um)).within(lens.cell)
+        span = (span or ChangeRange.of(lens.wavelength_um)).within(lens.cell)
         self.lens, self.response, self.span, self.angle_rad = (
             lens,
             response,
@@ -167,7 +167,7 @@ class Pillars:
             self.response, d, nodes
         )
 
-    def exact(self, bias_um: Array | float, change: Change) -> Array:
+    def exact(self, bias_um: Array | float, change: PillarChange) -> Array:
         """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under
         a change.
         """
@@ -184,7 +184,7 @@ class Pillars:
             angle_rad=self.angle_rad,
         )
 
-    def coefficients(self, change: Change, lean_um: float = 0.0) -> Array:
+    def coefficients(self, change: PillarChange, lean_um: float = 0.0) -> Array:
         """(b, r) coefficients of t in the basis, as Chebyshev series of the bias.
 
         lean_um: diameter at the foot of the pillars less that at half height, which is
@@ -197,19 +197,19 @@ class Pillars:
             reach = max(self.span.bias_um - off, 0.0)
             bias = np.clip(self.nodes_um, -reach, reach)[:, None]
             low, middle, high = (
-                self.exact(bias + step, Change()) for step in (-off, 0.0, off)
+                self.exact(bias + step, PillarChange()) for step in (-off, 0.0, off)
             )
             t = t * np.sqrt(low * high / middle**2)
         return np.asarray(self._to_series @ (t @ self.basis.T))
 
-    def slopes(self, change: Change) -> Array:
+    def slopes(self, change: PillarChange) -> Array:
         """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering
         causes, in base units.
         """
         rates = self._answer.rates(np.array(change.answers)) * self._at_nodes(change)
         return np.asarray(self._to_series @ (rates @ self.basis.T))
 
-    def _at_nodes(self, change: Change) -> Array:
+    def _at_nodes(self, change: PillarChange) -> Array:
         """:meth:`exact` at the bias nodes; what the last few wavelengths made of the
         design is kept.
         """
@@ -233,7 +233,9 @@ class Pillars:
         if abs(share) <= 1 and len(self._colours):
             return np.asarray(
                 np.tensordot(
-                    legendre.interpolation(_COLOURS, np.array(share)), self._colours, 1
+                    legendre.interpolation_matrix(_COLOURS, np.array(share)),
+                    self._colours,
+                    1,
                 )
             )
         d = self.diameter_um + self.nodes_um[:, None]
@@ -250,7 +252,7 @@ class Pillars:
         return np.stack(
             [
                 self._designed_at(w)
-                for w in legendre.mapped(_COLOURS, middle - reach, middle + reach)
+                for w in legendre.mapped_nodes(_COLOURS, middle - reach, middle + reach)
             ]
         )
 
@@ -296,17 +298,17 @@ class Pillars:
             slope[n] = 2 * weights[n - 1] + 2 * x * slope[n - 1] - slope[n - 2]
         return slope / reach
 
-    def _training(self) -> list[Change]:
+    def _training(self) -> list[PillarChange]:
         s, waves = self.span, self._waves()
         single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
         both = [
-            Change(tuple(sign * one[:-1]), sign * one[-1])
+            PillarChange(tuple(sign * one[:-1]), sign * one[-1])
             for one in single
             if one.any()
             for sign in (1, -1)
         ]
         return [
-            Change(),
+            PillarChange(),
             *both,
             *(_draw(np.random.default_rng(i), s, waves) for i in range(6)),
         ]
@@ -330,8 +332,8 @@ class Pillars:
         return worst
 
 
-class PairedPillars(Pillars):
-    """As :class:`Pillars`, of two sizes: functions of the kinds of pillars that the
+class PairedPillars(PillarResponse):
+    """As :class:`PillarResponse`, of two sizes: functions of the kinds of pillars that the
     lens has, one after the other.
 
     A bias moves all edges, so both sizes alike, along the table of the lens; the
@@ -354,7 +356,7 @@ class PairedPillars(Pillars):
     def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
         return Answer(self._rates[:, None], None, np.ones(1)), 1.0
 
-    def exact(self, bias_um: Array | float, change: Change) -> Array:
+    def exact(self, bias_um: Array | float, change: PillarChange) -> Array:
         """(..., kinds) complex t of both sizes + bias under a change."""
         t = self._table.t(self._own.width_um + bias_um, self._own.length_um + bias_um)
         return np.asarray(
@@ -362,7 +364,7 @@ class PairedPillars(Pillars):
         )
 
     def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
-        return self.exact(self.nodes_um[:, None], Change())
+        return self.exact(self.nodes_um[:, None], PillarChange())
 
     def _through_colours(self) -> Array:
         return np.empty(0)
@@ -385,18 +387,19 @@ def of_lens(
     lens: Lens,
     response: Sensitivity,
     *,
-    span: Range | None = None,
+    span: ChangeRange | None = None,
     angle_rad: float = 0.0,
-) -> Pillars:
+) -> PillarResponse:
     """The pillars of a lens, of one size or of two."""
-    kind = Pillars if lens.pairs is None else PairedPillars
+    kind = PillarResponse if lens.pairs is None else PairedPillars
     return kind(lens, response, span=span, angle_rad=angle_rad)
 
 
-def change(x: Array) -> Change:
+def pillar_change_of(x: Array) -> PillarChange:
     """The pillars' change that the parameters mean."""
-    return Change(
-        tuple(state(x).answers().tolist()), float(x[PLACE["wavelength_nm"]]) * 1e-3
+    return PillarChange(
+        tuple(process_state_of(x).answers().tolist()),
+        float(x[PLACE["wavelength_nm"]]) * 1e-3,
     )
 
 
@@ -408,12 +411,14 @@ def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
     return tilt if proxy.max_angle_rad > 0 else 0.0
 
 
-def _draw(random: np.random.Generator, span: Range, waves: bool) -> Change:
+def _draw(random: np.random.Generator, span: ChangeRange, waves: bool) -> PillarChange:
     known = np.flatnonzero(span.answers)
     *some, wave = random.uniform(-0.7, 0.7, len(known) + 1)
     amounts = np.zeros(len(span.answers))
     amounts[known] = np.array(some) * np.array(span.answers)[known]
-    return Change(tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves)
+    return PillarChange(
+        tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves
+    )
 
 
 def _cubic(values: Array, place: Array) -> Array:

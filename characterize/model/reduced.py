@@ -23,21 +23,28 @@ from typing import Any
 import numpy as np
 
 from characterize.model import gather
-from characterize.model.glass import Bench, Films
-from characterize.model.kernel import Kernel, digits, factors, precision, real_of, turns
-from characterize.model.pillars import Pillars
+from characterize.model.glass import BenchGeometry, FilmStack
+from characterize.model.kernel import (
+    CompressedKernel,
+    complex_precision,
+    extra_digits,
+    low_rank_factors,
+    phasors,
+    real_of,
+)
+from characterize.model.pillars import PillarResponse
 from characterize.model.window import (
     MIXED,
     STEP,
-    Operators,
-    Terms,
-    Turned,
-    turned,
-    ways,
+    CouplingTerms,
+    DerivativeOperators,
+    WindowOperators,
+    axis_operators,
+    derivative_operators,
 )
-from metalens.ground import legendre, threads
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
+from metalens.core import legendre, threads
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.lens import Lens, media
 
 Axes = tuple[Array, Array]
@@ -51,7 +58,7 @@ _SPARE, _WIDER = (
 _BESIDE = 0.1
 
 
-class Reduced:
+class CompressedLens:
     """A lens on nodes for one field angle.
 
     nodes (q, p); x_um, y_um: (q, p) places of the nodes on the lens; u, v: the same
@@ -67,18 +74,18 @@ class Reduced:
     def __init__(
         self,
         lens: Lens,
-        pillars: Pillars,
-        bench: Bench,
+        pillars: PillarResponse,
+        bench: BenchGeometry,
         *,
         window_um: float,
         depths_um: Array,
         tolerance: float,
     ) -> None:
         self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
-        self.kind = precision(tolerance)
+        self.kind = complex_precision(tolerance)
         self._layers, self.films = (
             lens.layers,
-            Films.of(lens.layers, bench.wavelength_um),
+            FilmStack.of(lens.layers, bench.wavelength_um),
         )
         self._near_um = self.films.reduced_um(
             bench.distance_um
@@ -89,8 +96,8 @@ class Reduced:
             lens.diameters.radius_um,
         )
         self.k = 2 * math.pi / bench.wavelength_um
-        self._operators: dict[tuple[float, ...], Operators] = {}
-        self._near, self._usual = False, dict[tuple[float, ...], Terms]()
+        self._operators: dict[tuple[float, ...], WindowOperators] = {}
+        self._near, self._usual = False, dict[tuple[float, ...], CouplingTerms]()
         self._lesser: dict[tuple[float, int], Any] = {}  # both of these, of quick ones
         self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
@@ -115,7 +122,7 @@ class Reduced:
             self.x_um, self.y_um, self.bench.distance_um, self.bench
         )
 
-    def quick(self, window_um: float | None = None) -> "Reduced":
+    def quick(self, window_um: float | None = None) -> "CompressedLens":
         """With terms that belong to the nominal wavelength and distance: what is left
         of the kernel when its factors
         are put on hardly changes with either. On fewer nodes, and fewer yet for a
@@ -139,7 +146,9 @@ class Reduced:
             part._hold(to_q.T @ self.gathered @ to_p)
         return part
 
-    def shaded(self, lens: Lens, pillars: Pillars, depth_um: float) -> "Reduced":
+    def shaded(
+        self, lens: Lens, pillars: PillarResponse, depth_um: float
+    ) -> "CompressedLens":
         """Lit from a depth through the lens' stop; what does not hang on the pillars is
         shared with this one.
         """
@@ -147,7 +156,7 @@ class Reduced:
         part._hold(self._gather(lens, pillars, depth_um))
         return part
 
-    def seen_by(self, other: "Reduced", values: Array) -> Array:
+    def seen_by(self, other: "CompressedLens", values: Array) -> Array:
         """(..., q, p) a smooth function on the nodes as it is on those of another one
         of the same lens.
         """
@@ -155,12 +164,15 @@ class Reduced:
         return np.asarray(to_q @ values @ to_p.T)
 
     @staticmethod
-    def _between(one: "Reduced", other: "Reduced") -> list[Array]:
+    def _between(one: "CompressedLens", other: "CompressedLens") -> list[Array]:
         """Interpolation along q and along p from the nodes of one to those of the
         other.
         """
         ends = (one._q, other.q[:, 0]), (one._p, other.p[0])
-        return [gather.at(one.nodes, one._pull, span, at) for span, at in ends]
+        return [
+            gather.even_interpolation(one.nodes, one._pull, span, at)
+            for span, at in ends
+        ]
 
     def _directions(self, beyond: float) -> None:
         """Nodes for waves as steep as the window makes them, and ``beyond``: radians a
@@ -179,20 +191,21 @@ class Reduced:
             + beyond
             + 8
             + 2 * (swing + 1) ** (1 / 3)
-            + 1.5 * digits(self.tolerance)
+            + 1.5 * extra_digits(self.tolerance)
         )
         self.nodes = next(
             n
             for n in itertools.count(12)
-            if n * gather.density(n, self.tolerance) >= bands
+            if n * gather.node_density(n, self.tolerance) >= bands
         )
         if self.nodes > 600:
             raise FitError(
                 f"window of {self.window_um:.0f} um needs {self.nodes} nodes a side; fit a smaller window"
             )
-        self._pull = gather.pull(self.nodes, self.tolerance)
+        self._pull = gather.node_stretch(self.nodes, self.tolerance)
         p, q = (
-            gather.even(self.nodes, self._pull, *span) for span in (self._p, self._q)
+            gather.even_nodes(self.nodes, self._pull, *span)
+            for span in (self._p, self._q)
         )
         self.p, self.q = np.meshgrid(p, q)
         if (self.p**2 + self.q**2).max() >= 0.98:
@@ -225,7 +238,7 @@ class Reduced:
         return self.p, self.q, np.hypot(self.u, self.v) < 1
 
     def _gather(
-        self, lens: Lens, pillars: Pillars, depth_um: float | None = None
+        self, lens: Lens, pillars: PillarResponse, depth_um: float | None = None
     ) -> Array:
         """(r, q, p) fields; depth_um: of the source whose light the lens' stop shades,
         None for all that meets it.
@@ -234,14 +247,16 @@ class Reduced:
         x, y = d.x_um, d.y_um
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = real_of(self.kind)
-        pull = gather.pull(n, self.tolerance)
+        pull = gather.node_stretch(n, self.tolerance)
         y0, x0 = (
             (len(y) // 2, len(x) // 2)
-            if gather.mirrored(d, self.bench.tangents, lens.layers.stop)
+            if gather.is_mirror_symmetric(d, self.bench.tangents, lens.layers.stop)
             else (0, 0)
         )
         across, along = (
-            gather.folded(gather.at(n, pull, (-h, h), t), first).astype(real_kind)
+            gather.fold_weights(
+                gather.even_interpolation(n, pull, (-h, h), t), first
+            ).astype(real_kind)
             for h, t, first in ((hx, x, x0), (hy, y, y0))
         )
         table = np.ascontiguousarray(pillars.table().astype(self.kind).T)
@@ -254,7 +269,7 @@ class Reduced:
                 rows = parts[i]
                 some = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
-                light = gather.lit(
+                light = gather.gather_light(
                     table,
                     pillars.entries(d, rows, built),
                     self._met(lens, rows, built, depth_um),
@@ -263,7 +278,7 @@ class Reduced:
                 sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
         with threads.one_blas_thread():
-            threads.split(len(parts), some)
+            threads.run_split(len(parts), some)
         whole = sums.sum(0, dtype=float).T
         return self._to_directions(whole[:r] + 1j * whole[r:], n)
 
@@ -278,7 +293,7 @@ class Reduced:
         turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[
             :, built
         ]
-        found = turns(
+        found = phasors(
             self.k * self.path(*places, self.bench.distance_um, self.bench) + turn,
             self.kind,
         )
@@ -297,12 +312,15 @@ class Reduced:
         along x, then along y.
         """
         hy, hx = self.half_um
-        x, y = (gather.even(n, gather.pull(n, self.tolerance), -h, h) for h in (hx, hy))
+        x, y = (
+            gather.even_nodes(n, gather.node_stretch(n, self.tolerance), -h, h)
+            for h in (hx, hy)
+        )
         (cx, cy), d, m = self.center_um, self._near_um, self.nodes
         p = (x[None] - cx) / np.sqrt(
             (x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2
         )
-        at = functools.partial(gather.at, m, self._pull)
+        at = functools.partial(gather.even_interpolation, m, self._pull)
         turned = np.stack([fields[:, j] @ at(self._p, p[j]) for j in range(n)], 1)
         q = (
             (y - cy)[None]
@@ -312,7 +330,9 @@ class Reduced:
         out = np.stack([turned[:, :, a] @ at(self._q, q[a]) for a in range(m)], 2)
         return np.asarray(out)
 
-    def path(self, x: Array, y: Array, distance_um: float, bench: Bench) -> Array:
+    def path(
+        self, x: Array, y: Array, distance_um: float, bench: BenchGeometry
+    ) -> Array:
         """Path from the reference source by (x, y) on the lens to the window's centre,
         um, less that by the axis.
         """
@@ -330,7 +350,7 @@ class Reduced:
         axes_um: tuple[Array, Array],
         edge_um: float = 0.0,
         turned_um: tuple[Array, Array] | None = None,
-    ) -> Operators:
+    ) -> WindowOperators:
         """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x)
         of the window's samples.
 
@@ -360,9 +380,12 @@ class Reduced:
         axes_um: Axes,
         edge_um: float,
         turned_um: Axes,
-    ) -> Operators:
-        usual_um, films = self.bench.distance_um, Films.of(self._layers, wavelength_um)
-        nominal = Kernel(
+    ) -> WindowOperators:
+        usual_um, films = (
+            self.bench.distance_um,
+            FilmStack.of(self._layers, wavelength_um),
+        )
+        nominal = CompressedKernel(
             self.k,
             self._p,
             self._q,
@@ -393,20 +416,24 @@ class Reduced:
             "step_um": STEP * distance_um,
         }
         about["rim_um"] = edge_um
-        y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
-        x, across = ways(kernel.by_x, self.p[0], axes_um[1], bands[1], **about)
+        y, down = axis_operators(
+            kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about
+        )
+        x, across = axis_operators(
+            kernel.by_x, self.p[0], axes_um[1], bands[1], **about
+        )
         kind = self.kind
         parts = [one.of_kind(kind) for one in (down, across)]
         inner = reach[0] - edge_um, reach[1] - edge_um
 
-        def moved(name: str) -> Terms:
+        def moved(name: str) -> CouplingTerms:
             ends = [kernel.moved(name, sign * STEP) for sign in (1, -1)]
             step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
         def bent(degree: int) -> tuple[Array, Array]:
             down, across = (
-                turned(*one, degree)
+                derivative_operators(*one, degree)
                 for one in zip(turned_um, (y, x), bands, strict=True)
             )
             return down.astype(real_of(kind)), across.astype(real_of(kind))
@@ -417,23 +444,23 @@ class Reduced:
             if self._near
             else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
         )
-        return Operators(
+        return WindowOperators(
             parts[0],
             parts[1],
             rest,
             moved,
-            Turned(kernel, (bands[0], bands[1]), functools.cache(bent))
+            DerivativeOperators(kernel, (bands[0], bands[1]), functools.cache(bent))
             if few
             else None,
         )
 
     def _from(
         self,
-        usual: Kernel,
-        kernel: Kernel,
+        usual: CompressedKernel,
+        kernel: CompressedKernel,
         axes_um: tuple[Array, Array],
         inner_um: tuple[float, float],
-    ) -> Terms:
+    ) -> CouplingTerms:
         """As :meth:`_terms` of the kernel alone, from those of the usual one: turned
         and as bright as its own are.
         """
@@ -449,20 +476,23 @@ class Reduced:
 
     def _terms(
         self,
-        kernel: Kernel,
-        rests: Sequence[Kernel],
+        kernel: CompressedKernel,
+        rests: Sequence[CompressedKernel],
         shares: Sequence[float],
         axes_um: tuple[Array, Array],
         inner_um: tuple[float, float],
-    ) -> Terms:
+    ) -> CouplingTerms:
         """Terms of a sum of rests by shares, on coarse axes (y, x), turned as the
         window of ``kernel`` is.
         """
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
         w, m = kernel.counts(wy, wx, self.tolerance)
-        Y, X = legendre.mapped(w, -wy, wy), legendre.mapped(w, -wx, wx)
-        P, Q = legendre.mapped(m, *self._p), legendre.mapped(m, *self._q)[:, None]
+        Y, X = legendre.mapped_nodes(w, -wy, wy), legendre.mapped_nodes(w, -wx, wx)
+        P, Q = (
+            legendre.mapped_nodes(m, *self._p),
+            legendre.mapped_nodes(m, *self._q)[:, None],
+        )
         weight = np.where(
             np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE
         )
@@ -481,7 +511,9 @@ class Reduced:
                 for of, s in zip(rests, shares, strict=True)
             ]
             layer[:] = share[:, None, None] * weight * sum(parts)
-        columns, rows, remainder = factors(table.reshape(w * w, m * m), self.tolerance)
+        columns, rows, remainder = low_rank_factors(
+            table.reshape(w * w, m * m), self.tolerance
+        )
         left, size, across = np.linalg.svd(
             (rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False
         )
@@ -505,13 +537,15 @@ class Reduced:
             for one in (across[:some] @ to_p.T, np.tensordot(to_p, amounts, 1), window)
         ]
         whole = float(np.linalg.norm(table)) / math.sqrt(table.size)
-        return Terms(arrays[0], arrays[1], arrays[2], remainder, mixed[:some], whole)
+        return CouplingTerms(
+            arrays[0], arrays[1], arrays[2], remainder, mixed[:some], whole
+        )
 
     def _to_nodes(self, count: int) -> Array:
         """(nodes, count) from Legendre nodes of the directions; kept."""
         if count not in self._from_few:
-            self._from_few[count] = legendre.interpolation(
-                count, gather.even(self.nodes, self._pull, -1.0, 1.0)
+            self._from_few[count] = legendre.interpolation_matrix(
+                count, gather.even_nodes(self.nodes, self._pull, -1.0, 1.0)
             )
         return self._from_few[count]
 
@@ -526,7 +560,7 @@ def _on_even(count: int, first: float, last: float, samples: int) -> Array:
     """(samples, count) from Legendre nodes on [-1, 1] to even places; treat as
     read-only.
     """
-    return legendre.interpolation(count, np.linspace(first, last, samples))
+    return legendre.interpolation_matrix(count, np.linspace(first, last, samples))
 
 
 def _named(axes_um: tuple[Array, Array]) -> tuple[float, ...]:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.model.glass import AIR, Films
+from characterize.model.glass import AIR, FilmStack
 from characterize.model.parameters import PLACE
-from characterize.model.pillars import Pillars
-from characterize.model.reduced import Reduced
+from characterize.model.pillars import PillarResponse
+from characterize.model.reduced import CompressedLens
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError
 from metalens.fabrication import CDError, WavefrontError, maps, named
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens
 
 LEAST_NM = (
@@ -25,7 +25,7 @@ _RIM, _TURN_STEP, _MOST_COLOURS = 48, 0.05, 64
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Setting:
+class FrameSetting:
     """The frames that are to be predicted.
 
     depth_um: (n,) stated source depths. angle_rad: (n, 2). exposure: (n,) relative.
@@ -74,7 +74,7 @@ class Setting:
         return np.where(self.dark_known, self.exposure, 1.0)[:, None, None]
 
 
-def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
+def true_depth(x: Array, setting: FrameSetting, centre_um: float) -> Array:
     """(n,) source depths after stage zero and scale; the scale acts about the middle of
     the stage.
     """
@@ -87,13 +87,13 @@ def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
     return np.asarray(np.maximum(depth, 0.2 * stated))
 
 
-def brightness(
+def pixel_brightness(
     x: Array,
-    setting: Setting,
+    setting: FrameSetting,
     *,
     centre_um: float,
     reference_um: float,
-    films: Films = AIR,
+    films: FilmStack = AIR,
 ) -> Array:
     """(n,) electrons in a pixel for light of unit density from ``reference_um``, by
     gain, exposure and depth.
@@ -105,17 +105,17 @@ def brightness(
     )
 
 
-def dimming(
-    x: Array, setting: Setting, centre_um: float, films: Films = AIR
+def brightness_slopes(
+    x: Array, setting: FrameSetting, centre_um: float, films: FilmStack = AIR
 ) -> dict[str, Array]:
-    """(n,) relative changes of :func:`brightness` by the stage: light falls as the
+    """(n,) relative changes of :func:`pixel_brightness` by the stage: light falls as the
     square of the depth.
     """
     rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))
     return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
 
 
-def background(x: Array, setting: Setting) -> Array:
+def background_planes(x: Array, setting: FrameSetting) -> Array:
     """(n, rows, columns) electrons of the background, a plane in every frame."""
     edge_y, edge_x = setting.edges
     along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
@@ -134,7 +134,7 @@ def light_maps(u: Array, v: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Group:
+class AngleGroup:
     """Frames of one field angle, by their ``index``, and the lens as they see it.
 
     bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the
@@ -144,20 +144,22 @@ class Group:
     """
 
     index: Array
-    pillars: Pillars
-    reduced: Reduced
+    pillars: PillarResponse
+    reduced: CompressedLens
     bending: Array
     widening: Array
     residual: Array
-    apart: tuple["Group", ...] = ()
+    apart: tuple["AngleGroup", ...] = ()
 
     @property
-    def lit(self) -> tuple["Group", ...]:
+    def lit(self) -> tuple["AngleGroup", ...]:
         """Groups whose frames meet the same pillars."""
         return self.apart or (self,)
 
     @classmethod
-    def of(cls, index: Array, pillars: Pillars, reduced: Reduced) -> "Group":
+    def of(
+        cls, index: Array, pillars: PillarResponse, reduced: CompressedLens
+    ) -> "AngleGroup":
         """Without a residual phase."""
         bending, widening = (
             maps(kind, reduced.u, reduced.v) for kind in (WavefrontError, CDError)
@@ -166,7 +168,7 @@ class Group:
             index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape))
         )
 
-    def shaded(self, lens: Lens, depth_um: Array) -> "Group":
+    def shaded(self, lens: Lens, depth_um: Array) -> "AngleGroup":
         """The same behind the lens' stop; (frames,) depths of all."""
         if lens.layers.stop is None:
             return self
@@ -187,7 +189,7 @@ class Group:
         )
         return dataclasses.replace(self, apart=apart)
 
-    def only(self, frames: Array) -> "Group | None":
+    def only(self, frames: Array) -> "AngleGroup | None":
         """Of some frames, in rising order of their index, which are counted anew; None
         without any.
         """
@@ -199,18 +201,20 @@ class Group:
             dataclasses.replace(self, index=place, apart=apart) if len(place) else None
         )
 
-    def bent(self, residual: Array) -> "Group":
+    def bent(self, residual: Array) -> "AngleGroup":
         """With the shapes of a residual phase; groups apart have the same nodes."""
         apart = tuple(dataclasses.replace(one, residual=residual) for one in self.apart)
         return dataclasses.replace(self, residual=residual, apart=apart)
 
-    def quick(self, window_um: float | None) -> "Group":
+    def quick(self, window_um: float | None) -> "AngleGroup":
         """See :meth:`Reduced.quick`."""
         reduced = self.reduced.quick(window_um)
         residual = self.reduced.seen_by(reduced, self.residual)
         apart = tuple(one.quick(window_um) for one in self.apart)
         return dataclasses.replace(
-            Group.of(self.index, self.pillars, reduced), residual=residual, apart=apart
+            AngleGroup.of(self.index, self.pillars, reduced),
+            residual=residual,
+            apart=apart,
         )
 
     def turning(self, name: str) -> Array | None:
@@ -227,7 +231,7 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
-class Spectrum:
+class SpectralLine:
     """A Gaussian line as the fewest colours that stand for it to a lens.
 
     Intensities turn with the wavelength as the paths through the lens differ: by up to
@@ -246,7 +250,7 @@ class Spectrum:
     @classmethod
     def of(
         cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float
-    ) -> "Spectrum":
+    ) -> "SpectralLine":
         """Paths from axis and rim to sources and chief ray's places, through films as
         through as much air as bends
         light like them; a wavelength more for the pillars.
@@ -259,7 +263,7 @@ class Spectrum:
             np.append(lens.diameters.radius_um * part, 0.0)
             for part in (np.cos(turn), np.sin(turn))
         )
-        z = Films.of(lens.layers, lens.wavelength_um).apparent_um(depth_um[:, None])
+        z = FilmStack.of(lens.layers, lens.wavelength_um).apparent_um(depth_um[:, None])
         d, (tx, ty) = lens.reduced_um, np.tan(angle_rad.T)[..., None]
         paths = np.sqrt((x + z * tx) ** 2 + (y + z * ty) ** 2 + z**2)
         paths = paths + np.sqrt((x - d * tx) ** 2 + (y - d * ty) ** 2 + d**2)

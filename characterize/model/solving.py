@@ -10,7 +10,9 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from metalens import modal
-from metalens.cell import Cell, Light
+from metalens.cell import Cell, Incidence
+from metalens.core import threads
+from metalens.core.arrays import Array
 from metalens.fabrication import (
     Perturbation,
     ResponseError,
@@ -20,8 +22,6 @@ from metalens.fabrication import (
     larger,
     of_kind,
 )
-from metalens.ground import threads
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.pillars import curve, engines
 
@@ -42,7 +42,7 @@ _AMOUNTS = {
 }
 
 
-def solved(lens: Lens) -> Solved | None:
+def solved_transmission(lens: Lens) -> Solved | None:
     """t by the modal solver; None where the lens's proxy is not of its cell (a measured
     one, say).
 
@@ -98,7 +98,7 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
             found[one] = _along(one, wavelength_um, diameters)
 
     with threads.one_blas_thread():
-        threads.split(len(apart), some)
+        threads.run_split(len(apart), some)
     return Solved(
         wavelength_um,
         diameters,
@@ -111,12 +111,14 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     function through them.
     """
     span = float(diameters[0]), float(diameters[-1])
-    solve = engines.smooth(
-        cell, Light(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
+    solve = engines.solver_at_fixed_discretization(
+        cell, Incidence(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
     )
-    nodes = curve.explore(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
+    nodes = curve.sample_adaptively(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
     return np.asarray(
-        curve.curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(diameters)[:, 0]
+        curve.fit_response_curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(
+            diameters
+        )[:, 0]
     )
 
 

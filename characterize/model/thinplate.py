@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import BSpline, RectBivariateSpline
 
+from metalens.core.arrays import Array
 from metalens.fabrication import WavefrontError, maps
-from metalens.ground.arrays import Array
 
 MODES, KNOTS, EXPECTED_RAD = 24, 9, 0.3
 _GRID = 61
@@ -24,13 +24,13 @@ def phase_rad(modes: Array, u: Array, v: Array) -> Array:
     radius; 1e-5 of its size.
     """
     t = np.linspace(-1, 1, 129)
-    coarse = np.tensordot(modes, basis(*np.meshgrid(t, t), len(modes)), 1)
+    coarse = np.tensordot(modes, thin_plate_basis(*np.meshgrid(t, t), len(modes)), 1)
     return np.asarray(
         RectBivariateSpline(t, t, coarse)(np.clip(v, -1, 1), np.clip(u, -1, 1))
     )
 
 
-def basis(u: Array, v: Array, count: int = MODES) -> Array:
+def thin_plate_basis(u: Array, v: Array, count: int = MODES) -> Array:
     """(count, *shape) modes at lens places over the radius, of unit rms on the disc."""
     weights, taken, _ = _modes()
     splines, known = _splines(u, v), _known(u, v)

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model.kernel import Kernel, real_of
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from characterize.model.kernel import CompressedKernel, real_of
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 MIXED = 0.1  # of the tolerance, for functions of p in the terms
 # the same where terms are left out: beside these it adds an eighth to what is missed
@@ -35,7 +35,7 @@ STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ways:
+class AxisOperators:
     """Along one axis: nodes to coarse samples, ``to`` (coarse, nodes); coarse to fine
     samples, ``fine`` (fine, coarse).
 
@@ -49,10 +49,10 @@ class Ways:
     carrier: Array
     moved: Callable[[str], Array]
 
-    def of_kind(self, kind: Any) -> "Ways":
+    def of_kind(self, kind: Any) -> "AxisOperators":
         """In complex numbers of a kind."""
         moved = functools.cache(lambda name: self.moved(name).astype(kind))
-        return Ways(
+        return AxisOperators(
             self.to.astype(kind),
             self.fine.astype(real_of(kind)),
             self.carrier.astype(kind),
@@ -61,7 +61,7 @@ class Ways:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Terms:
+class CouplingTerms:
     """What is no product of both axes, as few terms: functions of p (b, p), their
     amounts in every term (q, r, b), and
     every term on coarse samples (Y, r, X).
@@ -86,20 +86,20 @@ class Terms:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Turned:
-    """Coarse samples to derivatives of the field: :func:`turned` along (y, x) up to a
+class DerivativeOperators:
+    """Coarse samples to derivatives of the field: :func:`derivative_operators` along (y, x) up to a
     degree, real.
 
     bands: (y, x) rad/um that directions are counted in; kernel: of which field.
     """
 
-    kernel: Kernel
+    kernel: CompressedKernel
     bands: tuple[float, float]
     ways: Callable[[int], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Operators:
+class WindowOperators:
     """From nodes to window for one wavelength and distance: both axes, and the rest.
 
     moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its
@@ -108,11 +108,11 @@ class Operators:
     ones.
     """
 
-    y: Ways
-    x: Ways
-    rest: Terms
-    moved: Callable[[str], Terms]
-    turned: Turned | None = None
+    y: AxisOperators
+    x: AxisOperators
+    rest: CouplingTerms
+    moved: Callable[[str], CouplingTerms]
+    turned: DerivativeOperators | None = None
 
     def field(self, light: Array, tolerance: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or
@@ -139,10 +139,12 @@ class Operators:
 
         def some(first: int, last: int) -> None:
             for i in range(first, last):
-                out[i] = weighted(self.y.fine, weighted(self.x.fine, flat[i].T).T)
+                out[i] = real_complex_product(
+                    self.y.fine, real_complex_product(self.x.fine, flat[i].T).T
+                )
 
         with threads.one_blas_thread():
-            threads.split(len(flat), some)
+            threads.run_split(len(flat), some)
         return out.reshape(*coarse.shape[:-2], *out.shape[-2:])
 
     def rates(
@@ -177,7 +179,7 @@ class Operators:
         )
 
     def _sum(
-        self, light: Array, ways: tuple[tuple[Array, Array, Terms, float], ...]
+        self, light: Array, ways: tuple[tuple[Array, Array, CouplingTerms, float], ...]
     ) -> Array:
         """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X),
         for several (Fy, Fx, terms).
@@ -216,11 +218,11 @@ class Operators:
                     )  # five times as quick as einsum
 
         with threads.one_blas_thread():
-            threads.split(len(flat), some)
+            threads.run_split(len(flat), some)
         return out
 
 
-def weighted(weights: Array, values: Array) -> Array:
+def real_complex_product(weights: Array, values: Array) -> Array:
     """(m, k) product of real (m, n) and complex (n, k) numbers: half the work of one of
     complex numbers.
     """
@@ -229,7 +231,7 @@ def weighted(weights: Array, values: Array) -> Array:
     )
 
 
-def ways(
+def axis_operators(
     by: Callable[..., Array],
     nodes: Array,
     at_um: Array,
@@ -239,7 +241,7 @@ def ways(
     tolerance: float,
     step_um: float,
     rim_um: float = 0.0,
-) -> tuple[Array, Ways]:
+) -> tuple[Array, AxisOperators]:
     """(coarse samples, the way there from nodes and from there to the window's samples)
     along one axis.
 
@@ -265,10 +267,14 @@ def ways(
         ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
         return np.asarray(1j * k * (ends[0] - ends[1]) / (2 * step_um) * value)
 
-    return coarse, Ways(value, weights, np.exp(1j * k * by(middle, at_um)), moved)
+    return coarse, AxisOperators(
+        value, weights, np.exp(1j * k * by(middle, at_um)), moved
+    )
 
 
-def turned(at_um: Array, coarse_um: Array, band: float, degree: int) -> Array:
+def derivative_operators(
+    at_um: Array, coarse_um: Array, band: float, degree: int
+) -> Array:
     """(degree + 1, fine, coarse) from coarse samples to the field of light times powers
     of its own direction.
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from characterize.pupil.fit import PupilFit as PupilFit
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from characterize.pupil.fit import save as save
     from characterize.pupil.record import PupilSpec as PupilSpec
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "PupilFit": "fit",

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from characterize.inference import Data
+from characterize.inference import FitImages
 
 LEAST_NCC = 0.8
 # of the light that planes left out may miss beyond their noise; right optics miss about
@@ -19,7 +19,7 @@ CAUSES = (
 )
 
 
-def order_score(data: Data) -> float:
+def order_score(data: FitImages) -> float:
     """How much likelier planes resemble their neighbours than any others: 1 in order, 0
     shuffled.
 
@@ -40,7 +40,7 @@ def order_score(data: Data) -> float:
     return (follow - every) / (best - every) if best - every > 0.02 else math.nan
 
 
-def missed(nrmse: float, data: Data, background: float) -> float:
+def unexplained_share(nrmse: float, data: FitImages, background: float) -> float:
     """Share of the light that a prediction misses beyond the noise of single pixels,
     which is seen at dark places.
     """
@@ -53,12 +53,14 @@ def missed(nrmse: float, data: Data, background: float) -> float:
     return math.sqrt(max(nrmse**2 - by_noise**2, 0.0))
 
 
-def problems(data: Data, ncc: float, share: float, stopped: str) -> list[str]:
+def pupil_problems(
+    data: FitImages, ncc: float, share: float, stopped: str
+) -> list[str]:
     """What makes a pupil no result, in words.
 
     Args:
         ncc: correlation with the planes left out, else with all. share: of the light
-            that is :func:`missed` there.
+            that is :func:`unexplained_share` there.
         stopped: why the fit stopped before it converged; empty where it did.
     """
     if order_score(data) < 0.4:
@@ -82,7 +84,7 @@ def problems(data: Data, ncc: float, share: float, stopped: str) -> list[str]:
     return words
 
 
-def doubts(share: float, stopped: str) -> list[str]:
+def pupil_warnings(share: float, stopped: str) -> list[str]:
     """What a pupil that is not refused still leaves to explain, in words; ``share`` of
     the light is missed.
     """

@@ -11,16 +11,26 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from characterize.captures import Frames, clean
+from characterize.captures import ElectronFrames, to_electrons
 from characterize.captures import capture as captures
-from characterize.inference import Data, Prior, Settings, Solution, leastsquares
+from characterize.inference import (
+    FitImages,
+    FitSolution,
+    GaussianPrior,
+    SolverSettings,
+    leastsquares,
+)
 from characterize.pupil import check as pupilcheck
-from characterize.pupil.free import Optics, freed, told
-from characterize.pupil.judge import Agreement, agree, spline
+from characterize.pupil.free import Optics, fit_free_settings, freed_text
+from characterize.pupil.judge import (
+    StackAgreement,
+    measure_agreement,
+    predict_by_splines,
+)
 from characterize.pupil.record import PupilModel, PupilSpec, stage_sigma_um
-from metalens.ground import config, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError, FitRefused
+from metalens.core import config, store
+from metalens.core.arrays import Array
+from metalens.core.errors import FitError, FitRefused
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,9 +61,9 @@ class PupilFit:
     residual_sigma: Array
     phase_rad: Array
     amplitude: Array
-    agreement: Agreement
-    held_out: Agreement | None
-    between: Agreement | None
+    agreement: StackAgreement
+    held_out: StackAgreement | None
+    between: StackAgreement | None
     optics: tuple[tuple[str, float, float], ...]
     chi2_per_dof: float
     converged: bool
@@ -83,7 +93,7 @@ def fit_pupil(
         FitError: too few planes, no bead, or refused: no convergence, planes out of
             order, predictions too poor.
     """
-    spec, frames = _complete(spec, capture), clean(capture)
+    spec, frames = _complete(spec, capture), to_electrons(capture)
     position = _positions(capture, spec)
     stated = dataclasses.replace(spec, stage_sigma_um=stage_sigma_um(spec, position))
     data, background, notes = _crop(frames, stated)
@@ -93,12 +103,12 @@ def fit_pupil(
     )
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
-    agreement = agree(solution.image, data, background)
+    agreement = measure_agreement(solution.image, data, background)
     stopped = "" if solution.converged else solution.reason
     score = held_out or agreement
-    share = pupilcheck.missed(score.nrmse, data, background)
-    problems = pupilcheck.problems(data, score.ncc, share, stopped)
-    notes += pupilcheck.doubts(share, stopped)
+    share = pupilcheck.unexplained_share(score.nrmse, data, background)
+    problems = pupilcheck.pupil_problems(data, score.ncc, share, stopped)
+    notes += pupilcheck.pupil_warnings(share, stopped)
     if problems and not insist:
         raise FitRefused("fit refused: " + "; ".join(problems))
     return PupilFit(
@@ -122,7 +132,7 @@ def fit_pupil(
         cautions=(
             *frames.corrections,
             *notes,
-            *told(stated, optics),
+            *freed_text(stated, optics),
             *_cautions(spec, solution),
         ),
         problems=tuple(problems),
@@ -204,7 +214,9 @@ def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
     return np.asarray(stated - (weight * stated).sum() / weight.sum())
 
 
-def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
+def _crop(
+    frames: ElectronFrames, spec: PupilSpec
+) -> tuple[FitImages, float, list[str]]:
     """The window about the bead, moved inwards where it would reach over the edge; the
     background level; notes.
     """
@@ -235,7 +247,7 @@ def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
     else:
         plane = np.zeros_like(plane)
     electrons = frames.electrons[cut] - plane
-    data = Data(
+    data = FitImages(
         electrons,
         frames.usable[cut],
         frames.saturated[cut],
@@ -276,21 +288,21 @@ def _find(light: Array) -> tuple[int, int]:
 
 
 def _freed(
-    spec: PupilSpec, position: Array, data: Data, sparse: int
+    spec: PupilSpec, position: Array, data: FitImages, sparse: int
 ) -> tuple[PupilSpec, Array, Optics]:
     """What is free, from every ``sparse``-th plane, so that the others judge it too."""
     seen = np.arange(0, len(position), sparse if len(position) >= 2 * sparse + 1 else 1)
     part, planes = position[seen], data.planes(seen)
     coarse = functools.partial(_coarse, spec, part, planes)
-    made, optics, longer = freed(
+    made, optics, longer = fit_free_settings(
         spec, part, planes, coarse, step_um=float(np.abs(np.diff(position)).mean())
     )
     return made, longer * position, optics
 
 
 def _judge(
-    spec: PupilSpec, position: Array, data: Data, background: float, sparse: int
-) -> tuple[Agreement | None, Agreement | None, Array | None]:
+    spec: PupilSpec, position: Array, data: FitImages, background: float, sparse: int
+) -> tuple[StackAgreement | None, StackAgreement | None, Array | None]:
     """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a
     spline through the same planes.
 
@@ -330,13 +342,17 @@ def _judge(
         fitted.layout().off.start,
         np.zeros(len(position) if spec.stage_sigma_um > 0 else 0),
     )
-    between = spline(position, data, seen, hidden)
-    return agree(predicted, rest, background), agree(between, rest, background), start
+    between = predict_by_splines(position, data, seen, hidden)
+    return (
+        measure_agreement(predicted, rest, background),
+        measure_agreement(between, rest, background),
+        start,
+    )
 
 
 def _fit(
-    spec: PupilSpec, position: Array, data: Data, start: Array | None = None
-) -> tuple[PupilModel, Solution]:
+    spec: PupilSpec, position: Array, data: FitImages, start: Array | None = None
+) -> tuple[PupilModel, FitSolution]:
     """Low orders from several starts, the best one on to all orders; all orders at once
     from a known ``start``.
     """
@@ -348,20 +364,22 @@ def _fit(
     )
     if start is None:
         start = _coarse(spec, position, data, model)
-    settings = Settings(iterations=60, step_tolerance=1.0, near=2.0, secant=True)
-    return model, leastsquares.fit(
+    settings = SolverSettings(iterations=60, step_tolerance=1.0, near=2.0, secant=True)
+    return model, leastsquares.fit_levenberg_marquardt(
         model.images, data, start, prior=_prior(model, start), settings=settings
     )
 
 
-def _coarse(spec: PupilSpec, position: Array, data: Data, model: PupilModel) -> Array:
+def _coarse(
+    spec: PupilSpec, position: Array, data: FitImages, model: PupilModel
+) -> Array:
     coarse = PupilModel(spec, position, phase_order=4, amplitude_order=0)
     starts = [_start(coarse, data, spherical) for spherical in (0.0, 0.8, -0.8)]
-    settings = Settings(
+    settings = SolverSettings(
         iterations=12, step_tolerance=1.0, near=1.0, secant=True, finish=False
     )
     tries = [
-        leastsquares.fit(
+        leastsquares.fit_levenberg_marquardt(
             coarse.images, data, s, prior=_prior(coarse, s), settings=settings
         )
         for s in starts
@@ -369,7 +387,7 @@ def _coarse(spec: PupilSpec, position: Array, data: Data, model: PupilModel) -> 
     return _grow(min(tries, key=lambda t: t.merit).value, coarse, model)
 
 
-def _start(model: PupilModel, data: Data, spherical: float) -> Array:
+def _start(model: PupilModel, data: FitImages, spherical: float) -> Array:
     layout = model.layout()
     x = np.zeros(layout.size)
     x[model.phase_indices.index((4, 0))] = spherical
@@ -389,7 +407,7 @@ def _start(model: PupilModel, data: Data, spherical: float) -> Array:
     return x
 
 
-def _offset(data: Data) -> Array:
+def _offset(data: FitImages) -> Array:
     """(y, x) pixels from the window's centre to the bead, where it is more than a
     quarter of the window; else 0.
     """
@@ -412,7 +430,7 @@ def _grow(value: Array, small: PupilModel, large: PupilModel) -> Array:
     )
 
 
-def _prior(model: PupilModel, start: Array) -> Prior:
+def _prior(model: PupilModel, start: Array) -> GaussianPrior:
     """Smoothness: coefficients of higher orders are smaller; gains of frames scatter by
     30 % about their start.
     """
@@ -431,7 +449,7 @@ def _prior(model: PupilModel, start: Array) -> Prior:
     sigma[blur + 1 :][: layout.frames] = 0.3
     low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
     low[blur], high[blur] = 0.05 * model.spec.pixel_um, 4 * model.spec.pixel_um
-    return Prior(mean, sigma, low, high)
+    return GaussianPrior(mean, sigma, low, high)
 
 
 def _maps(model: PupilModel, value: Array) -> tuple[Array, Array]:
@@ -443,7 +461,7 @@ def _maps(model: PupilModel, value: Array) -> tuple[Array, Array]:
     return angle, level
 
 
-def _cautions(spec: PupilSpec, solution: Solution) -> list[str]:
+def _cautions(spec: PupilSpec, solution: FitSolution) -> list[str]:
     words = [
         "reversing the stack turns the phase by 180 degrees about the axis and flips its sign: the order of the stage "
         "cannot be seen in the images alone",

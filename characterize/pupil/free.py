@@ -9,9 +9,14 @@ from typing import Literal
 
 import numpy as np
 
-from characterize.inference import Data, Prior, Settings, leastsquares
+from characterize.inference import (
+    FitImages,
+    GaussianPrior,
+    SolverSettings,
+    leastsquares,
+)
 from characterize.pupil.record import FREE, PupilModel, PupilSpec
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _REACH = 0.3  # of the logarithm of a factor
 _STEP = 1e-3
@@ -19,10 +24,10 @@ _MOST_SINE = 0.98
 Optics = tuple[tuple[str, float, float], ...]
 
 
-def freed(
+def fit_free_settings(
     spec: PupilSpec,
     position_um: Array,
-    data: Data,
+    data: FitImages,
     coarse: Callable[[PupilModel], Array],
     *,
     step_um: float,
@@ -53,9 +58,11 @@ def freed(
     low[p:], high[p:] = -_REACH, _REACH
     blur = p - 2 * len(position_um) - 1
     low[blur], high[blur] = 0.05 * spec.pixel_um, 4 * spec.pixel_um
-    settings = Settings(iterations=40, step_tolerance=0.1, near=1.0, secant=True)
-    prior = Prior(mean, wide, low, high)
-    found = leastsquares.fit(images, data, start, prior=prior, settings=settings)
+    settings = SolverSettings(iterations=40, step_tolerance=0.1, near=1.0, secant=True)
+    prior = GaussianPrior(mean, wide, low, high)
+    found = leastsquares.fit_levenberg_marquardt(
+        images, data, start, prior=prior, settings=settings
+    )
     made, position = images.optics(found.value[p:])
     spread = np.sqrt(np.diag(found.covariance)[p:] * max(1.0, found.chi2_per_dof))
     longer = float(np.ptp(position) / np.ptp(position_um))
@@ -127,7 +134,7 @@ class _Images:
         return image, np.concatenate([slopes, np.array(more)])
 
 
-def told(spec: PupilSpec, found: Optics) -> list[str]:
+def freed_text(spec: PupilSpec, found: Optics) -> list[str]:
     """What was freed beside what was stated, in words."""
     words = []
     for name, value, sigma in found:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from characterize.inference import Data
-from metalens.ground.arrays import Array
+from characterize.inference import FitImages
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class StackAgreement:
     """How predicted images compare with measured ones, all planes together.
 
     ncc: Pearson correlation over all pixels. plane_ncc: mean over planes of the
@@ -25,7 +25,9 @@ class Agreement:
     nrmse: float
 
 
-def agree(predicted: Array, data: Data, background: float) -> Agreement:
+def measure_agreement(
+    predicted: Array, data: FitImages, background: float
+) -> StackAgreement:
     """Agreement over usable, unsaturated pixels."""
     keep = data.usable & ~data.saturated
     a, b = predicted[keep], data.electrons[keep]
@@ -34,10 +36,12 @@ def agree(predicted: Array, data: Data, background: float) -> Agreement:
         for p, d, k in zip(predicted, data.electrons, keep, strict=True)
     ]
     error = float(np.linalg.norm(a - b) / np.linalg.norm(b - background))
-    return Agreement(_ncc(a, b), float(np.mean(planes)), error)
+    return StackAgreement(_ncc(a, b), float(np.mean(planes)), error)
 
 
-def spline(position: Array, data: Data, seen: Array, hidden: Array) -> Array:
+def predict_by_splines(
+    position: Array, data: FitImages, seen: Array, hidden: Array
+) -> Array:
     """(hidden, y, x) light of planes left out by cubic splines through the others: what
     no physics predicts.
     """

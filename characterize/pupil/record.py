@@ -18,8 +18,8 @@ from scipy import ndimage
 from characterize.captures.capture import read_images
 from characterize.model import detector
 from characterize.pupil import zernike
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError, FitError
+from metalens.core.arrays import Array
+from metalens.core.errors import CaptureError, FitError
 
 _BLOCK = 1 << 22  # samples of the fields that are formed at once
 FREE = {
@@ -124,7 +124,7 @@ class PupilSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ParameterLayout:
     """Which parameter is where: phase, log-amplitude, drift x and y, stage, blur, gain
     and background of each frame.
 
@@ -186,7 +186,7 @@ class Layout:
 
 class PupilModel:
     """Images of one bead at given stage positions as a function of the parameters of
-    :class:`Layout`.
+    :class:`ParameterLayout`.
 
     Accuracy: the pupil is sampled finely enough that images of ``window`` pixels do not
     wrap around at the farthest
@@ -211,15 +211,20 @@ class PupilModel:
         self.span_um = max(float(np.abs(position_um).max()), 1e-9)
         highest = 2 * spec.numerical_aperture / spec.wavelength_um
         over = detector.fine_enough(spec.pixel_um, highest)
-        self.grid = detector.Grid(
+        self.grid = detector.DetectorGrid(
             spec.window, spec.window, spec.pixel_um, over, margin=3
         )
         self._sample_pupil(phase_order, amplitude_order, nodes)
         fy, fx = self.grid.frequencies()
         fixed = (
-            detector.pixel(fy, fx, spec.pixel_um) if over > 1 else np.ones_like(fy * fx)
+            detector.pixel_transfer(fy, fx, spec.pixel_um)
+            if over > 1
+            else np.ones_like(fy * fx)
         )
-        self._fixed, self._f = fixed * detector.ball(fy, fx, spec.bead_um), (fy, fx)
+        self._fixed, self._f = (
+            fixed * detector.ball_transfer(fy, fx, spec.bead_um),
+            (fy, fx),
+        )
         self._sharp = over == 1 and not spec.bead_um
 
     def _sample_pupil(
@@ -239,11 +244,11 @@ class PupilModel:
         squeeze = np.minimum(1, sine / np.maximum(np.hypot(self.sx, self.sy), 1e-12))
         self.cosine = np.sqrt(1 - (self.sx * squeeze) ** 2 - (self.sy * squeeze) ** 2)
         self.k, self.nodes = k, nodes
-        self.phase_indices = zernike.indices(2, phase_order)
-        self.amplitude_indices = zernike.indices(1, amplitude_order)
+        self.phase_indices = zernike.zernike_indices(2, phase_order)
+        self.amplitude_indices = zernike.zernike_indices(1, amplitude_order)
         u, v = self.sx * squeeze / sine, self.sy * squeeze / sine
-        self.phase_basis = zernike.basis(self.phase_indices, u, v)
-        self.amplitude_basis = zernike.basis(self.amplitude_indices, u, v)
+        self.phase_basis = zernike.zernike_basis(self.phase_indices, u, v)
+        self.amplitude_basis = zernike.zernike_basis(self.amplitude_indices, u, v)
         self._mask = (
             1.0
             if spec.mask is None
@@ -263,7 +268,7 @@ class PupilModel:
         period = 2 * math.pi / (k * (q[1] - q[0]))
         self._norm = (self.grid.pixel_um / period) ** 2
 
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """Where each parameter is."""
         n = len(self.position_um)
         many = (
@@ -271,14 +276,17 @@ class PupilModel:
             len(self.amplitude_indices),
             self.spec.drift_order + 1,
         )
-        return Layout(*many, n, n if self.stage_sigma_um > 0 else 0)
+        return ParameterLayout(*many, n, n if self.stage_sigma_um > 0 else 0)
 
     def names(self) -> list[str]:
         """Name of every parameter, with its unit."""
         n, drift = len(self.position_um), range(self.spec.drift_order + 1)
         return [
-            *(f"phase {zernike.name(i)} / rad" for i in self.phase_indices),
-            *(f"log-amplitude {zernike.name(i)}" for i in self.amplitude_indices),
+            *(f"phase {zernike.zernike_name(i)} / rad" for i in self.phase_indices),
+            *(
+                f"log-amplitude {zernike.zernike_name(i)}"
+                for i in self.amplitude_indices
+            ),
             *(f"drift {axis} order {j} / um" for axis in "xy" for j in drift),
             *(f"stage {i} / um" for i in range(self.layout().stage)),
             "blur / um",
@@ -299,7 +307,11 @@ class PupilModel:
         sharp = self._sharp and blur <= _SHARP * self.spec.pixel_um
         field = self._transform(pupil, sharp)
         intensity = (field.real**2 + field.imag**2).sum(1)
-        transfer = None if sharp else self._fixed * detector.gauss(*self._f, blur)[0]
+        transfer = (
+            None
+            if sharp
+            else self._fixed * detector.gaussian_transfer(*self._f, blur)[0]
+        )
         light = self._seen(intensity, transfer) * scale
         image = light + background[:, None, None]
         if not jacobian:
@@ -314,7 +326,11 @@ class PupilModel:
         out[: layout.size - 2 * layout.frames - 1] *= scale
         for j, z in enumerate(self.amplitude_basis, layout.phase):
             out[j] -= light * (2 * (envelope**2 * z).sum() / total)
-        by_blur = None if sharp else self._fixed * detector.gauss(*self._f, blur)[1]
+        by_blur = (
+            None
+            if sharp
+            else self._fixed * detector.gaussian_transfer(*self._f, blur)[1]
+        )
         self._linear_columns(
             out,
             layout,
@@ -332,7 +348,7 @@ class PupilModel:
     def _pupil_columns(
         self,
         out: Array,
-        layout: Layout,
+        layout: ParameterLayout,
         at: tuple[Array, Array],
         transfer: Array | None,
     ) -> None:
@@ -364,7 +380,7 @@ class PupilModel:
                     out[place : place + layout.drift] = drift[:, :, None, None] * seen
 
     def _linear_columns(
-        self, out: Array, layout: Layout, light: Array, blur_slope: Array
+        self, out: Array, layout: ParameterLayout, light: Array, blur_slope: Array
     ) -> None:
         first = layout.size - 2 * layout.frames
         out[first - 1] = blur_slope

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 Index = tuple[int, int]
 _NAMES = {
@@ -21,19 +21,19 @@ _NAMES = {
 }
 
 
-def indices(lowest: int, highest: int) -> list[Index]:
+def zernike_indices(lowest: int, highest: int) -> list[Index]:
     """(n, m) of all polynomials of radial order ``lowest`` to ``highest``, m from -n to
     n in steps of 2.
     """
     return [(n, m) for n in range(lowest, highest + 1) for m in range(-n, n + 1, 2)]
 
 
-def name(index: Index) -> str:
+def zernike_name(index: Index) -> str:
     """Usual name where there is one, else ``Z(n, m)``."""
     return _NAMES.get(index, f"Z({index[0]}, {index[1]})")
 
 
-def polynomial(index: Index, rho: Array, theta: Array) -> Array:
+def zernike_polynomial(index: Index, rho: Array, theta: Array) -> Array:
     """Z_n^m at polar coordinates of the unit disc: sqrt(n + 1) (sqrt 2 if m) R(rho)
     cos(m theta), or sin for m < 0.
     """
@@ -51,11 +51,11 @@ def polynomial(index: Index, rho: Array, theta: Array) -> Array:
     return np.asarray(math.sqrt((n + 1) * (2 if m else 1)) * radial * angular)
 
 
-def basis(which: list[Index], x: Array, y: Array) -> Array:
+def zernike_basis(which: list[Index], x: Array, y: Array) -> Array:
     """(len(which), *shape) polynomials at Cartesian coordinates of the unit disc."""
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
     return (
-        np.stack([polynomial(index, rho, theta) for index in which])
+        np.stack([zernike_polynomial(index, rho, theta) for index in which])
         if which
         else np.empty((0, *x.shape))
     )

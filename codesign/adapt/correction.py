@@ -16,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model import PLACE, state
-from codesign.optics import MadeLens, Stack
+from characterize.model import PLACE, process_state_of
+from codesign.optics import MadeLens, PixelPsfStack
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 from metalens.fabrication import (
     STEEPEST,
     Bias,
@@ -26,16 +29,13 @@ from metalens.fabrication import (
     of_process,
     transmission,
 )
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
 from metalens.lens import DiameterMap, Lens
 
 _RAYS = 8  # of the places where the corrected map is judged
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Correction:
+class MaskCorrection:
     """Proposal for the next mask.
 
     drawn_nm, bias_nm: (knots,) the new bias table: made less drawn diameter, as
@@ -56,20 +56,20 @@ class Correction:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Proposal:
+class LensProposal:
     """One state of the next lens: its PSFs, Strehl ratio against the designed wave
     front, and light.
     """
 
     name: str
-    stack: Stack
+    stack: PixelPsfStack
     strehl: float
     light: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Table:
-    """A bias table, (knots,) each: see :class:`Correction`."""
+class CorrectionTable:
+    """A bias table, (knots,) each: see :class:`MaskCorrection`."""
 
     drawn_nm: Array
     bias_nm: Array
@@ -77,7 +77,9 @@ class Table:
     wanted_um: Array
 
 
-def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias) -> Correction:
+def propose_correction(
+    design: Lens, x: Array, *, response: Sensitivity, old: Bias
+) -> MaskCorrection:
     """The correction that fitted parameters ask for.
 
     Args:
@@ -86,8 +88,10 @@ def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias) -> Corr
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
     """
-    made = table(design, x, response=response, old=old, range_um=printed_um(design))
-    return Correction(
+    made = bias_table(
+        design, x, response=response, old=old, range_um=printed_um(design)
+    )
+    return MaskCorrection(
         made.drawn_nm,
         made.bias_nm,
         old.at(made.drawn_nm),
@@ -105,7 +109,7 @@ def printed_um(design: Lens) -> tuple[float, float]:
     )
 
 
-def table(
+def bias_table(
     design: Lens,
     x: Array,
     *,
@@ -113,7 +117,7 @@ def table(
     old: Bias,
     range_um: tuple[float, float],
     knots: int = 13,
-) -> Table:
+) -> CorrectionTable:
     """The bias table alone, without a look at the pillars: what many draws of a
     posterior are asked for.
 
@@ -122,7 +126,7 @@ def table(
     """
     designed = np.linspace(*range_um, knots)
     wanted = _wanted_um(design, designed, x, response)
-    drawn = old.drawn_nm(wanted * 1e3 - state(x)["bias_nm"])
+    drawn = old.drawn_nm(wanted * 1e3 - process_state_of(x)["bias_nm"])
     bias = designed * 1e3 - drawn
     slope = np.diff(bias) / np.diff(drawn)
     if np.abs(slope).max() > STEEPEST:
@@ -130,12 +134,12 @@ def table(
             f"the table would change by {np.abs(slope).max():.2f} nm per nm, the layout takes {STEEPEST}: the as-built "
             "lens is too far from its design for a table; correct height or index in the process instead"
         )
-    return Table(drawn, bias, designed, wanted)
+    return CorrectionTable(drawn, bias, designed, wanted)
 
 
 def next_lenses(
-    made: MadeLens, plan: Correction, x_fit: Array, x_true: Array
-) -> list[Proposal]:
+    made: MadeLens, plan: MaskCorrection, x_fit: Array, x_true: Array
+) -> list[LensProposal]:
     """The lens as made, with the new table, with the corrected map too, and at the
     corrected distance besides.
 
@@ -158,17 +162,17 @@ def next_lenses(
     for name, lens, x in cases:
         wave = lens.wave(x)
         out.append(
-            Proposal(
+            LensProposal(
                 name,
                 lens.stack(x),
-                overlap(wave, goal),
+                wavefront_overlap(wave, goal),
                 float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum()),
             )
         )
     return out
 
 
-def worse(before: Proposal, after: Proposal) -> str:
+def loss_reason(before: LensProposal, after: LensProposal) -> str:
     """Why a step of the correction is not written: the simulated lens is worse with it;
     empty where it is not.
     """
@@ -180,7 +184,7 @@ def worse(before: Proposal, after: Proposal) -> str:
     )
 
 
-def overlap(one: Array, other: Array) -> float:
+def wavefront_overlap(one: Array, other: Array) -> float:
     """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a>
     <b, b>), best piston.
     """
@@ -195,10 +199,14 @@ def uneven_nm(x: Array) -> Array:
     turn = 2 * np.pi * np.arange(_RAYS) / _RAYS
     rho = np.repeat([0.5, 1.0], _RAYS)
     u, v = (np.append(0.0, rho * np.tile(way(turn), 2)) for way in (np.cos, np.sin))
-    return np.asarray(state(x).bias_um(u, v) * 1e3 - state(x)["bias_nm"])
+    return np.asarray(
+        process_state_of(x).bias_um(u, v) * 1e3 - process_state_of(x)["bias_nm"]
+    )
 
 
-def write(folder: Path, plan: Correction, *, evened: bool = True) -> None:
+def write_correction(
+    folder: Path, plan: MaskCorrection, *, evened: bool = True
+) -> None:
     """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5
     where it is ``evened``.
     """
@@ -239,7 +247,7 @@ def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -
         np.unwrap(
             np.angle(transmission(design.proxy, response, fine, wave, made.answers()))
         )
-        for made in (state(x), State.of())
+        for made in (process_state_of(x), State.of())
     )
     inside = (fine >= designed[0]) & (fine <= designed[-1])
     piston = float((now - meant)[inside].mean())
@@ -261,23 +269,23 @@ def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -
 
 def _evened(design: Lens, x: Array) -> Lens:
     d = design.diameters
-    constant = state(x)["bias_nm"] * 1e-3
+    constant = process_state_of(x)["bias_nm"] * 1e-3
     change = np.empty(d.diameter_um.shape, np.float32)
     for first in range(0, len(change), 256):
         rows = slice(first, first + 256)
         u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um[rows] / d.radius_um)
-        change[rows] = state(x).bias_um(u, v) - constant
+        change[rows] = process_state_of(x).bias_um(u, v) - constant
     return _with_diameters(design, d.diameter_um - change, d.diameter_um > 0)
 
 
-def _drawn_with(design: Lens, plan: Correction, x_fit: Array) -> Lens:
+def _drawn_with(design: Lens, plan: MaskCorrection, x_fit: Array) -> Lens:
     """The lens whose diameters, made by a process of that bias, are those that the new
     table aims at.
     """
     d = design.diameters.diameter_um
     aim = (
         np.interp(d, plan.designed_um, plan.wanted_um - plan.designed_um)
-        - state(x_fit)["bias_nm"] * 1e-3
+        - process_state_of(x_fit)["bias_nm"] * 1e-3
     )
     return _with_diameters(design, d + aim, d > 0, keep=False)
 
@@ -298,7 +306,7 @@ def _with_diameters(
     )
 
 
-def table_rows(plan: Correction) -> list[tuple[Any, ...]]:
+def table_rows(plan: MaskCorrection) -> list[tuple[Any, ...]]:
     """Rows of the table for people: drawn diameter, present bias, new bias, designed
     and aimed diameter, nm.
     """

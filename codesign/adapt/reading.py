@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from codesign.train import Answers, Seen
-from metalens.ground.arrays import Array
+from codesign.train import Predictions, SensorFrames
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Accuracy:
+class NetworkAccuracy:
     """Errors of one network on one lens: (n,) absolute errors of the slippage, mean
     over axes and along each, in mm.
 
@@ -25,7 +25,7 @@ class Accuracy:
     error_mm: Tensor
     iou: Tensor
     above: str = ""
-    finer: "Accuracy | None" = None
+    finer: "NetworkAccuracy | None" = None
 
     @property
     def slip_mm(self) -> float:
@@ -44,12 +44,12 @@ class Accuracy:
 
     def interval_mm(self, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
         """95 % interval of ``slip_mm`` by a bootstrap over frames."""
-        low, high = bootstrap(
+        low, high = bootstrap_interval(
             self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed
         )
         return low, high
 
-    def _beside(self, fine: "Accuracy") -> dict[str, float]:
+    def _beside(self, fine: "NetworkAccuracy") -> dict[str, float]:
         return {
             "finer_slip_mm": fine.slip_mm,
             "finer_axial_mm": fine.axial_mm,
@@ -70,12 +70,14 @@ class Accuracy:
         }
 
 
-def accuracy(answers: Answers, seen: Seen) -> Accuracy:
+def measure_accuracy(answers: Predictions, seen: SensorFrames) -> NetworkAccuracy:
     """Errors of answers against the truth of their frames."""
-    return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou, seen.above)
+    return NetworkAccuracy(
+        (answers.slip_mm - seen.slip_mm).abs(), answers.iou, seen.above
+    )
 
 
-def bootstrap(
+def bootstrap_interval(
     values: Array, *, draws: int = 1000, seed: int = 0
 ) -> tuple[float, float]:
     """95 % interval of the mean of (n,) values."""

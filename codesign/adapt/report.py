@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt.correction import Correction, Proposal, table_rows
-from codesign.adapt.train import Lenses, Outcome
-from metalens.ground import report
-from metalens.ground.report import Figure, KeyFigure, Section, Table
+from codesign.adapt.correction import LensProposal, MaskCorrection, table_rows
+from codesign.adapt.train import LensPsfs, RetrainingOutcome
+from metalens.core import report
+from metalens.core.report import Figure, KeyFigure, Section, Table
 
 CASES = {
     "designed": "nominal lens, network as it came",
@@ -24,7 +24,7 @@ CASES = {
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Story:
+class RetrainingResults:
     """Everything that the page shows.
 
     apart: PSF errors against the nominal lens of the fitted lens and of the lens that
@@ -34,18 +34,18 @@ class Story:
     correction is not written; uneven: why the table alone is; empty where they are.
     """
 
-    outcome: Outcome
-    lenses: Lenses
+    outcome: RetrainingOutcome
+    lenses: LensPsfs
     apart: tuple[float, float]
     curves: dict[str, tuple[list[int], list[float]]]
-    plan: Correction
-    proposals: Sequence[tuple[Proposal, float, float]]
+    plan: MaskCorrection
+    proposals: Sequence[tuple[LensProposal, float, float]]
     cautions: Sequence[str] = field(default_factory=tuple)
     refused: str = ""
     uneven: str = ""
 
 
-def write(path: Path, story: Story) -> None:
+def write_retraining_page(path: Path, story: RetrainingResults) -> None:
     """Write report.html."""
     o = story.outcome
     keys = [
@@ -67,16 +67,16 @@ def write(path: Path, story: Story) -> None:
     sections = [_accuracy(story), _light(story), _mask(story)]
     if story.cautions:
         sections.append(Section("Read with care", "\n\n".join(story.cautions)))
-    report.write(
+    report.write_report(
         path, "Retrained on the lens as built", sections, lead=lead, key_figures=keys
     )
 
 
-def _share(o: Outcome) -> str:
+def _share(o: RetrainingOutcome) -> str:
     return "no gap beyond chance" if o.recovered is None else f"{o.recovered:.0%}"
 
 
-def _accuracy(story: Story) -> Section:
+def _accuracy(story: RetrainingResults) -> Section:
     head = (
         "case",
         "slippage error / mm",
@@ -111,17 +111,20 @@ def _accuracy(story: Story) -> Section:
         "Accuracy",
         text,
         [
-            Figure(bars(story.outcome), "Slippage error, with its 95 % interval."),
+            Figure(
+                plot_error_bars(story.outcome),
+                "Slippage error, with its 95 % interval.",
+            ),
             Table(head, rows, digits=3),
             Figure(_curves(story), "Loss while training on."),
         ],
     )
 
 
-def bars(outcome: Outcome) -> bytes:
+def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
     """Slippage error of every case as PNG."""
     rows = outcome.rows()
-    figure, axes = report.canvas(size=(6.4, 2.6))
+    figure, axes = report.make_figure(size=(6.4, 2.6))
     place = np.arange(len(rows))[::-1]
     values = [v["slip_mm"] for v in rows.values()]
     reach = [
@@ -140,11 +143,11 @@ def bars(outcome: Outcome) -> bytes:
     axes.set_yticks(place, [CASES[n] for n in rows])
     axes.set(xlabel="slippage error / mm")
     axes.grid(axis="y", visible=False)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def _curves(story: Story) -> bytes:
-    figure, axes = report.canvas(size=(6.4, 2.4))
+def _curves(story: RetrainingResults) -> bytes:
+    figure, axes = report.make_figure(size=(6.4, 2.4))
     for name, (step, loss) in story.curves.items():
         width = max(1, len(loss) // 20)
         smooth = np.convolve(loss, np.ones(width) / width, mode="valid")
@@ -159,10 +162,10 @@ def _curves(story: Story) -> bytes:
         )
     axes.set(xlabel="step", ylabel="task loss")
     axes.legend()
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def _light(story: Story) -> Section:
+def _light(story: RetrainingResults) -> Section:
     fitted, judged = story.apart
     text = (
         f"PSFs of the fitted lens differ from the nominal ones by {fitted:.1%} (relative L2 over all depths), those of "
@@ -172,7 +175,7 @@ def _light(story: Story) -> Section:
     return Section("Light", text, [Figure(_psfs(story), caption, wide=True)])
 
 
-def _psfs(story: Story) -> bytes:
+def _psfs(story: RetrainingResults) -> bytes:
     lenses = story.lenses
     rows = (
         ("nominal", lenses.nominal),
@@ -182,7 +185,7 @@ def _psfs(story: Story) -> bytes:
     chosen = np.unique(
         np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int)
     )
-    figure, axes = report.canvas(
+    figure, axes = report.make_figure(
         len(rows), len(chosen), size=(1.15 * len(chosen), 3.6), squeeze=False
     )
     for column, depth in enumerate(chosen):
@@ -197,10 +200,10 @@ def _psfs(story: Story) -> bytes:
         axes[0, column].set_title(
             f"{float(lenses.nominal.depths_um[depth]) * 1e-3:.1f} mm"
         )
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def _mask(story: Story) -> Section:
+def _mask(story: RetrainingResults) -> Section:
     head = (
         "next lens",
         "PSF error",
@@ -251,10 +254,10 @@ def _mask(story: Story) -> Section:
     )
 
 
-def _table_plot(plan: Correction) -> bytes:
-    figure, axes = report.canvas(size=(5.2, 2.6))
+def _table_plot(plan: MaskCorrection) -> bytes:
+    figure, axes = report.make_figure(size=(5.2, 2.6))
     axes.plot(plan.drawn_nm, plan.old_nm, "--", color="#888", label="present table")
     axes.plot(plan.drawn_nm, plan.bias_nm, "o-", label="new table")
     axes.set(xlabel="drawn diameter / nm", ylabel="bias / nm")
     axes.legend()
-    return report.png(figure)
+    return report.figure_png(figure)

@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from characterize.bench import Truth
+from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
 from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.source import Source, is_retraining, lens_file
+from codesign.adapt.source import FinishedRun, is_retraining, lens_file
 from codesign.optics import MadeLens
 from codesign.train import RunConfig, checkpoint
 from metalens import lens as lenses
-from metalens.ground import config, manifest, reading
-from metalens.ground.errors import TrainingError
+from metalens.core import config, manifest, reading
+from metalens.core.errors import TrainingError
 
 RECIPE, RESULT = "retrain.toml", "result.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class RetrainingRecipe:
     """What a retraining was made of, and a resume must find unchanged.
 
     asbuilt, weights, truth: SHA-256 of the files; '' without one.
@@ -36,7 +36,7 @@ class Recipe:
     truth: str = ""
 
 
-def given(
+def relative_inputs(
     folder: Path, run: Path, built: Path, truth: Path | None
 ) -> dict[str, str | None]:
     """Where a retraining's run, fit and truth lie, as seen from its folder, for its
@@ -68,8 +68,8 @@ def lens_of(path: Path) -> str:
     return "as made" if _places(folder)["truth"] else "as fitted"
 
 
-def load(path: Path) -> Source:
-    """A finished run as :func:`codesign.adapt.source.load` has it; of a retraining its
+def load_retrained(path: Path) -> FinishedRun:
+    """A finished run as :func:`codesign.adapt.source.load_finished_run` has it; of a retraining its
     network and the made lens.
 
     Args:
@@ -87,35 +87,41 @@ def load(path: Path) -> Source:
     """
     folder = _folder(path)
     if not is_retraining(folder):
-        return retraining.load(path)
+        return retraining.load_finished_run(path)
     job = "retrained" if path == folder else path.stem
-    with reading.steady(folder):
-        manifest.check(folder)
-        recipe, places = config.load(folder / RECIPE, Recipe), _places(folder)
+    with reading.refuse_changes(folder):
+        manifest.check_manifest(folder)
+        recipe, places = config.load(folder / RECIPE, RetrainingRecipe), _places(folder)
         for name, sha in (
             ("run", recipe.weights),
             ("asbuilt", recipe.asbuilt),
             ("truth", recipe.truth),
         ):
             _unchanged(folder, name, places[name], sha)
-        source = retraining.load(
+        source = retraining.load_finished_run(
             _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
         )
         built = asbuilt.load(_known(places["asbuilt"]))
-        truth = None if places["truth"] is None else config.load(places["truth"], Truth)
+        truth = (
+            None
+            if places["truth"] is None
+            else config.load(places["truth"], HiddenLens)
+        )
         run_dir, budget = _known(places["run"]), source.row["budget_mmacs"]
         design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
         made = MadeLens(design, source.settings.optics, response=built.response)
-        found = retraining.lenses(made, built, recipe.settings, truth)
+        found = retraining.lens_psfs(made, built, recipe.settings, truth)
         if (
-            job not in retraining.jobs(found)
+            job not in retraining.available_jobs(found)
             or not (folder / f"{job}.safetensors").is_file()
         ):
-            have = ", ".join(f"{name}.safetensors" for name in retraining.jobs(found))
+            have = ", ".join(
+                f"{name}.safetensors" for name in retraining.available_jobs(found)
+            )
             raise TrainingError(
                 f"{path}: no network of this retraining; it holds {have}"
             )
-        going = retraining.job(source, recipe.settings, found, job)
+        going = retraining.make_job(source, recipe.settings, found, job)
         going.restore(
             checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"]
         )

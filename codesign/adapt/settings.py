@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 
 from characterize.inference import AsBuilt
-from codesign.network import Architecture, check, subnet
-from codesign.optics import Stack
-from codesign.train import Run, RunConfig, checkpoint
+from codesign.network import Architecture, check_architecture, subnet
+from codesign.optics import PixelPsfStack
+from codesign.train import CodesignRun, RunConfig, checkpoint
 from codesign.train import run as runs
-from metalens.ground import manifest, reading
-from metalens.ground.errors import FitError, TrainingError
+from metalens.core import manifest, reading
+from metalens.core.errors import FitError, TrainingError
 from metalens.lens import Lens
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Source:
+class FinishedRun:
     """A finished run that is trained on: its network, the architecture that was chosen,
     its row of result.json.
 
@@ -29,10 +29,10 @@ class Source:
     own lens.
     """
 
-    run: Run
+    run: CodesignRun
     architecture: Architecture
     row: dict[str, Any]
-    made: Stack | None = None
+    made: PixelPsfStack | None = None
 
     @property
     def settings(self) -> RunConfig:
@@ -40,7 +40,7 @@ class Source:
         return self.run.settings
 
 
-def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
+def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun:
     """A finished run and its network of this budget, as result.json judged it.
 
     The weights are those of the network's own file, fine-tuned where the run did so.
@@ -62,10 +62,10 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
             f"{folder} is a half-written run: {', '.join(missing)} missing; finish it with "
             f"`metalens codesign RUN.toml -o {folder} --resume`"
         )
-    with reading.steady(folder):
-        manifest.check(folder)
-        settings = runs.load(folder / "run.toml")
-        made = runs.resume(folder / "checkpoint.safetensors", settings)
+    with reading.refuse_changes(folder):
+        manifest.check_manifest(folder)
+        settings = runs.load_run_settings(folder / "run.toml")
+        made = runs.resume_run(folder / "checkpoint.safetensors", settings)
         rows = rows_of(folder)
     found = (
         [r for r in rows if r["budget_mmacs"] == budget_mmacs]
@@ -78,9 +78,9 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
         )
     architecture = architecture_of(found[0]["architecture"], made, folder)
-    with reading.steady(folder):
+    with reading.refuse_changes(folder):
         restore_weights(made, found[0], folder)
-    return Source(made, architecture, found[0])
+    return FinishedRun(made, architecture, found[0])
 
 
 def weights_file(folder: Path, budget_mmacs: float) -> Path:
@@ -94,7 +94,7 @@ def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
     return folder / f"{name}.h5"
 
 
-def restore_weights(run: Run, row: dict[str, Any], folder: Path) -> None:
+def restore_weights(run: CodesignRun, row: dict[str, Any], folder: Path) -> None:
     """Give the run's network the weights that a row of result.json was judged with.
 
     Without fine-tuning those are the checkpoint's own; networks with optics of their
@@ -110,7 +110,7 @@ def restore_weights(run: Run, row: dict[str, Any], folder: Path) -> None:
     with torch.no_grad():
         for name in ("coefficients_rad", "log_pitch"):
             getattr(model, name).copy_(state.pop(f"optics.{name}"))
-    subnet.restore(model.net, state)
+    subnet.restore_weights(model.net, state)
 
 
 def is_retraining(folder: Path) -> bool:
@@ -136,7 +136,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
         TrainingError: the file is missing, cut short or of another version.
     """
     _no_retraining(folder)
-    manifest.check(folder)
+    manifest.check_manifest(folder)
     path = folder / "result.json"
     if not path.is_file():
         raise TrainingError(f"{path} is missing: no finished run; resume the run")
@@ -154,7 +154,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def architecture_of(
-    entry: dict[str, Any] | None, run: Run, folder: Path
+    entry: dict[str, Any] | None, run: CodesignRun, folder: Path
 ) -> Architecture:
     """The architecture in a row of result.json.
 
@@ -168,7 +168,7 @@ def architecture_of(
         if k not in ("error", "macs")
     }
     try:
-        return check(run.settings.space, Architecture(**values))
+        return check_architecture(run.settings.space, Architecture(**values))
     except TypeError as error:
         raise TrainingError(
             f"{folder}/result.json: its network is of another version ({error})"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.inference import AsBuilt
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 
 DRAWS = 24
 # standard deviation of the table's entries beyond which it is no table: the step of
@@ -50,22 +50,24 @@ _FRAMES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class CorrectionPart:
     """A part of a correction, in words, and the parameters that it follows."""
 
     words: str
     names: tuple[str, ...]
 
 
-TABLE = Part("the bias table", ("bias_nm", "height_nm", "index", "sidewall_deg"))
-MAP = Part(
+TABLE = CorrectionPart(
+    "the bias table", ("bias_nm", "height_nm", "index", "sidewall_deg")
+)
+MAP = CorrectionPart(
     "what varies over the lens",
     ("bias_x_nm", "bias_y_nm", "bias_r_nm", "bias_a_nm", "bias_o_nm"),
 )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sureness:
+class CorrectionSpread:
     """How the posterior spreads a correction.
 
     table_nm: (draws, knots) that of every draw. sigma_nm: (knots,) its standard
@@ -83,14 +85,14 @@ class Sureness:
         return not self.words
 
 
-def judge(
+def judge_correction(
     result: AsBuilt,
     table: Callable[[Array], Array],
     *,
-    part: Part = TABLE,
+    part: CorrectionPart = TABLE,
     wide_nm: float = WIDE_NM,
     seed: int = 5,
-) -> Sureness:
+) -> CorrectionSpread:
     """What every draw of the posterior would ask for, and whether they agree.
 
     Args:
@@ -103,19 +105,19 @@ def judge(
             [table(result.parameters(row)) for row in result.samples(DRAWS, seed=seed)]
         )
     except ConfigError as refusal:
-        return Sureness(
+        return CorrectionSpread(
             np.empty((0, 0)),
             np.empty(0),
             f"no correction: for lenses of the posterior {refusal}",
         )
     sigma = drawn.std(axis=0, ddof=1)
     if sigma.max() <= wide_nm:
-        return Sureness(drawn, sigma, "")
+        return CorrectionSpread(drawn, sigma, "")
     ranges = [
         (name, *result.interval(name)) for name in part.names if name in result.names
     ]
     told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
-    return Sureness(
+    return CorrectionSpread(
         drawn,
         sigma,
         f"no correction: the posterior leaves {part.words} open by {sigma.max():.1f} nm (1 sigma, at most "
@@ -127,7 +129,7 @@ def _settled(
     result: AsBuilt,
     table: Callable[[Array], Array],
     sigma: Array,
-    wanted: tuple[Part, float],
+    wanted: tuple[CorrectionPart, float],
 ) -> str:
     """What would make the table narrow, the most telling first: causes to state, and
     frames where these say too little.

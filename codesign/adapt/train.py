@@ -15,34 +15,34 @@ from pathlib import Path
 
 import torch
 
-from characterize.bench import Truth
+from characterize.bench import HiddenLens
 from characterize.inference import AsBuilt
 from codesign.adapt import reading
-from codesign.adapt.reading import Accuracy
+from codesign.adapt.reading import NetworkAccuracy
 from codesign.adapt.settings import RetrainConfig
 from codesign.adapt.source import (
-    Source,
+    FinishedRun,
     architecture_of,
     check_lens,
     lens_file,
-    load,
+    load_finished_run,
     rows_of,
 )
 from codesign.batches import TEST
-from codesign.network import recalibrate
-from codesign.optics import MadeLens, Stack, built
+from codesign.network import recalibrate_batch_norm
+from codesign.optics import MadeLens, PixelPsfStack, built
 from codesign.train import (
-    Batch,
+    FrameBatch,
     InnerConfig,
-    Record,
-    Scenes,
-    Schedule,
-    Seen,
+    LearningRateSchedule,
+    LogRecord,
+    SceneSource,
+    SensorFrames,
     Trainer,
     assess,
     checkpoint,
-    model,
-    place,
+    make_model,
+    place_on_device,
 )
 
 APART = 7919  # between the seeds of retrainings: no step of one is a step of another
@@ -54,7 +54,7 @@ JOBS = (
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lenses:
+class LensPsfs:
     """PSFs of the lens in question.
 
     nominal: as designed. best: of the fitted values. drawn: from the posterior, for
@@ -62,14 +62,14 @@ class Lenses:
     judge: the truth where it is known, else further draws. known: whether it is.
     """
 
-    nominal: Stack
-    best: Stack
-    drawn: tuple[Stack, ...]
-    judges: tuple[Stack, ...]
+    nominal: PixelPsfStack
+    best: PixelPsfStack
+    drawn: tuple[PixelPsfStack, ...]
+    judges: tuple[PixelPsfStack, ...]
     known: bool
 
 
-def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
+def gap_sigma_mm(worse: NetworkAccuracy, better: NetworkAccuracy) -> float:
     """Standard error of the difference of two mean slippage errors over the frames,
     which both cases share.
     """
@@ -78,7 +78,7 @@ def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Outcome:
+class RetrainingOutcome:
     """Accuracy in the order of the story.
 
     designed: the run's network on the nominal lens, as it was. nominal: trained on for
@@ -88,11 +88,11 @@ class Outcome:
     the fit. known: trained on with the truth known; None on a real bench.
     """
 
-    designed: Accuracy
-    nominal: Accuracy
-    before: Accuracy
-    after: Accuracy
-    known: Accuracy | None
+    designed: NetworkAccuracy
+    nominal: NetworkAccuracy
+    before: NetworkAccuracy
+    after: NetworkAccuracy
+    known: NetworkAccuracy | None
 
     @property
     def gap_mm(self) -> float:
@@ -129,15 +129,22 @@ class Outcome:
         return {name: case.values() for name, case in cases.items() if case is not None}
 
 
-def lenses(
-    made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None
-) -> Lenses:
+def lens_psfs(
+    made: MadeLens,
+    result: AsBuilt,
+    config: RetrainConfig,
+    truth: HiddenLens | None = None,
+) -> LensPsfs:
     """PSFs of the nominal, fitted, drawn and (where known) true lens."""
-    rows = list(built.posterior(result, config.draws + config.judge, seed=config.seed))
+    rows = list(
+        built.posterior_parameters(
+            result, config.draws + config.judge, seed=config.seed
+        )
+    )
     drawn = tuple(made.stack(x) for x in rows[: config.draws])
     judging = rows[config.draws :] if truth is None else [truth.vector()]
     best = made.stack(result.parameters())
-    return Lenses(
+    return LensPsfs(
         made.stack(),
         best,
         drawn,
@@ -146,12 +153,14 @@ def lenses(
     )
 
 
-def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:
+def make_trainer(
+    source: FinishedRun, config: RetrainConfig, stacks: Sequence[PixelPsfStack]
+) -> Trainer:
     """The inner loop of the run, from its trained weights and where it is placed, on
     given PSFs; only weights move.
     """
     settings, origin = source.settings, source.run.trainer
-    fresh = model(
+    fresh = make_model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
     )  # fmt: skip
     fresh.net.load_state_dict(origin.model.net.state_dict())
@@ -162,22 +171,24 @@ def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> T
         fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, fresh,
         architecture=source.architecture, stacks=stacks,
     )  # fmt: skip
-    place(made, origin.light.device)
+    place_on_device(made, origin.light.device)
     return made
 
 
 def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
     """The inner loop's settings for training on."""
-    still = Schedule(0.0)
+    still = LearningRateSchedule(0.0)
     return replace(
         inner, steps=config.steps, seed=inner.seed + APART * (config.seed + 1),
         weights=replace(inner.weights, rate=config.rate, start=0.0, end=1.0), optics=still, pitch=still,
     )  # fmt: skip
 
 
-def job(source: Source, config: RetrainConfig, found: Lenses, name: str) -> Trainer:
+def make_job(
+    source: FinishedRun, config: RetrainConfig, found: LensPsfs, name: str
+) -> Trainer:
     """The training of one of :data:`JOBS`."""
-    return trainer(
+    return make_trainer(
         source,
         config,
         {"nominal": (found.nominal,), "retrained": found.drawn, "known": found.judges}[
@@ -186,14 +197,14 @@ def job(source: Source, config: RetrainConfig, found: Lenses, name: str) -> Trai
     )
 
 
-def jobs(found: Lenses) -> tuple[str, ...]:
+def available_jobs(found: LensPsfs) -> tuple[str, ...]:
     """Networks that can be trained: with the truth only where it is known."""
     return JOBS if found.known else JOBS[:2]
 
 
-def train(
+def run_job(
     going: Trainer, path: Path, settings: object, *, every: int = 50
-) -> Iterator[Record]:
+) -> Iterator[LogRecord]:
     """Run one job to its end, from where it stands, with checkpoints in ``path``; a
     record a step.
     """
@@ -203,7 +214,9 @@ def train(
             checkpoint.save(path, {"trainer": going.state()}, settings=settings)
 
 
-def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
+def recalibrate_on_lenses(
+    going: Trainer, source: FinishedRun, *, batches: int = 8
+) -> None:
     """Measure the batch statistics on training frames through the lenses that the
     network was trained for.
 
@@ -214,15 +227,15 @@ def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
     for number in range(batches):
         made = going.light.stacks[number % len(going.light.stacks)]
         step = _Step(going.scenes, number)
-        frames.append(assess.frames(going, step, 1, stack=made).frames)
-    recalibrate(going.model.net, source.architecture, frames)
+        frames.append(assess.sensor_frames(going, step, 1, stack=made).frames)
+    recalibrate_batch_norm(going.model.net, source.architecture, frames)
 
 
 @dataclass(frozen=True, slots=True)
 class _Step:
     """One batch of scenes."""
 
-    scenes: Scenes
+    scenes: SceneSource
     number: int
 
     @property
@@ -230,56 +243,56 @@ class _Step:
         """Samples around the frames."""
         return self.scenes.margin
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """The batch, whatever ``step``."""
         return self.scenes.batch(self.number, size)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Held:
+class TestFrames:
     """Frames that judge, rendered once for every case."""
 
-    batches: tuple[Batch, ...]
+    batches: tuple[FrameBatch, ...]
     margin: int
     stream: int
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """Batch number ``step``, of the size that it was rendered in."""
         return self.batches[step]
 
 
-def held(source: Source, config: RetrainConfig) -> Held:
+def render_test_frames(source: FinishedRun, config: RetrainConfig) -> TestFrames:
     """The test frames of a run, that no training sees."""
     scenes = source.run.scenes(TEST)
     size = source.settings.inner.batch
-    return Held(
+    return TestFrames(
         tuple(scenes.batch(n, size) for n in range(config.test_batches)),
         scenes.margin,
         scenes.stream,
     )
 
 
-def judge(
+def judge_network(
     going: Trainer,
-    source: Source,
+    source: FinishedRun,
     config: RetrainConfig,
-    stacks: Sequence[Stack],
+    stacks: Sequence[PixelPsfStack],
     *,
-    frames: Held | None = None,
+    frames: TestFrames | None = None,
     finer: bool = True,
-) -> Accuracy:
+) -> NetworkAccuracy:
     """Errors on test frames, each the mean over these lenses: the frames are what all
     cases share.
 
     Args:
-        frames: of :func:`held`, where several cases are judged.
+        frames: of :func:`render_test_frames`, where several cases are judged.
         finer: judge on images formed at a quarter of the tolerance too.
     """
-    settle(going, source)
-    frames = frames or held(source, config)
+    recalibrate_on_lenses(going, source)
+    frames = frames or render_test_frames(source, config)
     own, fine = [], []
     for made in stacks[: config.judge]:
-        seen = assess.frames(going, frames, config.test_batches, stack=made)
+        seen = assess.sensor_frames(going, frames, config.test_batches, stack=made)
         own.append(_read(going, source, seen))
         more = (going, frames, config.test_batches) if finer else None
         exact = more and assess.finer_frames(*more, stack=made)
@@ -289,31 +302,36 @@ def judge(
     return replace(whole, finer=_mean(fine)) if len(fine) == len(own) else whole
 
 
-def _read(going: Trainer, source: Source, seen: Seen) -> Accuracy:
-    answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
-    return reading.accuracy(answers, seen)
+def _read(going: Trainer, source: FinishedRun, seen: SensorFrames) -> NetworkAccuracy:
+    answers = assess.predict_frames(
+        going.model.net, source.architecture, seen, going.inner
+    )
+    return reading.measure_accuracy(answers, seen)
 
 
-def _mean(parts: Sequence[Accuracy]) -> Accuracy:
+def _mean(parts: Sequence[NetworkAccuracy]) -> NetworkAccuracy:
     """Errors frame by frame, each the mean over lenses."""
     error, iou = (
         torch.stack([getattr(p, name) for p in parts]).mean(0)
         for name in ("error_mm", "iou")
     )
-    return Accuracy(error, iou, next((p.above for p in parts if p.above), ""))
+    return NetworkAccuracy(error, iou, next((p.above for p in parts if p.above), ""))
 
 
-def outcome(
-    source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]
-) -> Outcome:
+def retraining_outcome(
+    source: FinishedRun,
+    config: RetrainConfig,
+    found: LensPsfs,
+    trained: dict[str, Trainer],
+) -> RetrainingOutcome:
     """Accuracy of all cases, on the same test frames."""
-    nominal, frames = (found.nominal,), held(source, config)
-    untouched = trainer(source, config, nominal)
+    nominal, frames = (found.nominal,), render_test_frames(source, config)
+    untouched = make_trainer(source, config, nominal)
 
-    def of(going: Trainer, stacks: Sequence[Stack]) -> Accuracy:
-        return judge(going, source, config, stacks, frames=frames)
+    def of(going: Trainer, stacks: Sequence[PixelPsfStack]) -> NetworkAccuracy:
+        return judge_network(going, source, config, stacks, frames=frames)
 
-    return Outcome(
+    return RetrainingOutcome(
         designed=of(untouched, nominal),
         nominal=of(trained["nominal"], nominal),
         before=of(trained["nominal"], found.judges),
@@ -327,8 +345,8 @@ def retrain(
     result: AsBuilt,
     *,
     config: RetrainConfig | None = None,
-    truth: Truth | None = None,
-) -> Outcome:
+    truth: HiddenLens | None = None,
+) -> RetrainingOutcome:
     """A finished run's network trained on for the lens that was made, in one call;
     ``metalens retrain`` keeps files.
 
@@ -344,26 +362,45 @@ def retrain(
     from metalens import lens as lens_files
 
     config = config or RetrainConfig()
-    source = load(folder, budget_mmacs=config.budget_mmacs)
+    source = load_finished_run(folder, budget_mmacs=config.budget_mmacs)
     design = lens_files.load(
         lens_file(folder, source.settings, source.row["budget_mmacs"])
     )
     check_lens(design, result)
-    found = lenses(
+    found = lens_psfs(
         MadeLens(design, source.settings.optics, response=result.response),
         result,
         config,
         truth,
     )
-    trained = {name: job(source, config, found, name) for name in jobs(found)}
+    trained = {
+        name: make_job(source, config, found, name) for name in available_jobs(found)
+    }
     for going in trained.values():
         for _ in going.run():
             pass
-    return outcome(source, config, found, trained)
+    return retraining_outcome(source, config, found, trained)
 
 
 __all__ = [
-    "Accuracy", "Held", "Lenses", "Outcome", "RetrainConfig", "Source", "architecture_of", "check_lens",
-    "fine_tuning", "held", "job", "jobs", "judge", "lenses", "load", "outcome", "retrain", "rows_of",
-    "train", "trainer",
+    "FinishedRun",
+    "LensPsfs",
+    "NetworkAccuracy",
+    "RetrainConfig",
+    "RetrainingOutcome",
+    "TestFrames",
+    "architecture_of",
+    "available_jobs",
+    "check_lens",
+    "fine_tuning",
+    "judge_network",
+    "lens_psfs",
+    "load_finished_run",
+    "make_job",
+    "make_trainer",
+    "render_test_frames",
+    "retrain",
+    "retraining_outcome",
+    "rows_of",
+    "run_job",
 ]  # fmt: skip

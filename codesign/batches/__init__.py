@@ -2,20 +2,20 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.batches import parallel as parallel
-    from codesign.batches.batch import Batch as Batch
-    from codesign.batches.batch import Pose as Pose
-    from codesign.batches.batch import Scenes as Scenes
-    from codesign.batches.flat import Flat as Flat
+    from codesign.batches.batch import EyePose as EyePose
+    from codesign.batches.batch import FrameBatch as FrameBatch
+    from codesign.batches.batch import SceneSource as SceneSource
+    from codesign.batches.flat import SingleSurfaceFrames as SingleSurfaceFrames
     from codesign.batches.flat import depth_um as depth_um
-    from codesign.batches.flat import irradiance as irradiance
-    from codesign.batches.flat import samples as samples
-    from codesign.batches.pool import Pool as Pool
+    from codesign.batches.flat import frame_samples as frame_samples
+    from codesign.batches.flat import sensor_irradiance as sensor_irradiance
+    from codesign.batches.pool import FramePool as FramePool
     from codesign.batches.pool import PoolScenes as PoolScenes
-    from codesign.batches.pool import fill as fill
+    from codesign.batches.pool import render_pool as render_pool
     from codesign.batches.scenes import CALIBRATION as CALIBRATION
     from codesign.batches.scenes import EXPERIMENT as EXPERIMENT
     from codesign.batches.scenes import TEST as TEST
@@ -23,33 +23,33 @@ if TYPE_CHECKING:
     from codesign.batches.scenes import EyeScenes as EyeScenes
     from codesign.batches.scenes import SceneConfig as SceneConfig
     from codesign.batches.scenes import as_batch as as_batch
-    from codesign.batches.scenes import decoupled as decoupled
-    from codesign.batches.scenes import varied as varied
-    from codesign.batches.scenes import worn as worn
+    from codesign.batches.scenes import augmented_frames as augmented_frames
+    from codesign.batches.scenes import depth_factors as depth_factors
+    from codesign.batches.scenes import widen_motion as widen_motion
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Batch": "batch",
+        "FrameBatch": "batch",
         "CALIBRATION": "scenes",
         "EXPERIMENT": "scenes",
         "EyeScenes": "scenes",
-        "Flat": "flat",
-        "Pool": "pool",
+        "SingleSurfaceFrames": "flat",
+        "FramePool": "pool",
         "PoolScenes": "pool",
-        "Pose": "batch",
+        "EyePose": "batch",
         "SceneConfig": "scenes",
-        "Scenes": "batch",
+        "SceneSource": "batch",
         "TEST": "scenes",
         "VALIDATION": "scenes",
         "as_batch": "scenes",
-        "decoupled": "scenes",
+        "depth_factors": "scenes",
         "depth_um": "flat",
-        "fill": "pool",
-        "irradiance": "flat",
+        "render_pool": "pool",
+        "sensor_irradiance": "flat",
         "parallel": "",
-        "samples": "flat",
-        "varied": "scenes",
-        "worn": "scenes",
+        "frame_samples": "flat",
+        "widen_motion": "scenes",
+        "augmented_frames": "scenes",
     },
 )

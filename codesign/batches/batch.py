@@ -6,16 +6,16 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from codesign.batches.flat import Flat
+from codesign.batches.flat import SingleSurfaceFrames
 from metalens.image import Frames
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pose:
+class EyePose:
     """How the eye stands before the camera.
 
     shift_mm: (batch, 3) displacement of the head as the camera sees it
-    (:class:`codesign.eye.Labels`): what a network
+    (:class:`codesign.eye.FrameLabels`): what a network
         can learn of the slippage. axis: (batch, 3) optic axis, a unit vector in the
         camera's frame.
     points: (batch, points, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's
@@ -27,13 +27,13 @@ class Pose:
     axis: Tensor
     points: Tensor
 
-    def to(self, device: torch.device) -> "Pose":
+    def to(self, device: torch.device) -> "EyePose":
         """The same on a device."""
-        return Pose(*(getattr(self, name).to(device) for name in Pose.__slots__))
+        return EyePose(*(getattr(self, name).to(device) for name in EyePose.__slots__))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Batch:
+class FrameBatch:
     """Rendered frames with what is true of them.
 
     frames: on the image grid, ``margin`` samples wider on every side.
@@ -41,25 +41,27 @@ class Batch:
     pose: of the eye; None where nobody trains on it.
     """
 
-    frames: Frames | Flat
+    frames: Frames | SingleSurfaceFrames
     mask: Tensor
     slip_mm: Tensor
-    pose: Pose | None = None
+    pose: EyePose | None = None
 
-    def to(self, device: torch.device) -> "Batch":
+    def to(self, device: torch.device) -> "FrameBatch":
         """What is true of the frames on a device; the frames themselves go there as
         they are imaged.
         """
         pose = None if self.pose is None else self.pose.to(device)
-        return Batch(self.frames, self.mask.to(device), self.slip_mm.to(device), pose)
+        return FrameBatch(
+            self.frames, self.mask.to(device), self.slip_mm.to(device), pose
+        )
 
 
-class Scenes(Protocol):
+class SceneSource(Protocol):
     """Where frames come from: the same step gives the same frames."""
 
     @property
     def margin(self) -> int:
         """Samples around the frames that are blurred in but not seen."""
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """``size`` frames of training step ``step``."""

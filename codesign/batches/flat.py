@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import SceneError
+from metalens.core.arrays import Array
+from metalens.core.errors import SceneError
 from metalens.image import (
     CODES,
     Frames,
@@ -31,7 +31,7 @@ from metalens.image import (
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Flat:
+class SingleSurfaceFrames:
     """Opaque frames: every pixel has one radiance and one depth.
 
     light: (n, y, x) uint8, radiance 1 is 255. depth_um: (n, y, x) uint16, at unit
@@ -55,7 +55,7 @@ class Flat:
             )
 
 
-def flattened(frames: Frames, scale: Tensor) -> Flat:
+def flatten_layers(frames: Frames, scale: Tensor) -> SingleSurfaceFrames:
     """Both sheets as one: their light added, the depth of the sheet that covers more of
     the pixel.
 
@@ -71,26 +71,31 @@ def flattened(frames: Frames, scale: Tensor) -> Flat:
         frames.coverage[:, 1] > 0.5, frames.depth_um[:, 1], frames.depth_um[:, 0]
     )
     plain = (depth / scale.to(depth)[:, None, None]).clamp(0, 65535).round()
-    return Flat(
+    return SingleSurfaceFrames(
         light.numpy(), plain.numpy().astype(np.uint16), scale.numpy().astype(np.float32)
     )
 
 
-def samples(frames: Frames | Flat) -> int:
+def frame_samples(frames: Frames | SingleSurfaceFrames) -> int:
     """Samples along a side, margin included."""
     return int(
-        (frames.light if isinstance(frames, Flat) else frames.radiance).shape[-1]
+        (
+            frames.light if isinstance(frames, SingleSurfaceFrames) else frames.radiance
+        ).shape[-1]
     )
 
 
 def depth_um(
-    frames: Frames | Flat, *, margin: int = 0, device: torch.device | str = "cpu"
+    frames: Frames | SingleSurfaceFrames,
+    *,
+    margin: int = 0,
+    device: torch.device | str = "cpu",
 ) -> Tensor:
     """(n, y, x) depth of what is seen at every sample without the margin: of the sheet
     that covers more of it.
     """
     if isinstance(
-        frames, Flat
+        frames, SingleSurfaceFrames
     ):  # no more than the frames' own bytes travel to a device
         scale = torch.from_numpy(frames.scale.astype(np.float32)).to(device)
         whole = (
@@ -110,12 +115,12 @@ def _inside(shape: tuple[int, ...], margin: int) -> list[slice]:
     return [slice(margin, n - margin) for n in shape]
 
 
-def _radiance(frames: Flat, device: torch.device | str) -> Tensor:
+def _radiance(frames: SingleSurfaceFrames, device: torch.device | str) -> Tensor:
     return torch.from_numpy(frames.light).to(device).float() * (1 / 255)
 
 
-def irradiance(
-    frames: Frames | Flat, optics: UniformImager | Imager, *, margin: int
+def sensor_irradiance(
+    frames: Frames | SingleSurfaceFrames, optics: UniformImager | Imager, *, margin: int
 ) -> Tensor:
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the
     kernels of ``optics``.
@@ -157,8 +162,10 @@ def irradiance(
     return torch.cat(out)
 
 
-def _elsewhere(frames: Flat, optics: UniformImager, *, margin: int) -> Tensor:
-    """As :func:`irradiance` of flat frames, all at once on another device than the
+def _elsewhere(
+    frames: SingleSurfaceFrames, optics: UniformImager, *, margin: int
+) -> Tensor:
+    """As :func:`sensor_irradiance` of flat frames, all at once on another device than the
     processor.
     """
     light, depth = (

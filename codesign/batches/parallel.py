@@ -17,13 +17,13 @@ import torch
 from torch import Tensor, nn
 from torch import distributed as dist
 
-from codesign.batches.batch import Batch
-from codesign.batches.flat import Flat
-from metalens.ground.errors import TrainingError
+from codesign.batches.batch import FrameBatch
+from codesign.batches.flat import SingleSurfaceFrames
+from metalens.core.errors import TrainingError
 from metalens.image import Frames
 
 
-def join(device: torch.device | None = None) -> None:
+def join_processes(device: torch.device | None = None) -> None:
     """Join the other processes of ``torchrun``, if it started this one; ``device``:
     where this one computes.
     """
@@ -35,7 +35,7 @@ def join(device: torch.device | None = None) -> None:
             dist.init_process_group("gloo")
 
 
-def leave() -> None:
+def leave_processes() -> None:
     """Part from the others: what follows is done by process 0 alone."""
     if dist.is_initialized():
         dist.barrier()
@@ -46,7 +46,7 @@ _alone = False
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
+def single_process() -> Iterator[None]:
     """Work that this process does by itself, though others train along with it."""
     global _alone
     before, _alone = _alone, True
@@ -56,37 +56,37 @@ def alone() -> Iterator[None]:
         _alone = before
 
 
-def rank() -> int:
+def process_rank() -> int:
     """Number of this process."""
     return dist.get_rank() if dist.is_initialized() and not _alone else 0
 
 
-def ranks() -> int:
+def process_count() -> int:
     """Processes that train together."""
     return dist.get_world_size() if dist.is_initialized() and not _alone else 1
 
 
-def wait() -> None:
+def wait_for_all() -> None:
     """Until all are here."""
-    if ranks() > 1:
+    if process_count() > 1:
         dist.barrier()
 
 
-def part_of(batch: Batch) -> Batch:
+def part_of(batch: FrameBatch) -> FrameBatch:
     """The frames of a batch that this process takes.
 
     Raises:
         TrainingError: the processes do not share the batch evenly.
     """
-    if ranks() == 1:
+    if process_count() == 1:
         return batch
-    size, odd = divmod(len(batch.slip_mm), ranks())
+    size, odd = divmod(len(batch.slip_mm), process_count())
     if odd:
         raise TrainingError(
-            f"a batch of {len(batch.slip_mm)} frames on {ranks()} processes: need a multiple of them"
+            f"a batch of {len(batch.slip_mm)} frames on {process_count()} processes: need a multiple of them"
         )
-    mine = slice(rank() * size, (rank() + 1) * size)
-    frames: Frames | Flat = _rows(batch.frames, mine)
+    mine = slice(process_rank() * size, (process_rank() + 1) * size)
+    frames: Frames | SingleSurfaceFrames = _rows(batch.frames, mine)
     pose = None if batch.pose is None else _rows(batch.pose, mine)
     return replace(
         batch,
@@ -104,16 +104,16 @@ def _rows(record: Any, rows: slice) -> Any:
     )
 
 
-def average(parameters: Iterable[nn.Parameter]) -> None:
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Replace every gradient by its mean over the processes."""
-    if ranks() == 1:
+    if process_count() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
     for kind in sorted(
         {(g.dtype, g.device) for g in grads}, key=str
     ):  # in the same order everywhere
         mine = [g for g in grads if (g.dtype, g.device) == kind]
-        joined = _reduced(torch.cat([g.flatten() for g in mine])) / ranks()
+        joined = _reduced(torch.cat([g.flatten() for g in mine])) / process_count()
         start = 0
         for grad in mine:
             grad.copy_(joined[start : start + grad.numel()].view_as(grad))
@@ -122,14 +122,14 @@ def average(parameters: Iterable[nn.Parameter]) -> None:
 
 def shared_rows(count: int) -> Tensor:
     """Rows out of ``count`` that this process computes."""
-    return torch.arange(rank(), count, ranks())
+    return torch.arange(process_rank(), count, process_count())
 
 
-def gathered(part: Tensor, rows: Tensor, count: int) -> Tensor:
+def gather_rows(part: Tensor, rows: Tensor, count: int) -> Tensor:
     """(count, ...) rows of all processes from those of each (:func:`shared_rows`);
     differentiable: every process's loss depends on every process's rows.
     """
-    if ranks() == 1:
+    if process_count() == 1:
         return part
     whole = part.new_zeros((count, *part.shape[1:]))
     return _summed(whole.index_copy(0, rows.to(part.device), part))
@@ -137,26 +137,27 @@ def gathered(part: Tensor, rows: Tensor, count: int) -> Tensor:
 
 def mean_of(values: list[float]) -> list[float]:
     """Mean of numbers over the processes."""
-    if ranks() == 1:
+    if process_count() == 1:
         return values
     return [
-        float(v) for v in _reduced(torch.tensor(values, dtype=torch.float64)) / ranks()
+        float(v)
+        for v in _reduced(torch.tensor(values, dtype=torch.float64)) / process_count()
     ]
 
 
-def each(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
+def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
     """``work`` of every item, done by one process each; all get all answers, in order."""
     found = torch.zeros(len(items), dtype=torch.float64)
-    for i in range(rank(), len(items), ranks()):
+    for i in range(process_rank(), len(items), process_count()):
         found[i] = work(items[i])
-    return [float(v) for v in (_reduced(found) if ranks() > 1 else found)]
+    return [float(v) for v in (_reduced(found) if process_count() > 1 else found)]
 
 
 def batch_norm(
     x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5
 ) -> Tensor:
     """Batch normalisation with the statistics of all processes' frames; differentiable."""
-    count = x.numel() // x.shape[1] * ranks()
+    count = x.numel() // x.shape[1] * process_count()
     mean = _summed(x.sum((0, 2, 3))) / count
     centred = x - mean[:, None, None]
     variance = _summed(centred.square().sum((0, 2, 3))) / count

@@ -10,27 +10,27 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from codesign.batches.batch import Batch, Pose
-from codesign.batches.flat import Flat, flattened
-from codesign.batches.scenes import EyeScenes, decoupled, pose_of
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
-from metalens.ground.reading import reader
+from codesign.batches.batch import EyePose, FrameBatch
+from codesign.batches.flat import SingleSurfaceFrames, flatten_layers
+from codesign.batches.scenes import EyeScenes, depth_factors, pose_of
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
+from metalens.core.reading import typed_reader
 
 MASK = 64  # pixels along a side of the kept masks, where the frame allows it
 CHUNK = 64  # frames rendered at a time
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pool:
+class FramePool:
     """Frames at unit scale, with their labels; what :class:`PoolScenes` draws from.
 
     light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil
     coverage without the margin.
     place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3)
     the same as the camera sees it.
-    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.Pose`. here_um:
+    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.EyePose`. here_um:
     (3,) nominal place.
     depths_um: (2,) range of the depth.
     """
@@ -49,7 +49,7 @@ class Pool:
         return len(self.light)
 
 
-def fill(scenes: EyeScenes, count: int) -> Pool:
+def render_pool(scenes: EyeScenes, count: int) -> FramePool:
     """Render ``count`` frames of a stream of scenes."""
     parts = []
     for number, start in enumerate(range(0, count, CHUNK)):
@@ -58,31 +58,33 @@ def fill(scenes: EyeScenes, count: int) -> Pool:
     light, depth, mask, place, seen, axis, points = (
         np.concatenate(rows) for rows in zip(*parts, strict=True)
     )
-    return Pool(
+    return FramePool(
         light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um)
     )
 
 
-def save(path: Path, pool: Pool) -> None:
+def save_pool(path: Path, pool: FramePool) -> None:
     """Keep a pool (HDF5, kind ``pool``)."""
-    store.save(path, "pool", {name: getattr(pool, name) for name in Pool.__slots__})
+    store.save(
+        path, "pool", {name: getattr(pool, name) for name in FramePool.__slots__}
+    )
 
 
-@reader
-def load(path: Path) -> Pool:
+@typed_reader
+def load_pool(path: Path) -> FramePool:
     """A pool that was kept.
 
     Raises:
         StoreError: not a pool.
     """
-    return Pool(**store.load(path, "pool").arrays)
+    return FramePool(**store.load(path, "pool").arrays)
 
 
 def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
-    """The first seven arrays of a :class:`Pool`."""
+    """The first seven arrays of a :class:`FramePool`."""
     made = scenes.rendered(number, count)
     states = scenes.states(number, count)
-    flat = flattened(made.frames, states.scale)
+    flat = flatten_layers(made.frames, states.scale)
     inside = slice(scenes.margin, made.pupil.shape[-1] - scenes.margin)
     mask = made.pupil[:, None, inside, inside]
     if mask.shape[-1] % MASK == 0:
@@ -120,17 +122,17 @@ class PoolScenes:
     hold theirs at once.
     """
 
-    pool: Pool | Callable[[], Pool]
+    pool: FramePool | Callable[[], FramePool]
     margin: int
     spread: float
     seed: int
 
     @property
-    def held(self) -> Pool:
+    def held(self) -> FramePool:
         """The frames."""
-        return self.pool if isinstance(self.pool, Pool) else self.pool()
+        return self.pool if isinstance(self.pool, FramePool) else self.pool()
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """``size`` frames of a step.
 
         Raises:
@@ -149,7 +151,7 @@ class PoolScenes:
             np.random.default_rng([self.seed, step, 6]),
         )
 
-    def rows(self, rows: Array, generator: np.random.Generator) -> Batch:
+    def rows(self, rows: Array, generator: np.random.Generator) -> FrameBatch:
         """The frames of these numbers, at scales drawn from ``generator``."""
         pool = self.held
         here, place = (
@@ -157,21 +159,21 @@ class PoolScenes:
             torch.from_numpy(pool.place_um[rows]),
         )
         low, high = pool.depths_um
-        scale = decoupled(
+        scale = depth_factors(
             place[:, 2], (float(low), float(high)), self.spread, generator
         )
         slip, shift = (
             (scale[:, None] * p - here) * 1e-3
             for p in (place, torch.from_numpy(pool.seen_um[rows]))
         )
-        pose = Pose(
+        pose = EyePose(
             shift.float(),
             torch.from_numpy(pool.axis[rows]),
             torch.from_numpy(pool.points[rows]),
         )
-        flat = Flat(
+        flat = SingleSurfaceFrames(
             pool.light[rows], pool.depth_um[rows], scale.numpy().astype(np.float32)
         )
-        return Batch(
+        return FrameBatch(
             flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float(), pose
         )

@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches.batch import Batch, Pose
+from codesign.batches.batch import EyePose, FrameBatch
 from codesign.eye import (
     POPULATION,
-    Camera,
-    Motion,
-    Rendered,
-    Rig,
-    States,
-    Trait,
-    drawn,
+    CameraRig,
+    EyeStates,
+    MotionRanges,
+    PinholeCamera,
+    RenderedFrames,
+    SubjectTrait,
+    draw_augmentations,
     render_dressed,
 )
 from codesign.eye import population as eye
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 from metalens.image import Frames
 
 # Streams of the random generator. Training, the search's selection, the calibration of
@@ -48,7 +48,7 @@ class SceneConfig:
     samples rendered beyond it.
     scale: spread of the scale ambiguity: depths and labels are multiplied by a factor
     of 1 +- scale at an unchanged
-        pinhole image, so that size does not tell depth; see :func:`decoupled`.
+        pinhole image, so that size does not tell depth; see :func:`depth_factors`.
     slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up
     or down.
     depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image
@@ -84,7 +84,7 @@ class SceneConfig:
                 f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
                 "margin below them, and a scale below 0.5"
             )
-        nearest = 1e-3 * Rig().distance_um
+        nearest = 1e-3 * CameraRig().distance_um
         if (
             min(self.slip_mm) < 0
             or self.slip_mm[2] >= nearest
@@ -106,13 +106,13 @@ class SceneConfig:
         (two standard deviations).
         """
         reach = self.slip_mm[2] * 1e3 + 2e3 * self.depth_sd_mm
-        return Rig().distance_um - reach, Rig().distance_um + reach
+        return CameraRig().distance_um - reach, CameraRig().distance_um + reach
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> MotionRanges:
         """The ranges that states are drawn from, at unit scale."""
         depth = replace(POPULATION["depth_um"], sd=self.depth_sd_mm * 1e3)
-        wide = varied(self.variety)
+        wide = widen_motion(self.variety)
         return replace(
             wide,
             population={**wide.population, "depth_um": depth},
@@ -145,9 +145,9 @@ class EyeScenes:
         return self.settings.margin
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> CameraRig:
         """Camera and lamps."""
-        return replace(Rig(), sensor_distance_um=self.sensor_distance_um)
+        return replace(CameraRig(), sensor_distance_um=self.sensor_distance_um)
 
     @property
     def depths_um(self) -> tuple[float, float]:
@@ -156,54 +156,60 @@ class EyeScenes:
         return self.rig.distance_um - reach, self.rig.distance_um + reach
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> PinholeCamera:
         """Image grid with its margin."""
-        return Camera(self.settings.pixels + 2 * self.margin, self.sample_um)
+        return PinholeCamera(self.settings.pixels + 2 * self.margin, self.sample_um)
 
-    def states(self, step: int, size: int) -> States:
+    def states(self, step: int, size: int) -> EyeStates:
         """Subjects and states of a step."""
-        plain = eye.draw(
+        plain = eye.draw_states(
             size, (self.seed, self.stream, step), motion=self.settings.motion
         )
         depth = self.rig.distance_um + plain.slip_um[:, 2]
         generator = np.random.default_rng((self.seed, self.stream, step, 1))
         return replace(
             plain,
-            scale=decoupled(depth, self.depths_um, self.settings.scale, generator),
+            scale=depth_factors(depth, self.depths_um, self.settings.scale, generator),
         )
 
-    def rendered(self, step: int, size: int) -> Rendered:
+    def rendered(self, step: int, size: int) -> RenderedFrames:
         """Frames of a step with all labels, and with what the scenes' variety lets them
         wear.
         """
         seed = (self.seed, self.stream, step, 3)
-        return worn(
+        return augmented_frames(
             self.states(step, size), self.rig, self.camera, self.settings.variety, seed
         )
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """Frames of a step, as training takes them."""
         return as_batch(self.rendered(step, size), self.margin)
 
 
-def worn(
-    states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[int, ...]
-) -> Rendered:
+def augmented_frames(
+    states: EyeStates,
+    rig: CameraRig,
+    camera: PinholeCamera,
+    variety: float,
+    seed: tuple[int, ...],
+) -> RenderedFrames:
     """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1."""
-    found = drawn(len(states), variety, np.random.default_rng(seed))
+    found = draw_augmentations(len(states), variety, np.random.default_rng(seed))
     return render_dressed(states, found, rig=rig, camera=camera)
 
 
-def varied(variety: float) -> Motion:
+def widen_motion(variety: float) -> MotionRanges:
     """The usual ranges with looks and opening of the lids spread by a factor about the
     mean.
     """
-    usual = Motion()
+    usual = MotionRanges()
     widest = max(1 - (1 - usual.aperture[0]) * variety, 0.1), usual.aperture[1]
-    return replace(usual, population={**POPULATION, **looks(variety)}, aperture=widest)
+    return replace(
+        usual, population={**POPULATION, **widen_traits(variety)}, aperture=widest
+    )
 
 
-def looks(variety: float) -> dict[str, Trait]:
+def widen_traits(variety: float) -> dict[str, SubjectTrait]:
     """Traits of :data:`LOOKS`, spread and limits widened about the mean, between
     :data:`LEAST` and :data:`MOST`.
     """
@@ -220,7 +226,7 @@ def looks(variety: float) -> dict[str, Trait]:
     return found
 
 
-def decoupled(
+def depth_factors(
     depth_um: Tensor,
     range_um: tuple[float, float],
     spread: float,
@@ -238,13 +244,13 @@ def decoupled(
     return (wanted / depth_um).clamp(1 - spread, 1 + spread)
 
 
-def as_batch(made: Rendered, margin: int) -> Batch:
+def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
     """Rendered frames as a training batch: the mask without its margin, the slippage in
     mm.
     """
     inside = slice(margin, made.pupil.shape[-1] - margin)
     frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
-    return Batch(
+    return FrameBatch(
         frames,
         made.pupil[:, inside, inside],
         (made.labels.slip_um * 1e-3).float(),
@@ -252,11 +258,11 @@ def as_batch(made: Rendered, margin: int) -> Batch:
     )
 
 
-def pose_of(made: Rendered, margin: int) -> Pose:
+def pose_of(made: RenderedFrames, margin: int) -> EyePose:
     """How the eyes of rendered frames stand."""
     size, labels = made.pupil.shape[-1], made.labels
     places = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
     points = (places - (size - 1) / 2) / (size - 2 * margin)
-    return Pose(
+    return EyePose(
         (labels.shift_um * 1e-3).float(), labels.optic_axis.float(), points.float()
     )

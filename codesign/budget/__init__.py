@@ -2,28 +2,28 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.budget import links as links
     from codesign.budget import page as page
     from codesign.budget.entry import MEASURED as MEASURED
     from codesign.budget.entry import TOTAL as TOTAL
-    from codesign.budget.entry import Entry as Entry
-    from codesign.budget.entry import total as total
-    from codesign.budget.prepared import Given as Given
-    from codesign.budget.prepared import bench as bench
+    from codesign.budget.entry import BudgetEntry as BudgetEntry
+    from codesign.budget.entry import quadrature_total as quadrature_total
+    from codesign.budget.prepared import BudgetInputs as BudgetInputs
+    from codesign.budget.prepared import prepare_device as prepare_device
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Entry": "entry",
-        "Given": "prepared",
+        "BudgetEntry": "entry",
+        "BudgetInputs": "prepared",
         "MEASURED": "entry",
         "TOTAL": "entry",
-        "bench": "prepared",
+        "prepare_device": "prepared",
         "links": "",
         "page": "",
-        "total": "entry",
+        "quadrature_total": "entry",
     },
 )

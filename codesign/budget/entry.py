@@ -8,7 +8,7 @@ TOTAL, MEASURED = "all links", "measured, all at once"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class BudgetEntry:
     """One link: rms phase error over the pillars (rad), relative L2 error of the PSFs,
     gaze error (rad, mean angle).
 
@@ -25,12 +25,12 @@ class Entry:
     counted: bool = True
 
 
-def more(error: float, before: float) -> float:
+def quadrature_difference(error: float, before: float) -> float:
     """What an error has more than before, in quadrature; 0 where it has less."""
     return math.sqrt(max(error**2 - before**2, 0.0))
 
 
-def total(found: list[Entry]) -> Entry:
+def quadrature_total(found: list[BudgetEntry]) -> BudgetEntry:
     """The root of the sum of squares of what counts."""
 
     def together(name: str) -> float:
@@ -41,6 +41,6 @@ def total(found: list[Entry]) -> Entry:
     said = "root of the sum of squares" + (
         f"; without {', '.join(missing)}" if missing else ""
     )
-    return Entry(
+    return BudgetEntry(
         TOTAL, together("phase_rad"), together("psf"), together("gaze_rad"), said
     )

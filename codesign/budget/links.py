@@ -17,51 +17,60 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from characterize.model import PLACE, state
+from characterize.model import PLACE, process_state_of
 from codesign.budget import task
-from codesign.budget.entry import MEASURED, NONE, Entry, total
-from codesign.budget.person import person
-from codesign.budget.prepared import Bench
-from codesign.budget.response import between, put_right, scatter_rad
+from codesign.budget.entry import MEASURED, NONE, BudgetEntry, quadrature_total
+from codesign.budget.person import subject_entries
+from codesign.budget.prepared import PreparedDevice
+from codesign.budget.response import interpolate_response, put_right, scatter_rad
 from codesign.evaluate import AXIAL
 from codesign.optics import psf_difference
 from codesign.train import assess
-from metalens.cell import Light
-from metalens.design import neighbours as supercell
-from metalens.fabrication import State, biased, draws, sensitivity, transmission
-from metalens.ground.arrays import Array
-from metalens.ground.errors import (
+from metalens.cell import Incidence
+from metalens.core.arrays import Array
+from metalens.core.errors import (
     CellError,
     LensError,
     PropagationError,
     SceneError,
 )
-from metalens.lens import Neighbours
+from metalens.design import neighbours as supercell
+from metalens.fabrication import State, biased, draws, sensitivity, transmission
+from metalens.lens import NeighbourRows
 from metalens.pillars import PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again
 FINER = 30.0  # how much more precisely
 
 
-def entries(about: Bench) -> Iterator[Entry]:
+def budget_entries(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """The budget, link by link from the answered gaze back to the pillars, ending with
     the sum.
 
     Raises:
         LensError: the as-built file is of another lens.
     """
-    found: list[Entry] = []
-    first = (answer,) if about.reading is None else (_read,)
-    parts = (*first, image, device, pillars, neighbours, mask, process, calibration)
-    for part in (*parts, numerics):
+    found: list[BudgetEntry] = []
+    first = (oracle_answer_entry,) if about.reading is None else (_read,)
+    parts = (
+        *first,
+        image_tolerance_entry,
+        pillar_device_entry,
+        solver_entries,
+        neighbour_coupling_entry,
+        mask_entry,
+        process_entries,
+        calibration_entry,
+    )
+    for part in (*parts, numerics_entries):
         for entry in part(about):
             found.append(entry)
             yield entry
-    yield from measured(about)
-    yield total(found)
+    yield from measured_entry(about)
+    yield quadrature_total(found)
 
 
-def _read(about: Bench) -> Iterator[Entry]:
+def _read(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Of a run's network; later links are judged with the persons that these
     calibrate.
     """
@@ -69,14 +78,14 @@ def _read(about: Bench) -> Iterator[Entry]:
         yield from about.reading.path()
 
 
-def answer(about: Bench) -> Iterator[Entry]:
+def oracle_answer_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """From the true pupil to the answer where no run was given: what no reader changes."""
-    yield from person(about.given.frames, about.setting.rig)
-    yield Entry("reader", NONE, NONE, NONE, "not known: no run was given (--run)")
+    yield from subject_entries(about.given.frames, about.setting.rig)
+    yield BudgetEntry("reader", NONE, NONE, NONE, "not known: no run was given (--run)")
     noise = (
         about.reader.noise_rad * math.sqrt(math.pi) / 2
     )  # rms to mean of a Gaussian in the plane
-    yield Entry(
+    yield BudgetEntry(
         "sensor noise",
         NONE,
         NONE,
@@ -95,22 +104,22 @@ def answer(about: Bench) -> Iterator[Entry]:
         said += f"; pillars answer as at {design_nm:g} nm, whatever their library holds"
         yield replace(about.entry("spectrum", one, said), counted=False)
     else:
-        yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
+        yield BudgetEntry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
 
 
-def image(about: Bench) -> Iterator[Entry]:
+def image_tolerance_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """The tolerance of the image itself: one formed at a quarter of it."""
     link, tolerance = "image tolerance", about.image_tolerance
     said = f"image formed at {tolerance / assess.FINER:g} in place of {tolerance:g}"
     try:
         turn = about.turned_on_finer_image()
     except (SceneError, PropagationError) as problem:
-        yield Entry(link, NONE, NONE, NONE, f"not known: {problem}")
+        yield BudgetEntry(link, NONE, NONE, NONE, f"not known: {problem}")
         return
-    yield Entry(link, NONE, NONE, turn, said)
+    yield BudgetEntry(link, NONE, NONE, turn, said)
 
 
-def device(about: Bench) -> Iterator[Entry]:
+def pillar_device_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Pillars in place of the smooth phase, films, both polarisations."""
     if about.reading is not None:
         said = (
@@ -131,21 +140,23 @@ def device(about: Bench) -> Iterator[Entry]:
             "glass", bare, f"{len(films)} films of the lens file taken away"
         )
     else:
-        yield Entry("glass", NONE, 0.0, 0.0, "the lens file holds no film")
+        yield BudgetEntry("glass", NONE, 0.0, 0.0, "the lens file holds no film")
     said = "flux of both polarisations through the sensor in place of one scalar"
     yield about.entry("polarisation", about.device.both_polarisations(), said)
 
 
-def measured(about: Bench) -> Iterator[Entry]:
+def measured_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """What the virtual experiment measures on the same frames."""
     if about.reading is None:
         return
     gaze = math.radians(about.reading.measured_deg[AXIAL])
     said = f"virtual experiment on these {about.given.frames.frames} frames, mean under axial slippage"
-    yield Entry(MEASURED, NONE, NONE, gaze, said, counted=False)
+    yield BudgetEntry(MEASURED, NONE, NONE, gaze, said, counted=False)
 
 
-def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
+def _changed(
+    about: PreparedDevice, link: str, table: Array, method: str
+) -> BudgetEntry:
     """The entry of other pillars: a table t(D) against the designed one."""
     turn = np.angle(table / about.aperture.designed())
     optics = about.device.image(wave=about.gathered(*about.aperture.maps(table)))
@@ -154,15 +165,18 @@ def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
     )
 
 
-def pillars(about: Bench) -> Iterator[Entry]:
+def solver_entries(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Solver and proxy, against the solver asked for thirty times the precision."""
     lens, given = about.lens, about.given
     low, high = supercell.printed(lens)
     at = np.linspace(low, high, SOLVED)
     tolerance = given.library.sweep.bar if given.library else given.tolerance
-    engine = engines.choose(lens.cell)
-    solve = engines.precise(
-        lens.cell, Light(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine
+    engine = engines.choose_engine(lens.cell)
+    solve = engines.solve_to_tolerance(
+        lens.cell,
+        Incidence(lens.wavelength_um),
+        tolerance=tolerance / FINER,
+        engine=engine,
     )
     exact = np.array([solve(float(d)).t for d in at])
     proxy = lens.proxy.transmission(at, lens.wavelength_um) * np.exp(
@@ -187,17 +201,19 @@ def _stored(library: PillarLibrary, at_um: Array, wavelength_um: float) -> Array
     between its diameters.
     """
     near = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
-    return between(library.t[:, 0, near].mean(0), library.diameter_um, at_um)
+    return interpolate_response(
+        library.t[:, 0, near].mean(0), library.diameter_um, at_um
+    )
 
 
-def neighbours(about: Bench) -> Iterator[Entry]:
+def neighbour_coupling_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Local periodic approximation: rows of unlike pillars solved as one; what is open
     of them where the lens holds
     them."""
     held = about.lens.neighbours
     if held is not None:
         found = [
-            among(about, other, "")
+            other_rows_entry(about, other, "")
             for other in held.doubted(about.aperture.turn_sine())
         ]
         rms = [
@@ -207,25 +223,29 @@ def neighbours(about: Bench) -> Iterator[Entry]:
             )
         ]
         said = "rows of the lens file, in the image: another truncation, a row left out, zones that get shorter"
-        yield Entry("neighbours", rms[0], rms[1], rms[2], said)
+        yield BudgetEntry("neighbours", rms[0], rms[1], rms[2], said)
         return
     try:
         rows = supercell.neighbours(about.lens)
     except CellError:
         return  # films or tilted walls: rows of those are not solved
-    counts = f"rows of {', '.join(map(str, lengths(rows, about.lens.cell.pitch_um)))}"
+    counts = (
+        f"rows of {', '.join(map(str, row_lengths(rows, about.lens.cell.pitch_um)))}"
+    )
     said = f"{counts} unlike pillars solved as one cell; factor carried over the aperture by the angle of turning"
-    yield among(about, rows, said)
+    yield other_rows_entry(about, rows, said)
 
 
-def lengths(rows: Neighbours, pitch_um: float) -> list[int]:
+def row_lengths(rows: NeighbourRows, pitch_um: float) -> list[int]:
     """Pillars of every row along the lattice: it turns light by one wave over its
     length.
     """
     return [round(n) for n in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um]
 
 
-def among(about: Bench, rows: Neighbours, said: str) -> Entry:
+def other_rows_entry(
+    about: PreparedDevice, rows: NeighbourRows, said: str
+) -> BudgetEntry:
     """The entry of other rows than the lens holds."""
     built, sine = about.aperture.place >= 0, about.aperture.turn_sine()
     turn = np.angle(rows.mean(sine[built]))
@@ -238,7 +258,7 @@ def among(about: Bench, rows: Neighbours, said: str) -> Entry:
     return about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
-def mask(about: Bench) -> Iterator[Entry]:
+def mask_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Diameters as the mask holds them, where one is given."""
     if about.given.mask is None:
         return
@@ -247,16 +267,16 @@ def mask(about: Bench) -> Iterator[Entry]:
     yield _changed(about, "mask grid", table, f"every diameter rounded to {step:g} nm")
 
 
-def process(about: Bench) -> Iterator[Entry]:
+def process_entries(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Draws of the process; what a fit of the built lens would take out again."""
     if about.given.mask is None:
         return
     about.given.mask.spread.check(about.lens.cell)
     made = [
-        Made(draw.state())
+        FabricatedDevice(draw.state())
         for draw in draws(about.given.mask.spread, about.given.draws, seed=5)
     ]
-    yield drawn(
+    yield rms_over_lenses(
         about,
         "process spread",
         made,
@@ -265,7 +285,7 @@ def process(about: Bench) -> Iterator[Entry]:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class FabricatedDevice:
     """A made lens on its sensor: its causes, and how far the distance is off. (A
     decentre moves the image alike.)
     """
@@ -274,7 +294,9 @@ class Made:
     shift_um: float = 0.0
 
 
-def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
+def rms_over_lenses(
+    about: PreparedDevice, link: str, lenses: list[FabricatedDevice], method: str
+) -> BudgetEntry:
     """Root mean square over made lenses."""
     aperture, d = about.aperture, about.lens.diameters
     response = sensitivity(about.lens)
@@ -322,10 +344,10 @@ def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
         math.sqrt(sum(v * v for v in column) / len(rows))
         for column in zip(*rows, strict=True)
     ]
-    return Entry(link, rms[0], rms[1], rms[2], method)
+    return BudgetEntry(link, rms[0], rms[1], rms[2], method)
 
 
-def calibration(about: Bench) -> Iterator[Entry]:
+def calibration_entry(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """What the fit of the built lens leaves open: draws of its posterior against its
     best estimate.
     """
@@ -343,14 +365,16 @@ def calibration(about: Bench) -> Iterator[Entry]:
     made = []
     for row in fitted.lens_samples(about.given.draws, seed=3):
         off = fitted.parameters(row) - best
-        made.append(Made(state(off), float(off[PLACE["distance_um"]])))
+        made.append(
+            FabricatedDevice(process_state_of(off), float(off[PLACE["distance_um"]]))
+        )
     said = (
         f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"
     )
-    yield drawn(about, "calibration of the lens", made, said)
+    yield rms_over_lenses(about, "calibration of the lens", made, said)
 
 
-def numerics(about: Bench) -> Iterator[Entry]:
+def numerics_entries(about: PreparedDevice) -> Iterator[BudgetEntry]:
     """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its
     setting, the rest at its finest.
 
@@ -387,7 +411,7 @@ def numerics(about: Bench) -> Iterator[Entry]:
             psf_difference(optics, finest, about.window),
             task.gaze_mean(about.shift(optics, finest)),
         )
-        yield Entry(
+        yield BudgetEntry(
             link,
             NONE,
             psf,

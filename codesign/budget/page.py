@@ -3,18 +3,18 @@
 import math
 from pathlib import Path
 
-from codesign.budget.entry import MEASURED, TOTAL, Entry
-from metalens.ground import report
+from codesign.budget.entry import MEASURED, TOTAL, BudgetEntry
+from metalens.core import report
 
 
-def write(path: Path, rows: list[Entry]) -> None:
+def write_budget_page(path: Path, rows: list[BudgetEntry]) -> None:
     """One page: chart, table, how each number was found."""
     keys = [
         report.KeyFigure(
             "gaze error of all links", f"{math.degrees(rows[-1].gaze_rad):.2g}°"
         ),
         report.KeyFigure(
-            "largest", max(counted(rows[:-1]), key=lambda r: r.gaze_rad).link
+            "largest", max(counted_entries(rows[:-1]), key=lambda r: r.gaze_rad).link
         ),
     ]
     for row in rows:
@@ -26,15 +26,17 @@ def write(path: Path, rows: list[Entry]) -> None:
                 ),
             )
     lead = "What each link of the chain costs, carried through pillars, PSFs and images of eyes to the gaze that is read."
-    report.write(path, "Error budget", [section(rows)], lead=lead, key_figures=keys)
+    report.write_report(
+        path, "Error budget", [budget_section(rows)], lead=lead, key_figures=keys
+    )
 
 
-def counted(rows: list[Entry]) -> list[Entry]:
+def counted_entries(rows: list[BudgetEntry]) -> list[BudgetEntry]:
     """Those that the sum holds and that are known."""
     return [r for r in rows if r.counted and not math.isnan(r.gaze_rad)]
 
 
-def section(rows: list[Entry]) -> report.Section:
+def budget_section(rows: list[BudgetEntry]) -> report.Section:
     """Chart and table for any page."""
     cells = [
         (
@@ -55,7 +57,7 @@ def section(rows: list[Entry]) -> report.Section:
         "shown switched off and is not in the sum."
     )
     picture = report.Figure(
-        chart(rows), "Gaze error of each link, log scale.", wide=True
+        plot_budget(rows), "Gaze error of each link, log scale.", wide=True
     )
     return report.Section(
         "Error budget",
@@ -71,13 +73,13 @@ def section(rows: list[Entry]) -> report.Section:
     )
 
 
-def chart(rows: list[Entry]) -> bytes:
+def plot_budget(rows: list[BudgetEntry]) -> bytes:
     """Bars of the gaze error, the largest on top."""
     shown = sorted(
         (r for r in rows if r.gaze_rad > 0 and (r.counted or r.link == MEASURED)),
         key=lambda r: r.gaze_rad,
     )
-    figure, axes = report.canvas(size=(7.5, 0.5 + 0.32 * len(shown)))
+    figure, axes = report.make_figure(size=(7.5, 0.5 + 0.32 * len(shown)))
     colours = ["#444" if r.link in (MEASURED, TOTAL) else "#1f6feb" for r in shown]
     axes.barh(
         [r.link for r in shown],
@@ -86,4 +88,4 @@ def chart(rows: list[Entry]) -> bytes:
     )
     axes.set(xscale="log", xlabel="gaze error / deg")
     axes.grid(axis="y", visible=False)
-    return report.png(figure)
+    return report.figure_png(figure)

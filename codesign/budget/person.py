@@ -10,28 +10,32 @@ import numpy as np
 import torch
 
 from codesign.batches import EXPERIMENT, EyeScenes, SceneConfig
-from codesign.budget.entry import NONE, Entry, more
+from codesign.budget.entry import NONE, BudgetEntry, quadrature_difference
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
-from codesign.eye import Camera, Rig, render
-from codesign.gaze import Readings, Sphere, angle_deg
+from codesign.eye import CameraRig, PinholeCamera, render
+from codesign.gaze import NetworkReadings, SphereCalibrator, angle_deg
 
 LABELS = 64  # pixels of renderings whose labels alone are wanted
 WIDTH_UM = 1152.0  # of the sensor
 
 
-def told(config: ExperimentConfig, scenes: EyeScenes) -> Readings:
+def known_readings(config: ExperimentConfig, scenes: EyeScenes) -> NetworkReadings:
     """Pupil and slippage of the experiment's frames as they are."""
     pupil, slip = [], []
     pitch = scenes.camera.pitch_um * scenes.camera.pixels / LABELS
     for subject in range(config.subjects):
         states, _ = gaze_experiment.states_of(config, subject, scenes)
-        labels = render(states, rig=scenes.rig, camera=Camera(LABELS, pitch)).labels
+        labels = render(
+            states, rig=scenes.rig, camera=PinholeCamera(LABELS, pitch)
+        ).labels
         pupil.append((labels.pupil_px - (LABELS - 1) / 2) * (pitch * 1e-3))
         slip.append(labels.slip_um * 1e-3)
-    return Readings(torch.cat(pupil).double().numpy(), torch.cat(slip).double().numpy())
+    return NetworkReadings(
+        torch.cat(pupil).double().numpy(), torch.cat(slip).double().numpy()
+    )
 
 
-def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
+def subject_entries(config: ExperimentConfig, rig: CameraRig) -> Iterator[BudgetEntry]:
     """Subject with calibration, and fixation: the error of answers that are given the
     true pupil and slippage.
     """
@@ -42,7 +46,7 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
         0,
         EXPERIMENT,
     )
-    trial = gaze_experiment.joined(
+    trial = gaze_experiment.join_subjects(
         [
             gaze_experiment.states_of(config, s, scenes)[1]
             for s in range(config.subjects)
@@ -50,8 +54,10 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
     )
     answers = []
     for one in (replace(config, fixation_deg=0.0), config):
-        how = Sphere(scenes.rig, one.hidden, one.seed)
-        answer, judged = gaze_experiment.calibrated(told(one, scenes), trial, one, how)
+        how = SphereCalibrator(scenes.rig, one.hidden, one.seed)
+        answer, judged = gaze_experiment.calibrated_gaze(
+            known_readings(one, scenes), trial, one, how
+        )
         answers.append(answer)
     kept = judged & trial.group(AXIAL)
     alone, whole = (
@@ -61,7 +67,7 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
     people = (
         f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
     )
-    yield Entry(
+    yield BudgetEntry(
         "subject and calibration",
         NONE,
         NONE,
@@ -69,4 +75,4 @@ def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
         f"true pupil and slippage; {people}",
     )
     said = f"scatter of {config.fixation_deg:g} deg about the stimulus"
-    yield Entry("fixation", NONE, NONE, more(whole, alone), said)
+    yield BudgetEntry("fixation", NONE, NONE, quadrature_difference(whole, alone), said)

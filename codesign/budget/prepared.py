@@ -7,27 +7,27 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from characterize.inference import AsBuilt
-from codesign.adapt import Source as Run
+from codesign.adapt import FinishedRun as Run
 from codesign.budget import task
-from codesign.budget.entry import NONE, Entry
-from codesign.budget.reading import Reading
-from codesign.budget.task import Linear, TaskSetting
+from codesign.budget.entry import NONE, BudgetEntry
+from codesign.budget.reading import NetworkReading
+from codesign.budget.task import LinearEstimator, TaskSetting
 from codesign.evaluate import ExperimentConfig
 from codesign.optics import (
-    Aperture,
-    Device,
-    Numerics,
+    ImageWindow,
+    ImagingDevice,
     OpticsConfig,
+    OpticsNumerics,
     PillarCells,
-    Window,
-    device,
-    gathered,
+    TabulatedLens,
+    gather_lens_plane,
     image_difference,
-    kernels,
+    make_device,
+    pixel_kernels,
 )
 from codesign.train import assess
+from metalens.core.errors import LensError
 from metalens.fabrication import Printed
-from metalens.ground.errors import LensError
 from metalens.image import Grid, Imager, PsfBasis
 from metalens.lens import Lens
 from metalens.pillars import PillarLibrary
@@ -35,7 +35,7 @@ from metalens.psf import Source
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class BudgetInputs:
     """What is known beside the lens: each adds its entries.
 
     numerics: of the chain. fwhm_nm: of the light source. mask: of the PROCESS.toml.
@@ -45,7 +45,7 @@ class Given:
     process and fit.
     """
 
-    numerics: Numerics = field(default_factory=Numerics)
+    numerics: OpticsNumerics = field(default_factory=OpticsNumerics)
     fwhm_nm: float = 0.0
     mask: Printed | None = None
     library: PillarLibrary | None = None
@@ -59,7 +59,7 @@ class Given:
 
 
 @dataclass(eq=False, slots=True)
-class Bench:
+class PreparedDevice:
     """The lens as a device, who reads its images, and the finest one-PSF optics that
     numerics are compared with.
 
@@ -69,15 +69,15 @@ class Bench:
     """
 
     lens: Lens
-    given: Given
+    given: BudgetInputs
     setting: TaskSetting
-    aperture: Aperture
-    finest: Numerics
-    window: Window
-    eyes: task.Views
-    device: Device
-    reader: Linear
-    reading: Reading | None
+    aperture: TabulatedLens
+    finest: OpticsNumerics
+    window: ImageWindow
+    eyes: task.RenderedViews
+    device: ImagingDevice
+    reader: LinearEstimator
+    reading: NetworkReading | None
 
     @property
     def above(self) -> list[str]:
@@ -106,7 +106,7 @@ class Bench:
         if self.reading is not None:
             return self.reading.turned_on_finer_image()
         here = self.device
-        fine = device(
+        fine = make_device(
             here.wave,
             here.whole.grid,
             layers=here.layers,
@@ -126,14 +126,14 @@ class Bench:
         self, phase: torch.Tensor, level: torch.Tensor, *, lens: Lens | None = None
     ) -> PillarCells:
         """The lens plane of other pillars, over cells as the device's."""
-        return gathered(
+        return gather_lens_plane(
             lens or self.lens, phase, level, window_um=self.device.window_um
         )
 
-    def basis(self, numerics: Numerics) -> PsfBasis:
+    def basis(self, numerics: OpticsNumerics) -> PsfBasis:
         """One-PSF kernels of the designed lens."""
         maps = self.aperture.maps(self.aperture.designed())
-        return kernels(
+        return pixel_kernels(
             self.lens, maps, numerics, self.window, fwhm_nm=self.given.fwhm_nm
         )
 
@@ -142,13 +142,14 @@ class Bench:
         through two optics.
         """
         one, other = (
-            task.electrons(self.eyes.anchor, o, self.setting) for o in (optics, base)
+            task.expected_electrons(self.eyes.anchor, o, self.setting)
+            for o in (optics, base)
         )
         return self.reader.shift(one) - self.reader.shift(other)
 
     def entry(
         self, link: str, optics: Imager, method: str, *, phase_rad: float = NONE
-    ) -> Entry:
+    ) -> BudgetEntry:
         """The entry of a change of the device, before the network or the linear
         estimator.
         """
@@ -156,10 +157,14 @@ class Bench:
         if self.reading is not None:
             return self.reading.changed(link, optics, base, method, phase_rad=phase_rad)
         gaze = task.gaze_mean(self.shift(optics, base))
-        return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
+        return BudgetEntry(
+            link, phase_rad, image_difference(optics, base), gaze, method
+        )
 
 
-def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench:
+def prepare_device(
+    lens: Lens, given: BudgetInputs, setting: TaskSetting | None = None
+) -> PreparedDevice:
     """Render the eyes, prepare the device and its reader; the finest optics have twice
     the depths (64 at most).
 
@@ -170,17 +175,17 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     setting = replace(
         setting or TaskSetting(), sensor_distance_um=lens.reduced_um
     )  # as the true image maps directions
-    aperture, eyes = Aperture(lens), task.views(setting)
+    aperture, eyes = TabulatedLens(lens), task.render_views(setting)
     finest = finest_of(given.numerics, fwhm_nm=given.fwhm_nm)
-    window = Window(*eyes.depths_um, setting.pitch_um)
+    window = ImageWindow(*eyes.depths_um, setting.pitch_um)
     if given.run is not None:
         same_lens(lens, given.run.settings.optics)
     maps, reading, known = aperture.maps(aperture.designed()), None, None
     if given.run is not None:
-        reading = Reading(given.run, given.frames, fwhm_nm=given.fwhm_nm)
-        wave = gathered(lens, *maps, window_um=reading.true.window_um)
+        reading = NetworkReading(given.run, given.frames, fwhm_nm=given.fwhm_nm)
+        wave = gather_lens_plane(lens, *maps, window_um=reading.true.window_um)
         seen = reading.stands(wave, lens.layers, lens.sensor_distance_um)
-        known = kernels(lens, maps, finest, window, fwhm_nm=given.fwhm_nm)
+        known = pixel_kernels(lens, maps, finest, window, fwhm_nm=given.fwhm_nm)
     else:
         grid = Grid(
             (setting.pixels,) * 2,
@@ -189,28 +194,28 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
             setting.margin,
             2 * setting.margin + 1,
         )
-        wave = gathered(lens, *maps, window_um=grid.window * grid.step_um)
+        wave = gather_lens_plane(lens, *maps, window_um=grid.window * grid.step_um)
         line = (
             Source(lens.wavelength_um * 1e3, given.fwhm_nm) if given.fwhm_nm else None
         )
-        seen = device(
+        seen = make_device(
             wave,
             grid,
             layers=lens.layers,
             distance_um=lens.sensor_distance_um,
             spectrum=line,
         )
-    reader = task.linear(eyes, known or seen.whole, setting)
-    return Bench(
+    reader = task.linear_estimator(eyes, known or seen.whole, setting)
+    return PreparedDevice(
         lens, given, setting, aperture, finest, window, eyes, seen, reader, reading
     )
 
 
-def finest_of(numerics: Numerics, *, fwhm_nm: float) -> Numerics:
+def finest_of(numerics: OpticsNumerics, *, fwhm_nm: float) -> OpticsNumerics:
     """What settings are compared with: twice the depths (64 at most), six more
     wavelengths, a tenth of the tolerances
     or 1e-5 and 1e-4."""
-    return Numerics(
+    return OpticsNumerics(
         min(2 * numerics.depth_count, 64),
         numerics.wavelength_count + 6 if fwhm_nm else 1,
         min(numerics.psf_tolerance / 10, 1e-5),

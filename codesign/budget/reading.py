@@ -25,16 +25,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign.adapt import Source
+from codesign.adapt import FinishedRun
 from codesign.batches import EXPERIMENT
-from codesign.budget.entry import NONE, Entry, more
-from codesign.budget.person import told
+from codesign.budget.entry import NONE, BudgetEntry, quadrature_difference
+from codesign.budget.person import known_readings
 from codesign.evaluate import AXIAL, ExperimentConfig, gaze_experiment
-from codesign.eye import Rendered
-from codesign.gaze import Calibrator, Person, Readings, angle_deg
-from codesign.optics import Device, OpticsConfig, device, formed, image_difference
+from codesign.eye import RenderedFrames
+from codesign.gaze import CalibratedPerson, NetworkReadings, PersonCalibrator, angle_deg
+from codesign.optics import (
+    ImagingDevice,
+    OpticsConfig,
+    formed,
+    image_difference,
+    make_device,
+)
 from codesign.train import assess
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.image import Imager, UniformImager
 from metalens.lens import Layers
 
@@ -42,33 +48,33 @@ THINNED = 320  # frames that small changes of the optics are judged on
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stand:
+class CalibratedStand:
     """Persons calibrated on the device as it is, and the frames on which a change of
     the optics is judged.
     """
 
-    people: dict[int, Person]
-    frames: tuple[Rendered, ...]
-    trial: gaze_experiment.Trial
+    people: dict[int, CalibratedPerson]
+    frames: tuple[RenderedFrames, ...]
+    trial: gaze_experiment.ExperimentTrials
 
 
-class Reading:
+class NetworkReading:
     """A run's network with its frames; ``measured_deg`` is there once :meth:`path` is
     through.
     """
 
     def __init__(
-        self, source: Source, config: ExperimentConfig, *, fwhm_nm: float
+        self, source: FinishedRun, config: ExperimentConfig, *, fwhm_nm: float
     ) -> None:
         self.source, self.config = source, config
         self.scenes = source.run.scenes(EXPERIMENT)
-        self.sensor = gaze_experiment.lighting([source], config)[0]
+        self.sensor = gaze_experiment.experiment_sensors([source], config)[0]
         believed = source.run.trainer.optics
         width = fwhm_nm or believed.fwhm_nm
         self.optics: OpticsConfig = replace(believed, image="true", fwhm_nm=width)
-        self.believed = gaze_experiment.ready(source, image="trained")
-        self._before: tuple[Imager | UniformImager, Calibrator] | None = None
-        self.subjects: list[Rendered] = []
+        self.believed = gaze_experiment.prepare_run(source, image="trained")
+        self._before: tuple[Imager | UniformImager, PersonCalibrator] | None = None
+        self.subjects: list[RenderedFrames] = []
         trials = []
         for subject in range(config.subjects):
             states, trial = gaze_experiment.states_of(config, subject, self.scenes)
@@ -76,10 +82,10 @@ class Reading:
                 gaze_experiment.render_subject(states, config, subject, self.scenes)
             )
             trials.append(trial)
-        self.trial = gaze_experiment.joined(trials)
+        self.trial = gaze_experiment.join_subjects(trials)
         self.true = self._device(self.optics)
         self.measured_deg = {AXIAL: NONE, gaze_experiment.LATERAL: NONE}
-        self._stand: Stand | None = None
+        self._stand: CalibratedStand | None = None
         self._error_rad = 0.0
 
     @property
@@ -89,21 +95,21 @@ class Reading:
             self.source.settings.scenes.pixels + 2 * self.source.settings.scenes.margin
         )
 
-    def _device(self, settings: OpticsConfig) -> Device:
+    def _device(self, settings: OpticsConfig) -> ImagingDevice:
         margin = self.source.settings.scenes.margin
         coefficients = self.source.run.trainer.model.coefficients_rad.detach()
-        whole = formed.imager(settings, coefficients, self.frame, margin=margin)
+        whole = formed.make_imager(settings, coefficients, self.frame, margin=margin)
         if not isinstance(whole, Imager):
             raise TypeError("a device is imaged truly")
         plane = formed.optics_of(settings, coefficients)
-        return Device(
+        return ImagingDevice(
             plane.wave, plane.layers, plane.distance_um, whole, settings.image_tolerance
         )
 
-    def stands(self, wave: object, layers: Layers, distance_um: float) -> Device:
+    def stands(self, wave: object, layers: Layers, distance_um: float) -> ImagingDevice:
         """The device of another lens plane behind films, on the frames of this run."""
         settings, margin = self.optics, self.source.settings.scenes.margin
-        return device(
+        return make_device(
             wave,  # type: ignore[arg-type]
             formed.grid_of(settings, self.frame, margin),
             layers=layers,
@@ -113,20 +119,20 @@ class Reading:
             tolerance=settings.image_tolerance,
         )
 
-    def path(self) -> Iterator[Entry]:
+    def path(self) -> Iterator[BudgetEntry]:
         """Entries from the true pupil to the answered gaze, and what was measured at
         its end.
         """
         still = replace(self.config, fixation_deg=0.0)
         people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
         said = f"true pupil and slippage; {people}"
-        sphere = gaze_experiment.sphere(self.source, self.config)
+        sphere = gaze_experiment.sphere_calibrator(self.source, self.config)
         yield self._grown(
             "subject and calibration",
-            self._error(told(still, self.scenes), sphere),
+            self._error(known_readings(still, self.scenes), sphere),
             said,
         )
-        true = told(self.config, self.scenes)
+        true = known_readings(self.config, self.scenes)
         said = f"scatter of {self.config.fixation_deg:g} deg about the stimulus"
         yield self._grown("fixation", self._error(true, sphere), said)
         yield from self._reader(true, sphere)
@@ -140,7 +146,9 @@ class Reading:
         self._settle(read, how)
         yield from self._known()
 
-    def _reader(self, true: Readings, sphere: Calibrator) -> Iterator[Entry]:
+    def _reader(
+        self, true: NetworkReadings, sphere: PersonCalibrator
+    ) -> Iterator[BudgetEntry]:
         """The pupil as read with the true slippage, then all that is read.
 
         Who reads an axis needs the pupil less than the sphere does: alone it costs at
@@ -149,16 +157,18 @@ class Reading:
         said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
         read, how = self._read(self.believed, quiet=True)
         together = self._error(read, how)
-        alone = self._error(Readings(read.pupil_mm, true.slip_mm), sphere)
+        alone = self._error(NetworkReadings(read.pupil_mm, true.slip_mm), sphere)
         yield self._grown("reader, pupil", min(alone, together), said)
         yield self._grown("reader, slippage", together, said)
 
-    def _grown(self, link: str, error_rad: float, method: str) -> Entry:
+    def _grown(self, link: str, error_rad: float, method: str) -> BudgetEntry:
         """The entry of one more cause: what the error has more than before, in
         quadrature; 0 where it has less.
         """
         before, self._error_rad = self._error_rad, error_rad
-        return Entry(link, NONE, NONE, more(error_rad, before), method)
+        return BudgetEntry(
+            link, NONE, NONE, quadrature_difference(error_rad, before), method
+        )
 
     def _unknown(self) -> Iterator[tuple[str, Imager, float, str]]:
         """What the reader's training left out of its image, one more in each."""
@@ -196,7 +206,7 @@ class Reading:
         narrow = self.true.one_wavelength(self.optics.wavelength_nm * 1e-3)
         return image_difference(narrow, self.true.whole)
 
-    def _known(self) -> Iterator[Entry]:
+    def _known(self) -> Iterator[BudgetEntry]:
         """What the reader was trained with, switched off."""
         believed, here = self.source.run.trainer.optics, self.true
         said = "known to the reader, switched off: what it answers then; not in the sum"
@@ -209,7 +219,9 @@ class Reading:
                 counted=False,
             )
         if not self.optics.fwhm_nm:
-            yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
+            yield BudgetEntry(
+                "spectrum", NONE, 0.0, 0.0, "the light has one wavelength"
+            )
         elif believed.image == "true" and believed.fwhm_nm == self.optics.fwhm_nm:
             narrow = here.one_wavelength(self.optics.wavelength_nm * 1e-3)
             yield replace(
@@ -224,12 +236,14 @@ class Reading:
         method: str,
         *,
         phase_rad: float = NONE,
-    ) -> Entry:
+    ) -> BudgetEntry:
         """The entry of a change of the optics after the persons were calibrated: the
         turn of their answers.
         """
         gaze = self.turned(optics, base)
-        return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
+        return BudgetEntry(
+            link, phase_rad, image_difference(optics, base), gaze, method
+        )
 
     def turned(self, optics: Imager, base: Imager) -> float:
         """Mean angle, rad, between the answers to frames through two optics; the
@@ -242,7 +256,7 @@ class Reading:
         if stand is None:
             raise RuntimeError("changes are judged once the path is through")
         one, other = (
-            gaze_experiment.answered(
+            gaze_experiment.predicted_gaze(
                 stand.people, self._frames(stand.frames, o, quiet=True), stand.trial
             )
             for o in (optics, base)
@@ -257,13 +271,14 @@ class Reading:
         fine = self._device(replace(self.optics, image_tolerance=tolerance))
         return self.turned(fine.whole, self.true.whole)
 
-    def _settle(self, read: Readings, how: Calibrator) -> None:
+    def _settle(self, read: NetworkReadings, how: PersonCalibrator) -> None:
         """Keep the persons of the last state, what it measured, and a thin sample of
         the judged frames.
         """
         people = self._taught(read, how)
         error = angle_deg(
-            gaze_experiment.answered(people, read, self.trial), self.trial.stimulus_deg
+            gaze_experiment.predicted_gaze(people, read, self.trial),
+            self.trial.stimulus_deg,
         )
         judged = self._judged()
         for kind in self.measured_deg:
@@ -278,8 +293,13 @@ class Reading:
                 zip(self.subjects, self._starts(), strict=True)
             )
         )
-        fields = (getattr(self.trial, f)[rows] for f in gaze_experiment.Trial.__slots__)
-        self._stand = Stand(people, frames, gaze_experiment.Trial(*fields))
+        fields = (
+            getattr(self.trial, f)[rows]
+            for f in gaze_experiment.ExperimentTrials.__slots__
+        )
+        self._stand = CalibratedStand(
+            people, frames, gaze_experiment.ExperimentTrials(*fields)
+        )
 
     def _starts(self) -> Array:
         return np.cumsum(
@@ -295,29 +315,33 @@ class Reading:
     def _judged(self) -> Array:
         return ~np.isin(
             np.arange(len(self.trial.subject)),
-            gaze_experiment.calibrating(self.trial, self.config),
+            gaze_experiment.calibration_frames(self.trial, self.config),
         )
 
-    def _error(self, read: Readings, how: Calibrator) -> float:
+    def _error(self, read: NetworkReadings, how: PersonCalibrator) -> float:
         """Mean error of the answers under axial slippage, rad, every person calibrated
         on what was read.
         """
-        answers = gaze_experiment.answered(self._taught(read, how), read, self.trial)
+        answers = gaze_experiment.predicted_gaze(
+            self._taught(read, how), read, self.trial
+        )
         return self._off(angle_deg(answers, self.trial.stimulus_deg))
 
-    def _taught(self, read: Readings, how: Calibrator) -> dict[int, Person]:
-        return gaze_experiment.taught(read, self.trial, self.config, how)
+    def _taught(
+        self, read: NetworkReadings, how: PersonCalibrator
+    ) -> dict[int, CalibratedPerson]:
+        return gaze_experiment.calibrate_subjects(read, self.trial, self.config, how)
 
     def _read(
         self, optics: Imager | UniformImager, *, quiet: bool = False
-    ) -> tuple[Readings, Calibrator]:
+    ) -> tuple[NetworkReadings, PersonCalibrator]:
         """What is read of all frames, and how people are calibrated whose frames come
         through these optics (noisy).
         """
         if self._before is None or self._before[0] is not optics:
             self._before = (
                 optics,
-                gaze_experiment.calibrator(
+                gaze_experiment.run_calibrator(
                     self.source, optics, self.config, self.sensor
                 ),
             )
@@ -326,18 +350,18 @@ class Reading:
     @torch.no_grad()
     def _frames(
         self,
-        subjects: list[Rendered] | tuple[Rendered, ...],
+        subjects: list[RenderedFrames] | tuple[RenderedFrames, ...],
         optics: Imager | UniformImager,
         *,
         quiet: bool = False,
-    ) -> Readings:
+    ) -> NetworkReadings:
         """What the network reads of frames through these optics; noise of the
         experiment's seeds.
         """
         found = []
         net, inner = self.source.run.trainer.model.net, self.source.settings.inner
         for subject, made in enumerate(subjects):
-            seen = gaze_experiment.through(
+            seen = gaze_experiment.image_frames(
                 self.source,
                 made,
                 optics,
@@ -345,11 +369,13 @@ class Reading:
                 sensor=self.sensor,
                 quiet=quiet,
             )
-            found.append(assess.predict(net, self.source.architecture, seen, inner))
+            found.append(
+                assess.predict_frames(net, self.source.architecture, seen, inner)
+            )
         return gaze_experiment.read_from(found, self.source)
 
 
-def _part(made: Rendered, rows: torch.Tensor) -> Rendered:
+def _part(made: RenderedFrames, rows: torch.Tensor) -> RenderedFrames:
     """Some of the frames with their labels."""
     frames = type(made.frames)(
         *(getattr(made.frames, f)[rows] for f in type(made.frames).__slots__)

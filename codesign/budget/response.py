@@ -4,10 +4,10 @@ right, compared.
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
-def between(t: Array, diameter_um: Array, at_um: Array) -> Array:
+def interpolate_response(t: Array, diameter_um: Array, at_um: Array) -> Array:
     """(*at) complex t between the diameters of a library: level and unwound phase are
     straight in between.
 

@@ -20,7 +20,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from codesign.eye import POPULATION, Camera, Motion, Rig, States, render
+from codesign.eye import (
+    POPULATION,
+    CameraRig,
+    EyeStates,
+    MotionRanges,
+    PinholeCamera,
+    render,
+)
 from codesign.eye import population as eye
 from metalens.image import Frames, Imager, PsfBasis, Sensor, scene, sensor
 
@@ -75,9 +82,9 @@ class TaskSetting:
     sensor_distance_um: float = field(default=2000.0, metadata={"above": 0})
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> CameraRig:
         """Camera and lamps."""
-        return Rig(sensor_distance_um=self.sensor_distance_um)
+        return CameraRig(sensor_distance_um=self.sensor_distance_um)
 
     @property
     def size(self) -> int:
@@ -85,13 +92,15 @@ class TaskSetting:
         return self.pixels + 2 * self.margin
 
     @property
-    def states(self) -> States:
+    def states(self) -> EyeStates:
         """The eyes: subjects, gazes and slips drawn from the seed."""
-        return eye.draw(self.scenes, (self.seed, SCENES), motion=Motion(scale=0.2))
+        return eye.draw_states(
+            self.scenes, (self.seed, SCENES), motion=MotionRanges(scale=0.2)
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Views:
+class RenderedViews:
     """Renderings of every eye: as it is, and moved to both sides along every unknown
     but the brightness.
     """
@@ -106,9 +115,12 @@ class Views:
         return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
-def views(
-    setting: TaskSetting, states: States | None = None, *, exposed: States | None = None
-) -> Views:
+def render_views(
+    setting: TaskSetting,
+    states: EyeStates | None = None,
+    *,
+    exposed: EyeStates | None = None,
+) -> RenderedViews:
     """Render everything that the linear estimator needs; two frames an unknown and eye.
 
     Args:
@@ -119,15 +131,17 @@ def views(
     lit = still if exposed is None else exposed
 
     def frames(unknown: int, step: float) -> Frames:
-        return _frames(shifted(still, unknown, step), lit, setting)
+        return _frames(shift_states(still, unknown, step), lit, setting)
 
-    pairs = [(frames(k, step), frames(k, -step)) for k, step in enumerate(steps())]
-    return Views(_frames(still, lit, setting), tuple(pairs))
+    pairs = [
+        (frames(k, step), frames(k, -step)) for k, step in enumerate(view_derivatives())
+    ]
+    return RenderedViews(_frames(still, lit, setting), tuple(pairs))
 
 
-def _frames(states: States, exposed: States, setting: TaskSetting) -> Frames:
+def _frames(states: EyeStates, exposed: EyeStates, setting: TaskSetting) -> Frames:
     """Renderings averaged over each pixel."""
-    camera = Camera(FINE * setting.size, setting.pitch_um / FINE)
+    camera = PinholeCamera(FINE * setting.size, setting.pitch_um / FINE)
     return pixels_of(
         render(states, rig=setting.rig, camera=camera, exposed=exposed).frames
     )
@@ -153,22 +167,22 @@ def pixels_of(fine: Frames) -> Frames:
     )
 
 
-def steps() -> tuple[float, ...]:
+def view_derivatives() -> tuple[float, ...]:
     """Half the central difference of every unknown but the brightness."""
     return (*STEPS, *(TRAIT_STEP * POPULATION[name].sd for name in TRAITS))
 
 
-def priors() -> tuple[float, ...]:
+def unknown_priors() -> tuple[float, ...]:
     """Standard deviations of all unknowns before the image is seen."""
     return (*PRIOR, *(POPULATION[name].sd for name in TRAITS), BRIGHTNESS)
 
 
-def precision() -> Tensor:
+def prior_information() -> Tensor:
     """(unknowns, unknowns) information before the image is seen."""
-    return torch.diag(1 / torch.tensor(priors(), dtype=torch.float64) ** 2)
+    return torch.diag(1 / torch.tensor(unknown_priors(), dtype=torch.float64) ** 2)
 
 
-def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
+def shift_states(states: EyeStates, unknown: int, amount: float | Tensor) -> EyeStates:
     """States moved along one of :data:`NAMES` but the last."""
     if unknown < 2:
         gaze = states.gaze_rad.clone()
@@ -185,7 +199,7 @@ def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
     return replace(states, traits=traits)
 
 
-def electrons(
+def expected_electrons(
     frames: Frames, optics: PsfBasis | Imager, setting: TaskSetting
 ) -> Tensor:
     """(scenes, pixels) expected electrons through these optics, float64: one PSF a
@@ -205,7 +219,7 @@ def electrons(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Linear:
+class LinearEstimator:
     """The estimator about each eye.
 
     image: (scenes, pixels) electrons that it expects. pull: (scenes, unknowns, pixels)
@@ -233,18 +247,25 @@ class Linear:
         )
 
 
-def linear(seen: Views, optics: PsfBasis | Imager, setting: TaskSetting) -> Linear:
+def linear_estimator(
+    seen: RenderedViews, optics: PsfBasis | Imager, setting: TaskSetting
+) -> LinearEstimator:
     """The estimator that knows these optics."""
-    image = electrons(seen.anchor, optics, setting)
+    image = expected_electrons(seen.anchor, optics, setting)
     slopes = [
-        (electrons(more, optics, setting) - electrons(less, optics, setting))
+        (
+            expected_electrons(more, optics, setting)
+            - expected_electrons(less, optics, setting)
+        )
         / (2 * step)
-        for (more, less), step in zip(seen.moved, steps(), strict=True)
+        for (more, less), step in zip(seen.moved, view_derivatives(), strict=True)
     ]
-    return estimator(image, torch.stack(slopes, 1), setting)
+    return estimator_of_slopes(image, torch.stack(slopes, 1), setting)
 
 
-def estimator(image: Tensor, slopes: Tensor, setting: TaskSetting) -> Linear:
+def estimator_of_slopes(
+    image: Tensor, slopes: Tensor, setting: TaskSetting
+) -> LinearEstimator:
     """The estimator of eyes whose images (scenes, pixels) move by slopes (scenes,
     unknowns but brightness, pixels).
     """
@@ -252,7 +273,7 @@ def estimator(image: Tensor, slopes: Tensor, setting: TaskSetting) -> Linear:
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     noise = sensor.variance(image, sensor=chip) + (setting.mismatch * image) ** 2
     weighted = derivative / noise[:, None]
-    prior = precision()
+    prior = prior_information()
     normal = weighted @ derivative.mT + prior
     unit = normal.diagonal(
         dim1=1, dim2=2
@@ -262,7 +283,7 @@ def estimator(image: Tensor, slopes: Tensor, setting: TaskSetting) -> Linear:
         * unit[:, :, None]
         * unit[:, None, :]
     )
-    return Linear(image, inverse @ weighted, inverse)
+    return LinearEstimator(image, inverse @ weighted, inverse)
 
 
 def gaze_rms(shift: Tensor) -> float:

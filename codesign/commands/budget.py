@@ -11,16 +11,16 @@ import numpy as np
 
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
-from codesign.budget import MEASURED, Entry, Given, bench
+from codesign.budget import MEASURED, BudgetEntry, BudgetInputs, prepare_device
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
 from codesign.commands.options.budget import Options
-from codesign.optics import Numerics
+from codesign.optics import OpticsNumerics
 from metalens import lens, library
+from metalens.core import config, reading, store
+from metalens.core.errors import ConfigError
+from metalens.core.reading import typed_reader
 from metalens.fabrication import of_process
-from metalens.ground import config, reading, store
-from metalens.ground.errors import ConfigError
-from metalens.ground.reading import reader
 from metalens.psf import Source, spectrum
 
 
@@ -33,20 +33,20 @@ def run(options: Options) -> int:
         raise ConfigError(f"{target}: need a name that ends in .h5")
     made, given = lens.load_plain(options.lens), _given(options)
     if given.fwhm_nm:
-        spectrum.points(
+        spectrum.spectrum_points(
             Source(made.wavelength_um * 1e3, given.fwhm_nm)
         )  # refused now, not after the work
     with options.claim(target, beside=(".html", ".png")) as draft:
         origin = _provenance(options, given)
-        about = bench(made, given)
-        links = budget.entries(about)
+        about = prepare_device(made, given)
+        links = budget.budget_entries(about)
         rows = list(options.console.track(links, total=19, label="links"))
-        save(draft.path, rows, origin)
-        budget_page.write(draft.path.with_suffix(".html"), rows)
-        store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
-    values = {"rows": [dataclasses.asdict(row) for row in rows], **summary(rows)}
+        save_budget(draft.path, rows, origin)
+        budget_page.write_budget_page(draft.path.with_suffix(".html"), rows)
+        store.write_bytes(draft.path.with_suffix(".png"), budget_page.plot_budget(rows))
+    values = {"rows": [dataclasses.asdict(row) for row in rows], **budget_summary(rows)}
     light = of_light(made)
-    words = "\n".join(filter(None, [text(rows), light]))
+    words = "\n".join(filter(None, [budget_text(rows), light]))
     return options.console.judged(_plain(values | {"light": light}), words, about.above)
 
 
@@ -59,7 +59,7 @@ def of_light(made: lens.Lens) -> str:
     return f"of {made.one_light}: these pillars ({made.cell.described}) answer x and y apart"
 
 
-def summary(rows: list[Entry]) -> dict[str, float]:
+def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:
     """The sum, what was measured on the same frames and the ratio of the two, where a
     run was given.
     """
@@ -73,7 +73,9 @@ def summary(rows: list[Entry]) -> dict[str, float]:
     return found
 
 
-def save(path: Path, rows: list[Entry], provenance: store.Provenance) -> None:
+def save_budget(
+    path: Path, rows: list[BudgetEntry], provenance: store.Provenance
+) -> None:
     """Write a budget file (kind ``budget``)."""
     numbers = {
         name: np.array([getattr(r, name) for r in rows])
@@ -86,8 +88,8 @@ def save(path: Path, rows: list[Entry], provenance: store.Provenance) -> None:
     store.save(path, "budget", numbers | words | counted, provenance=provenance)
 
 
-@reader
-def load(path: Path) -> list[Entry]:
+@typed_reader
+def load_budget(path: Path) -> list[BudgetEntry]:
     """Read a budget file.
 
     Raises:
@@ -105,10 +107,10 @@ def load(path: Path) -> list[Entry]:
         words["method"],
         counted,
     )
-    return [Entry(*row) for row in zip(*columns, strict=True)]
+    return [BudgetEntry(*row) for row in zip(*columns, strict=True)]
 
 
-def text(rows: list[Entry]) -> str:
+def budget_text(rows: list[BudgetEntry]) -> str:
     """The table for a terminal."""
     lines = [f"{'link':<30} {'phase/rad':>10} {'PSF':>9} {'gaze/deg':>10}  how"]
     for r in rows:
@@ -122,28 +124,28 @@ def text(rows: list[Entry]) -> str:
     return "\n".join(lines)
 
 
-def _given(options: Options) -> Given:
+def _given(options: Options) -> BudgetInputs:
     if options.led_fwhm_nm < 0:
         raise ConfigError(f"--led-fwhm-nm {options.led_fwhm_nm:g}: need 0 or more")
     wide = options.led_fwhm_nm > 0
-    numerics = Numerics(
+    numerics = OpticsNumerics(
         options.depths,
         options.wavelengths if wide else 1,
         options.tolerance,
         options.kernels,
     )
-    return Given(
+    return BudgetInputs(
         numerics=numerics,
         fwhm_nm=options.led_fwhm_nm,
         mask=of_process(options.process) if options.process else None,
         library=library.load(options.library) if options.library else None,
         asbuilt=asbuilt.load(options.asbuilt) if options.asbuilt else None,
-        run=retraining.load(options.run) if options.run else None,
+        run=retraining.load_finished_run(options.run) if options.run else None,
         frames=options.frames,
     )
 
 
-def _provenance(options: Options, given: Given) -> store.Provenance:
+def _provenance(options: Options, given: BudgetInputs) -> store.Provenance:
     weights = options.run / "checkpoint.safetensors" if options.run else None
     files = [options.lens, options.library, options.process, options.asbuilt, weights]
     return store.Provenance(

@@ -23,26 +23,26 @@ from codesign.network import Subnet
 from codesign.optics import OpticsConfig, formed
 from codesign.optics import stack as trained
 from codesign.train import (
-    End,
+    BudgetResult,
+    CodesignRun,
+    LogRecord,
     Part,
-    Record,
-    Run,
     RunConfig,
     assess,
-    best,
+    best_candidate,
     checkpoint,
     device_of,
-    finished,
-    pareto,
+    finished_budgets,
+    pareto_front,
     pictures,
-    place,
+    place_on_device,
     search,
 )
 from codesign.train import run as runs
 from metalens import design, lens, library
-from metalens.ground import config, report, store, transaction
-from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError, LensError
+from metalens.core import config, report, store, transaction
+from metalens.core.console import Console
+from metalens.core.errors import ConfigError, LensError
 
 CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
@@ -53,11 +53,11 @@ def run(options: Options) -> int:
     """Train, search, finish; exit 1 where the error of the true image is above what the
     run asks for.
     """
-    settings = _frozen(runs.load(options.config), options.freeze)
+    settings = _frozen(runs.load_run_settings(options.config), options.freeze)
     device = device_of(options.device)
-    parallel.join(device)
-    if parallel.rank():
-        return _assist(transaction.unfinished(options.output), settings, device)
+    parallel.join_processes(device)
+    if parallel.process_rank():
+        return _assist(transaction.unfinished_path(options.output), settings, device)
     with options.claim_work(
         options.output, keep=(CHECKPOINT,), resume=options.resume
     ) as draft:
@@ -71,7 +71,9 @@ def run(options: Options) -> int:
     }
     words = f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
     return options.console.judged(
-        values, f"{_table(rows)}\n{formed.words(said)}\n{words}", [said["above"]]
+        values,
+        f"{_table(rows)}\n{formed.describe_image_text(said)}\n{words}",
+        [said["above"]],
     )
 
 
@@ -85,11 +87,11 @@ def _work(
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
     if settings.run.pitch_um < settings.optics.sample_um:
         console.say(_of_samples(settings))
-    place(going.trainer, device)
-    parallel.wait()
+    place_on_device(going.trainer, device)
+    parallel.wait_for_all()
     writer = _writer(folder, going.trainer.step) if options.events else None
     held = False
-    for record in _progress(console, runs.train(going, folder / CHECKPOINT), going):
+    for record in _progress(console, runs.train_run(going, folder / CHECKPOINT), going):
         _log(folder, {"kind": "step", **asdict(record)})
         if writer:
             _events(writer, going, record)
@@ -109,8 +111,8 @@ def _work(
         console.say(
             f"budget {budget:g} MMACs: gaze error {born.error:.2f} deg at {born.macs / 1e6:.2f} MMACs"
         )
-    parallel.leave()
-    ends = finished(going)
+    parallel.leave_processes()
+    ends = finished_budgets(going)
     said = _image(going)
     _keep(folder, going, ends, said)
     if options.export:
@@ -125,7 +127,7 @@ def _of_samples(settings: RunConfig) -> str:
     )
 
 
-def _of_pitch(going: Run, limit_um: float) -> str:
+def _of_pitch(going: CodesignRun, limit_um: float) -> str:
     settings = going.settings
     if limit_um <= going.trainer.model.finest_um:
         return (
@@ -141,36 +143,38 @@ def _of_pitch(going: Run, limit_um: float) -> str:
     return f"the pitch is held at {limit_um:.3f} um: coarser pixels would leave a network less than it can take"
 
 
-def _image(going: Run) -> dict[str, Any]:
+def _image(going: CodesignRun) -> dict[str, Any]:
     settings = going.settings
     side = settings.scenes.pixels + 2 * settings.scenes.margin
     coefficients = going.trainer.model.coefficients_rad.detach()
-    return formed.described(
+    return formed.describe_image(
         settings.optics, coefficients, side, margin=settings.scenes.margin
     )
 
 
-def _export(folder: Path, going: Run, ends: list[End]) -> None:
+def _export(folder: Path, going: CodesignRun, ends: list[BudgetResult]) -> None:
     """Every budget's network as ONNX."""
     for end, state in zip(ends, going.searches, strict=True):
         path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
         own = replace(going, trainer=end.trainer)
         net = end.trainer.model.net
-        onnx_file.write(path, own, net, best(state.history).architecture)
+        onnx_file.write_network_file(
+            path, own, net, best_candidate(state.history).architecture
+        )
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     """Another process of ``torchrun``: trains and searches along from the same
     checkpoint, writes nothing.
     """
-    parallel.wait()
-    going = runs.resume(folder / CHECKPOINT, settings)
-    place(going.trainer, device)
-    for _ in runs.train(going, folder / CHECKPOINT):
+    parallel.wait_for_all()
+    going = runs.resume_run(folder / CHECKPOINT, settings)
+    place_on_device(going.trainer, device)
+    for _ in runs.train_run(going, folder / CHECKPOINT):
         pass
     for _ in search.search(going, folder / CHECKPOINT):
         pass
-    parallel.leave()
+    parallel.leave_processes()
     return 0
 
 
@@ -195,7 +199,7 @@ def _writer(folder: Path, step: int) -> Any:
     return make(str(folder), purge_step=step + 1 if step else None)
 
 
-def _events(writer: Any, going: Run, record: Record) -> None:
+def _events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
     for name, value in asdict(record).items():
         if name != "step":
             writer.add_scalar(name, float(value), record.step)
@@ -206,16 +210,16 @@ def _events(writer: Any, going: Run, record: Record) -> None:
     writer.flush()
 
 
-def _start(folder: Path, settings: RunConfig) -> Run:
+def _start(folder: Path, settings: RunConfig) -> CodesignRun:
     store.write_text(folder / SETTINGS, config.dumps(settings))
-    made = runs.start(settings)
-    runs.save(folder / CHECKPOINT, made)
+    made = runs.start_run(settings)
+    runs.save_run(folder / CHECKPOINT, made)
     return made
 
 
-def _resume(folder: Path, settings: RunConfig) -> Run:
+def _resume(folder: Path, settings: RunConfig) -> CodesignRun:
     """The run of the folder's checkpoint; log lines beyond it are dropped."""
-    made = runs.resume(folder / CHECKPOINT, settings)
+    made = runs.resume_run(folder / CHECKPOINT, settings)
     births = sum(len(s.history) for s in made.searches)
     kept: list[str] = []
     for line in (
@@ -244,8 +248,8 @@ def _entry(line: str) -> dict[str, Any]:
 
 
 def _progress(
-    console: Console, records: Iterator[Record], going: Run
-) -> Iterator[Record]:
+    console: Console, records: Iterator[LogRecord], going: CodesignRun
+) -> Iterator[LogRecord]:
     left = going.settings.inner.steps - going.trainer.step
     return console.track(records, total=left, label="training")
 
@@ -255,11 +259,13 @@ def _log(folder: Path, entry: dict[str, Any]) -> None:
         file.write(json.dumps(entry) + "\n")
 
 
-def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> None:
+def _keep(
+    folder: Path, going: CodesignRun, ends: list[BudgetResult], said: dict[str, Any]
+) -> None:
     """lens.h5, the networks, result.json, answers.h5 and the plot of the Pareto set."""
     settings = going.settings
     about = store.Provenance(config=config.dumps(settings), seed=settings.inner.seed)
-    phase = runs.coefficients(going)
+    phase = runs.lens_coefficients(going)
     lens.save(folder / "lens.h5", trained_lens(settings.optics, phase, about))
     _weights(folder, going, ends, about)
     pitch = float(going.trainer.model.pitch_um.detach())
@@ -270,7 +276,7 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
         "steps": settings.inner.steps,
         "rows": rows,
     }
-    found |= {"bound": pictures.bound(going)}
+    found |= {"bound": pictures.window_depth_bound(going)}
     found |= {
         "frozen": list(settings.run.frozen),
         "image": said,
@@ -283,19 +289,22 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
         for i, row in enumerate(rows)
     }
     store.save(
-        folder / ANSWERS, "answers", pictures.answered(ends, SHOWN), attributes=said_by
+        folder / ANSWERS,
+        "answers",
+        pictures.predictions_of_frames(ends, SHOWN),
+        attributes=said_by,
     )
     if going.searches:
         store.write_bytes(folder / "pareto.png", _plot(going))
 
 
 def _weights(
-    folder: Path, going: Run, ends: list[End], about: store.Provenance
+    folder: Path, going: CodesignRun, ends: list[BudgetResult], about: store.Provenance
 ) -> None:
     """Every network, cut to its own architecture, with the lens of its own."""
     for end, state in zip(ends, going.searches, strict=True):
         model, budget = end.trainer.model, end.row["budget_mmacs"]
-        kept = Subnet(model.net, best(state.history).architecture)
+        kept = Subnet(model.net, best_candidate(state.history).architecture)
         optics = {
             "optics.coefficients_rad": model.coefficients_rad,
             "optics.log_pitch": model.log_pitch,
@@ -347,8 +356,8 @@ def trained_lens(
     return over(0.0)
 
 
-def _plot(going: Run) -> bytes:
-    figure, axes = report.canvas(size=(6.0, 4.0))
+def _plot(going: CodesignRun) -> bytes:
+    figure, axes = report.make_figure(size=(6.0, 4.0))
     for budget, state in zip(
         going.settings.run.budgets_mmacs, going.searches, strict=True
     ):
@@ -359,7 +368,7 @@ def _plot(going: Run) -> bytes:
             "o",
             label=f"budget {budget:g} MMACs",
         )
-    front = pareto([c for s in going.searches for c in s.history])
+    front = pareto_front([c for s in going.searches for c in s.history])
     axes.step(
         [c.macs / 1e6 for c in front],
         [c.error for c in front],
@@ -373,7 +382,7 @@ def _plot(going: Run) -> bytes:
         title="Accuracy against compute",
     )
     axes.legend()
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _table(rows: list[dict[str, Any]]) -> str:

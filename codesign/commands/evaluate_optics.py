@@ -13,11 +13,11 @@ import torch
 from codesign.commands.options.optics import Options
 from codesign.evaluate import (
     FieldSetting,
+    MeasurementSettings,
     ReaderConfig,
-    Scenes,
-    Setting,
+    SensitivityScenes,
     field_page,
-    judged,
+    judge_lenses,
     reader,
 )
 from codesign.evaluate import optics as evaluate_optics
@@ -26,19 +26,19 @@ from codesign.evaluate import tables as evaluate_tables
 from codesign.eye import states_at
 from metalens import design
 from metalens import lens as lenses
+from metalens.core import config, reading, store
+from metalens.core.errors import ConfigError, PropagationError
+from metalens.core.report import Figure, Section, Table, write_report
 from metalens.design import Focus
-from metalens.design.free_form import Fisher, design_pupil
+from metalens.design.free_form import FisherSettings, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
-from metalens.ground import config, reading, store
-from metalens.ground.errors import ConfigError, PropagationError
-from metalens.ground.report import Figure, Section, Table, write
 from metalens.lens import Lens
 
 SPREAD = "brings no light together in one bright spot of the sensor: its beams are shown by psf --far-field"
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class OpticsSettings:
     """The content of OPTICS.toml; every key may be left out.
 
     axial: how the axial information is measured. over_field: what the designer's page
@@ -46,9 +46,9 @@ class Settings:
     table is made of. reader: what the reference reader sees, with ``--reader``.
     """
 
-    axial: Setting = field(default_factory=Setting)
+    axial: MeasurementSettings = field(default_factory=MeasurementSettings)
     over_field: FieldSetting = field(default_factory=FieldSetting)
-    scenes: Scenes = field(default_factory=Scenes)
+    scenes: SensitivityScenes = field(default_factory=SensitivityScenes)
     reader: ReaderConfig = field(default_factory=ReaderConfig)
 
 
@@ -59,16 +59,18 @@ def run(options: Options) -> int:
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
     settings = (
-        Settings()
+        OpticsSettings()
         if options.config is None
-        else config.load(options.config, Settings, empty=False)
+        else config.load(options.config, OpticsSettings, empty=False)
     )
     if options.scenes is not None:
         settings = dataclasses.replace(
             settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes)
         )
     made = [lenses.load_plain(path) for path in options.lenses]
-    names = distinct([reading.shown(path.stem) for path in options.lenses])
+    names = distinct_lens_names(
+        [reading.to_valid_utf8(path.stem) for path in options.lenses]
+    )
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)
@@ -78,7 +80,7 @@ def run(options: Options) -> int:
 
 def _measure(
     options: Options,
-    settings: Settings,
+    settings: OpticsSettings,
     made: list[Lens],
     names: list[str],
     folder: Path,
@@ -93,7 +95,10 @@ def _measure(
     pairs = options.console.track(
         zip(names, made, strict=True), total=len(made), label="PSFs"
     )
-    axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
+    axial = {
+        name: evaluate_optics.measure_axial_information(lens, measured)
+        for name, lens in pairs
+    }
     pairs = options.console.track(
         zip(names, made, strict=True), total=len(made), label="field"
     )
@@ -116,15 +121,15 @@ def _measure(
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *told])) from error
     tables = [
-        *evaluate_tables.tables(axial, scenes, measured, spread=told),
-        *field_page.tables(seen),
+        *evaluate_tables.format_tables(axial, scenes, measured, spread=told),
+        *field_page.field_tables(seen),
     ]
-    values = evaluate_tables.values(axial, scenes, measured)
-    values["failures"] = evaluate_tables.failures(axial, scenes, measured)
+    values = evaluate_tables.table_values(axial, scenes, measured)
+    values["failures"] = evaluate_tables.table_failures(axial, scenes, measured)
     for name, one in seen.items():
         values["lenses"][name] |= {
             "focuses": name not in spread,
-            "field": field_page.values(one),
+            "field": field_page.field_values(one),
         }
     if options.reader:
         table, values["reader"] = _read(
@@ -135,10 +140,10 @@ def _measure(
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
     pictures = {
-        "axial": evaluate_plots.information(axial, measured),
-        "slices": evaluate_plots.slices(axial, measured),
-        "scenes": evaluate_plots.scenes(scenes),
-        "field": field_page.picture(seen),
+        "axial": evaluate_plots.plot_axial_information(axial, measured),
+        "slices": evaluate_plots.plot_depth_slices(axial, measured),
+        "scenes": evaluate_plots.plot_scenes(scenes),
+        "field": field_page.plot_over_field(seen),
         "mtf": field_page.mtf_picture(seen),
     }
     _write(folder, pictures, tables)
@@ -150,10 +155,12 @@ def _read(
 ) -> tuple[Table, dict[str, Any]]:
     """What the reference reader makes of every lens."""
     found = dict(
-        options.console.track(judged(made, setting), total=len(made), label="reader")
+        options.console.track(
+            judge_lenses(made, setting), total=len(made), label="reader"
+        )
     )
     told = {name: one.values() for name, one in found.items()}
-    return reader.table(found, setting), {
+    return reader.reader_table(found, setting), {
         "settings": dataclasses.asdict(setting),
         "lenses": told,
     }
@@ -168,10 +175,10 @@ def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> Non
         Figure(image, captions[name], wide=True) for name, image in pictures.items()
     ]
     sections = [Section("Pictures", items=items), Section("Tables", items=tables)]
-    write(folder / "report.html", "What the lenses tell", sections)
+    write_report(folder / "report.html", "What the lenses tell", sections)
 
 
-def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
+def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:
     """The tuned hyperbolic lens and double helix, of the pillars and aperture of a
     lens, with their names.
     """
@@ -185,14 +192,14 @@ def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
         lens.source_distance_um,
         lens.layers,
     )
-    wanted = Fisher(
+    wanted = FisherSettings(
         depths_mm=measured.depths_mm,
         pixel_um=measured.pixel_um * min(setting.binnings),
         radius_um=measured.radius_um,
         normalisation="sum" if setting.normalisation == "sum" else "l2",
     ).about(focus, radius)
     out = []
-    for found in baselines.tuned_pair(design_pupil(focus, radius, wanted), wanted):
+    for found in baselines.tune_baselines(design_pupil(focus, radius, wanted), wanted):
         phase, mine = found.phase(focus, radius_um=radius)
         kind = "double-helix" if found.zones else "hyperbolic"
         simple, _ = design.make(
@@ -202,7 +209,7 @@ def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
     return out
 
 
-def distinct(names: list[str]) -> list[str]:
+def distinct_lens_names(names: list[str]) -> list[str]:
     """Names of lenses, numbered where two files have the same stem."""
     return [
         name if names.count(name) == 1 else f"{name} ({i + 1})"

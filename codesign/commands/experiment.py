@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import Source, bootstrap, retrained
+from codesign.adapt import FinishedRun, bootstrap_interval, retrained
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import (
     AXIAL,
     LATERAL,
     ExperimentConfig,
-    Result,
-    experiment,
+    RunResult,
     experiment_plots,
+    run_experiment,
 )
-from codesign.gaze import People, people_file
+from codesign.gaze import PopulationPrior, people_file
 from codesign.optics import formed
-from metalens.ground import config as settings
-from metalens.ground import reading, report, store
-from metalens.ground.errors import ConfigError
+from metalens.core import config as settings
+from metalens.core import reading, report, store
+from metalens.core.errors import ConfigError
 
 JSON, PAGE = "experiment.json", "report.html"
 PLACED = {"random": "drawn at random", "spread": "spread over the field"}
@@ -37,7 +37,7 @@ def run(options: Options) -> int:
     """
     if not options.runs:
         raise ConfigError("no run to evaluate; give one run folder or more")
-    names = options.names or distinct(options.runs)
+    names = options.names or distinct_run_names(options.runs)
     if len(names) != len(options.runs):
         raise ConfigError(
             f"{len(names)} names for {len(options.runs)} runs; give one a run"
@@ -47,10 +47,10 @@ def run(options: Options) -> int:
             f"names {', '.join(names)}: two are alike; give every run one of its own"
         )
     folder, config = options.output, options.settings
-    sources = [retrained.load(path) for path in options.runs]
+    sources = [retrained.load_retrained(path) for path in options.runs]
     with options.claim_folder(folder) as draft:
-        results: list[Result] = []
-        steps = experiment(sources, config, names=names)
+        results: list[RunResult] = []
+        steps = run_experiment(sources, config, names=names)
         for _, found in options.console.track(
             steps, total=config.subjects, label="subjects"
         ):
@@ -59,34 +59,34 @@ def run(options: Options) -> int:
             name: retrained.lens_of(path)
             for name, path in zip(names, options.runs, strict=True)
         }
-        values = summary(results, config) | {
-            "images": images(options.runs, names),
+        values = experiment_summary(results, config) | {
+            "images": image_summary(options.runs, names),
             "lenses": shown,
         }
         values["failures"] = [
             f"{one.name}: {one.above}" for one in results if one.above
         ]
         pictures = {
-            "samples.png": experiment_plots.samples(sources[0], config),
-            "ambiguity.png": experiment_plots.ambiguity(results[0]),
-            "errors.png": experiment_plots.errors(results),
+            "samples.png": experiment_plots.plot_samples(sources[0], config),
+            "ambiguity.png": experiment_plots.plot_ambiguity(results[0]),
+            "errors.png": experiment_plots.plot_gaze_errors(results),
         }
         _write(draft.path, values, pictures)
         for number, (result, source) in enumerate(
             zip(results, sources, strict=True), 1
         ):
-            if isinstance(result.how, People):
-                people_file.save(
+            if isinstance(result.how, PopulationPrior):
+                people_file.save_people(
                     draft.path / f"people_{number}.h5",
                     result.how,
                     provenance=_made(source, config),
                 )
     return options.console.judged(
-        values, f"{table(values)}\nopen {folder / PAGE}", values["failures"]
+        values, f"{experiment_table(values)}\nopen {folder / PAGE}", values["failures"]
     )
 
 
-def _made(source: Source, config: ExperimentConfig) -> store.Provenance:
+def _made(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
     """By which run, shown what."""
     seed = source.settings.inner.seed
     return store.Provenance(
@@ -94,7 +94,7 @@ def _made(source: Source, config: ExperimentConfig) -> store.Provenance:
     )
 
 
-def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
+def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
     """How every run's images were formed and how wrong they are, as the run itself
     found; None of older runs.
 
@@ -108,13 +108,13 @@ def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
+def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """Names of the folders, of a network in a folder with its own, numbered where they
     repeat.
     """
     places = (path.resolve() for path in paths)
     stems = [
-        reading.shown(
+        reading.to_valid_utf8(
             p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}"
         )
         for p in places
@@ -124,7 +124,9 @@ def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
     )
 
 
-def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, Any]:
+def experiment_summary(
+    results: Sequence[RunResult], config: ExperimentConfig
+) -> dict[str, Any]:
     """Numbers of every run with intervals over subjects, and ratios of the first to the
     others.
     """
@@ -142,7 +144,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
             )  # a network without a mask has no overlap
             row[quantity] = float(values.mean()) if known else None
             if known and len(values) > 1:
-                row[f"{quantity}_interval"] = list(bootstrap(values))
+                row[f"{quantity}_interval"] = list(bootstrap_interval(values))
         rows.append(row | _finer(result, row))
     ratios = []
     for other, means in zip(results[1:], per[1:], strict=True):
@@ -152,7 +154,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
             "slip_mm",
             "slip_axial_mm",
         ):
-            value, low, high = ratio(per[0][quantity], means[quantity])
+            value, low, high = subject_ratio(per[0][quantity], means[quantity])
             ratios.append({
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
                 "goal": GOALS.get(quantity, ""),
@@ -164,7 +166,7 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
 FINER = ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm", "iou")
 
 
-def _finer(result: Result, row: dict[str, Any]) -> dict[str, Any]:
+def _finer(result: RunResult, row: dict[str, Any]) -> dict[str, Any]:
     """Errors of the same frames on a finer image, and its ratio of the gaze error."""
     if result.finer is None:
         return {f"finer_{name}": None for name in (*FINER, "ratio")}
@@ -177,7 +179,7 @@ def _finer(result: Result, row: dict[str, Any]) -> dict[str, Any]:
     return found | {"finer_ratio": ratio}
 
 
-def _beyond(result: Result) -> dict[str, Any]:
+def _beyond(result: RunResult) -> dict[str, Any]:
     """Slippages that training never saw, how far it saw, and the axial error where it
     did.
     """
@@ -217,7 +219,7 @@ def _of_lenses(values: dict[str, Any]) -> list[str]:
     return [f"{name}: through the lens {lens}" for name, lens in made.items()]
 
 
-def _per_subject(result: Result) -> dict[str, Any]:
+def _per_subject(result: RunResult) -> dict[str, Any]:
     error, axial = result.slip_error_mm, result.trial.group(AXIAL)
     return {
         "gaze_axial_deg": result.per_subject(result.gaze_deg, axial),
@@ -234,7 +236,7 @@ def _per_subject(result: Result) -> dict[str, Any]:
     }
 
 
-def ratio(
+def subject_ratio(
     one: Any, other: Any, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
     """Ratio of means over subjects with its 95 % interval, by a paired bootstrap."""
@@ -249,7 +251,7 @@ def _finer_words(row: dict[str, Any]) -> str:
     return f"{row['finer_gaze_axial_deg']:24.2f} ({row['finer_ratio']:5.2f})"
 
 
-def table(values: dict[str, Any]) -> str:
+def experiment_table(values: dict[str, Any]) -> str:
     """The numbers as text."""
     head = (
         f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}"
@@ -272,7 +274,7 @@ def table(values: dict[str, Any]) -> str:
     ]
     for name, found in values.get("images", {}).items():
         lines.append(
-            f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}"
+            f"{name}: {formed.describe_image_text(found) if found else 'image: uniform, of unknown error; run it again'}"
         )
     return "\n".join(lines)
 
@@ -345,7 +347,7 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
         report.Section("Numbers", words, tables),
         report.Section("Figures", "", figures),
     ]
-    report.write(path, "Virtual experiment", sections, key_figures=keys)
+    report.write_report(path, "Virtual experiment", sections, key_figures=keys)
 
 
 def _told(about: dict[str, Any]) -> str:

@@ -7,14 +7,14 @@ from pathlib import Path
 from codesign.batches import EXPERIMENT
 from codesign.network import Architecture, Supernet, exported
 from codesign.network.subnet import Subnet
-from codesign.train import Run
+from codesign.train import CodesignRun
 from metalens.image import sensor as camera
 
 
-def scale_of(run: Run) -> exported.Scale:
+def scale_of(run: CodesignRun) -> exported.OutputScale:
     """What a run's networks answer in."""
     inner, pitch = run.settings.inner, float(run.trainer.model.pitch_um.detach())
-    return exported.Scale(
+    return exported.OutputScale(
         frame_mm=pixels_of(run) * pitch * 1e-3,
         slip_mm=inner.slip_scale_mm,
         elevation_rad=run.scenes(EXPERIMENT).rig.elevation_rad,
@@ -23,13 +23,15 @@ def scale_of(run: Run) -> exported.Scale:
     )
 
 
-def pixels_of(run: Run) -> int:
+def pixels_of(run: CodesignRun) -> int:
     """Pixels along a side of the run's sensor."""
     settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
     return camera.pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
 
 
-def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> None:
+def write_network_file(
+    path: Path, run: CodesignRun, net: Supernet, architecture: Architecture
+) -> None:
     """Write a network of a run, cut to its architecture, for frames of the run's
     sensor.
 
@@ -37,7 +39,7 @@ def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> No
         OSError: the target cannot be written.
     """
     pitch = float(run.trainer.model.pitch_um.detach())
-    exported.write(
+    exported.write_onnx(
         path,
         Subnet(net, architecture),
         scale_of(run),

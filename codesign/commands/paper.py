@@ -13,9 +13,16 @@ from codesign.commands import experiment as command_experiment
 from codesign.commands.options import experiment as experiment_options
 from codesign.commands.options import optics as optics_options
 from codesign.commands.options.paper import Options
-from codesign.evaluate import ROLES, ExperimentConfig, Line, Measured, paper, paper_runs
-from metalens.ground import report, store
-from metalens.ground.errors import ConfigError
+from codesign.evaluate import (
+    ROLES,
+    ClaimLine,
+    ExperimentConfig,
+    MeasuredNumber,
+    paper,
+    paper_runs,
+)
+from metalens.core import report, store
+from metalens.core.errors import ConfigError
 
 JSON, PAGE, GAZE = "paper.json", "report.html", "gaze.json"
 DIM_DB = 15.0
@@ -40,7 +47,9 @@ def run(options: Options) -> int:
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
         if options.runs and options.measure:
             _measure(options, draft.path)
-        told = paper.lines(collect(draft.path, runs, options.others), draft.path)
+        told = paper.claim_lines(
+            collect_measurements(draft.path, runs, options.others), draft.path
+        )
         _write(draft.path, told)
         values = [
             {
@@ -53,13 +62,13 @@ def run(options: Options) -> int:
         store.write_text(
             draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n"
         )
-    text = f"{table(told)}\nopen {folder / PAGE}"
+    text = f"{claims_table(told)}\nopen {folder / PAGE}"
     return options.console.judged(
-        {"lines": values, "folder": str(folder)}, text, failures(folder)
+        {"lines": values, "folder": str(folder)}, text, measurement_failures(folder)
     )
 
 
-def failures(folder: Path) -> list[str]:
+def measurement_failures(folder: Path) -> list[str]:
     """The checks that the measurements in ``folder`` failed, each with which it is of."""
     files = [
         folder / name
@@ -81,9 +90,9 @@ def failures(folder: Path) -> list[str]:
     ]
 
 
-def collect(
+def collect_measurements(
     folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()
-) -> dict[str, Measured]:
+) -> dict[str, MeasuredNumber]:
     """Everything that was measured into ``folder``, and the rows of the runs and of
     those with a part frozen.
 
@@ -91,7 +100,7 @@ def collect(
         StoreError, TrainingError: a measurement or a run is damaged or of another
             version.
     """
-    found: dict[str, Measured] = {}
+    found: dict[str, MeasuredNumber] = {}
     experiment, dim, optics = (
         folder / name / f"{file}.json"
         for name, file in (
@@ -159,7 +168,7 @@ def _measure_gaze(options: Options, path: Path) -> None:
     if str(folder) in told:
         return
     options.console.say(f"measuring: gaze of {folder}")
-    told[str(folder)] = {"rows": paper_runs.gaze(folder)}
+    told[str(folder)] = {"rows": paper_runs.gaze_errors(folder)}
     store.write_text(path, json.dumps(told, indent=1) + "\n")
 
 
@@ -171,13 +180,13 @@ def _named(folder: Path, name: str, run_dir: Path) -> Path:
     return kept / f"{name}.h5"
 
 
-def table(told: list[Line]) -> str:
+def claims_table(told: list[ClaimLine]) -> str:
     """The lines as text."""
     head = ("place", "what", "paper", "ours", "ratio", "conditions")
     return report.Table(head, [line.words() for line in told]).text
 
 
-def _write(folder: Path, told: list[Line]) -> None:
+def _write(folder: Path, told: list[ClaimLine]) -> None:
     places = list(dict.fromkeys(t.claim.place for t in told))
     head = ("what", "paper", "ours", "ratio", "conditions")
     sections = []
@@ -200,6 +209,6 @@ def _write(folder: Path, told: list[Line]) -> None:
         report.KeyFigure("measured here", str(done)),
     ]
     lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
-    report.write(
+    report.write_report(
         folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys
     )

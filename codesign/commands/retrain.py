@@ -7,44 +7,44 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from characterize.bench import Truth
+from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
-from codesign.adapt import Lenses, Source, correction, lens_file
+from codesign.adapt import FinishedRun, LensPsfs, correction, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
-from codesign.adapt.retrained import RECIPE, RESULT, Recipe, given
-from codesign.adapt.sure import MAP, judge
+from codesign.adapt.retrained import RECIPE, RESULT, RetrainingRecipe, relative_inputs
+from codesign.adapt.sure import MAP, judge_correction
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
-from codesign.optics import MadeLens, posterior, psf_error
-from codesign.train import Record, Trainer, checkpoint, device_of, place
+from codesign.optics import MadeLens, posterior_parameters, psf_error
+from codesign.train import LogRecord, Trainer, checkpoint, device_of, place_on_device
 from metalens import __version__, lens
+from metalens.core import config, reading, store
+from metalens.core.errors import TrainingError
+from metalens.core.transaction import OutputDraft
 from metalens.fabrication import Bias
-from metalens.ground import config, reading, store
-from metalens.ground.errors import TrainingError
-from metalens.ground.transaction import Draft
 
 LOG = "log.jsonl"
 
 
-Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
+Given = tuple[FinishedRun, asbuilt.AsBuilt, lens.Lens, HiddenLens | None, Bias]
 
 
 def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 1 where the error of the images that judge
     is above what the run asks
     for."""
-    source = retraining.load(
+    source = retraining.load_finished_run(
         options.run_dir, budget_mmacs=options.settings.budget_mmacs
     )
-    place(source.run.trainer, device_of(options.device))
+    place_on_device(source.run.trainer, device_of(options.device))
     result = asbuilt.load(options.asbuilt)
     design = lens.load_plain(
         lens_file(options.run_dir, source.settings, source.row["budget_mmacs"])
     )
     retraining.check_lens(design, result, insist=options.insist)
-    truth = config.load(options.truth, Truth) if options.truth else None
+    truth = config.load(options.truth, HiddenLens) if options.truth else None
     old = correction.present_bias(options.process)
     recipe = _recipe(options, source)
     with options.claim_work(
@@ -60,8 +60,8 @@ def run(options: Options) -> int:
 
 
 def _story(
-    options: Options, folder: Path, recipe: Recipe, given: Given
-) -> retrain_report.Story:
+    options: Options, folder: Path, recipe: RetrainingRecipe, given: Given
+) -> retrain_report.RetrainingResults:
     """Train on, judge, correct and write into the folder."""
     source, result, design, truth, old = given
     made = MadeLens(design, source.settings.optics, response=result.response)
@@ -69,27 +69,31 @@ def _story(
     console.say(
         f"lenses: the design, the fit and {options.settings.draws} draws of its posterior"
     )
-    found = retraining.lenses(made, result, options.settings, truth)
+    found = retraining.lens_psfs(made, result, options.settings, truth)
     trained = {
         name: _train(options, folder, (recipe, source, found), name)
-        for name in retraining.jobs(found)
+        for name in retraining.available_jobs(found)
     }
-    console.say(f"judging: {len(retraining.jobs(found)) + 2} cases on the same frames")
-    outcome = retraining.outcome(source, options.settings, found, trained)
-    plan = correction.propose(
+    console.say(
+        f"judging: {len(retraining.available_jobs(found)) + 2} cases on the same frames"
+    )
+    outcome = retraining.retraining_outcome(source, options.settings, found, trained)
+    plan = correction.propose_correction(
         design, result.parameters(), response=made.response, old=old
     )
     true = (
         truth.vector()
         if truth
         else list(
-            posterior(result, options.settings.draws + 1, seed=options.settings.seed)
+            posterior_parameters(
+                result, options.settings.draws + 1, seed=options.settings.seed
+            )
         )[-1]
     )
-    proposals, frames = [], retraining.held(source, options.settings)
+    proposals, frames = [], retraining.render_test_frames(source, options.settings)
     states = correction.next_lenses(made, plan, result.parameters(), true)
     for state in console.track(states, total=len(states), label="next lens"):
-        error = retraining.judge(
+        error = retraining.judge_network(
             trained["nominal"],
             source,
             options.settings,
@@ -99,22 +103,22 @@ def _story(
         )
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
     printed = correction.printed_um(design)
-    sure = judge(
+    sure = judge_correction(
         result,
         lambda x: (
-            correction.table(
+            correction.bias_table(
                 design, x, response=made.response, old=old, range_um=printed
             ).bias_nm
         ),
     )
-    even = judge(result, correction.uneven_nm, part=MAP)
-    refused = sure.words or correction.worse(states[0], states[1])
-    uneven = even.words or correction.worse(states[1], states[2])
+    even = judge_correction(result, correction.uneven_nm, part=MAP)
+    refused = sure.words or correction.loss_reason(states[0], states[1])
+    uneven = even.words or correction.loss_reason(states[1], states[2])
     apart = (
         psf_error(found.best, found.nominal),
         psf_error(found.judges[0], found.nominal),
     )
-    story = retrain_report.Story(
+    story = retrain_report.RetrainingResults(
         outcome,
         found,
         apart,
@@ -126,18 +130,18 @@ def _story(
         uneven,
     )
     if not refused:
-        correction.write(folder, plan, evened=not uneven)
+        correction.write_correction(folder, plan, evened=not uneven)
     _keep(folder, options, (source, trained["retrained"]), story)
     if options.export:
         net = trained["retrained"].model.net
-        onnx_file.write(
+        onnx_file.write_network_file(
             folder / "subnet_retrained.onnx", source.run, net, source.architecture
         )
     return story
 
 
-def _recipe(options: Options, source: Source) -> Recipe:
-    return Recipe(
+def _recipe(options: Options, source: FinishedRun) -> RetrainingRecipe:
+    return RetrainingRecipe(
         options.settings,
         reading.sha256(options.asbuilt),
         reading.sha256(options.run_dir / "checkpoint.safetensors"),
@@ -146,7 +150,7 @@ def _recipe(options: Options, source: Source) -> Recipe:
     )
 
 
-def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
+def _agree(draft: OutputDraft, recipe: RetrainingRecipe, *, resume: bool) -> None:
     """Note the recipe, or refuse to resume another."""
     folder = draft.path
     if resume:
@@ -154,7 +158,9 @@ def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
             raise TrainingError(
                 f"{draft.target}: no retraining to resume ({RECIPE} missing); start without --resume"
             )
-        changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), recipe)
+        changed = checkpoint.settings_difference(
+            (folder / RECIPE).read_text("utf-8"), recipe
+        )
         if changed:
             raise TrainingError(
                 f"{folder} belongs to other settings; start anew or undo the change:\n{changed}"
@@ -164,18 +170,21 @@ def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
 
 
 def _train(
-    options: Options, folder: Path, given: tuple[Recipe, Source, Lenses], name: str
+    options: Options,
+    folder: Path,
+    given: tuple[RetrainingRecipe, FinishedRun, LensPsfs],
+    name: str,
 ) -> Trainer:
     """One job to its end, logged and kept; a resume drops log lines beyond its
     checkpoint.
     """
     (recipe, source, found), console = given, options.console
-    going = retraining.job(source, options.settings, found, name)
+    going = retraining.make_job(source, options.settings, found, name)
     path = folder / f"{name}.safetensors"
     if path.is_file():
         going.restore(checkpoint.load(path, settings=recipe)["trainer"])
     _trim(folder, name, going.step)
-    records = retraining.train(going, path, recipe)
+    records = retraining.run_job(going, path, recipe)
     for record in console.track(
         records, total=going.inner.steps - going.step, label=f"training: {name}"
     ):
@@ -183,7 +192,7 @@ def _train(
     return going
 
 
-def _log(folder: Path, name: str, record: Record) -> None:
+def _log(folder: Path, name: str, record: LogRecord) -> None:
     with open(folder / LOG, "a", encoding="utf-8") as file:
         file.write(json.dumps({"job": name, **asdict(record)}) + "\n")
 
@@ -210,18 +219,18 @@ def _entries(folder: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def _curves(folder: Path, found: Lenses) -> dict[str, tuple[list[int], list[float]]]:
+def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[float]]]:
     entries = _entries(folder)
     return {
         name: (
             [e["step"] for e in entries if e["job"] == name],
             [e["task"] for e in entries if e["job"] == name],
         )
-        for name in retraining.jobs(found)
+        for name in retraining.available_jobs(found)
     }
 
 
-def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
+def _cautions(result: asbuilt.AsBuilt, found: LensPsfs) -> list[str]:
     words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
     if release != __version__:
@@ -238,21 +247,25 @@ def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
 def _keep(
     folder: Path,
     options: Options,
-    trained: tuple[Source, Trainer],
-    story: retrain_report.Story,
+    trained: tuple[FinishedRun, Trainer],
+    story: retrain_report.RetrainingResults,
 ) -> None:
     source, going = trained
-    retraining.settle(going, source)
+    retraining.recalibrate_on_lenses(going, source)
     cut = Subnet(going.model.net, source.architecture)
     checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
-    retrain_report.write(folder / "report.html", story)
-    store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
+    retrain_report.write_retraining_page(folder / "report.html", story)
+    store.write_bytes(
+        folder / "cases.png", retrain_report.plot_error_bars(story.outcome)
+    )
     store.write_text(
         folder / RESULT, json.dumps(_values(story, options), indent=1) + "\n"
     )
 
 
-def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
+def _values(
+    story: retrain_report.RetrainingResults, options: Options
+) -> dict[str, Any]:
     o, folder = story.outcome, options.output
     states = [
         {
@@ -266,7 +279,9 @@ def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
     ]
     return {
         "folder": str(folder),
-        "given": given(folder, options.run_dir, options.asbuilt, options.truth),
+        "given": relative_inputs(
+            folder, options.run_dir, options.asbuilt, options.truth
+        ),
         "rows": [
             {"case": retrain_report.CASES[name], **row}
             for name, row in o.rows().items()
@@ -290,7 +305,7 @@ def _finer(row: dict[str, float]) -> str:
     return f" {row['finer_slip_mm']:.3f} ({row['finer_ratio']:.2f})"
 
 
-def _text(story: retrain_report.Story, folder: Path) -> str:
+def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
     o = story.outcome
     lines = [
         f"{'case':<38}slippage error / mm        axial   IoU   finer image (ratio)"

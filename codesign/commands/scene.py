@@ -7,20 +7,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from codesign.batches import varied, worn
+from codesign.batches import augmented_frames, widen_motion
 from codesign.commands.options.scene import Options
 from codesign.evaluate import imaged
-from codesign.eye import Camera, Motion, Rendered, Rig, dataset, landmarks
+from codesign.eye import (
+    CameraRig,
+    MotionRanges,
+    PinholeCamera,
+    RenderedFrames,
+    dataset,
+    landmarks,
+)
 from metalens import lens as lenses
-from metalens.ground import config, reading, store, transaction
-from metalens.ground.errors import ConfigError
-from metalens.ground.store import Provenance
+from metalens.core import config, reading, store, transaction
+from metalens.core.errors import ConfigError
+from metalens.core.store import Provenance
 from metalens.image import scene
 from metalens.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SceneSettings:
     """The content of SCENE.toml; every key may be left out.
 
     frames, seed: how many states, drawn from which seed.
@@ -80,21 +87,21 @@ class Scene:
             raise ConfigError(f"variety = {self.variety}: need 0 to 4")
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> CameraRig:
         """Camera and lamps in um and rad."""
         return replace(
-            Rig(),
+            CameraRig(),
             elevation_rad=math.radians(self.elevation_deg),
             distance_um=self.distance_mm * 1e3,
         )
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> MotionRanges:
         """Ranges in um and rad."""
         x, y = (math.radians(angle) for angle in self.gaze_deg)
         slip = (self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3)
         return replace(
-            varied(self.variety),
+            widen_motion(self.variety),
             gaze_x_rad=x,
             gaze_y_rad=y,
             slip_um=slip,
@@ -104,7 +111,11 @@ class Scene:
 
 def run(options: Options) -> int:
     """Render, write and show; exit 1 where the image's error is above what it aims at."""
-    settings = Scene() if options.config is None else config.load(options.config, Scene)
+    settings = (
+        SceneSettings()
+        if options.config is None
+        else config.load(options.config, SceneSettings)
+    )
     if options.fwhm_nm < 0 or (options.fwhm_nm and options.lens is None):
         raise ConfigError(
             f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is"
@@ -133,20 +144,22 @@ def run(options: Options) -> int:
                 settings.seed,
             )
             found = _imaged(settings, lens, options.fwhm_nm)
-            imaged.write(draft.path, found, about)
+            imaged.write_images(draft.path, found, about)
             values |= {"image_error": found.error, "light": found.light}
             failures.append(found.problem)
             words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png{found.light}"
     return options.console.judged(values, words, failures)
 
 
-def _make(settings: Scene, folder: Path) -> int:
+def _make(settings: SceneSettings, folder: Path) -> int:
     """Render and write; the number of layers of the first frame."""
-    camera = Camera(settings.pixels, settings.pitch_um)
+    camera = PinholeCamera(settings.pixels, settings.pitch_um)
     states = dataset.states_at(
         torch.arange(settings.frames), settings.seed, motion=settings.motion
     )
-    made = worn(states, settings.rig, camera, settings.variety, (settings.seed, 3))
+    made = augmented_frames(
+        states, settings.rig, camera, settings.variety, (settings.seed, 3)
+    )
     about = Provenance(config=config.dumps(settings), seed=settings.seed)
     dataset.write_shard(folder / "scene.h5", made, seed=settings.seed, provenance=about)
     count = _write_layers(folder / "layers.h5", made, settings.layer_mm * 1e3, about)
@@ -155,20 +168,26 @@ def _make(settings: Scene, folder: Path) -> int:
     return count
 
 
-def _imaged(settings: Scene, lens: Lens, fwhm_nm: float) -> imaged.Imaged:
+def _imaged(settings: SceneSettings, lens: Lens, fwhm_nm: float) -> imaged.ImagedFrames:
     count = min(settings.frames, imaged.FRAMES)
     states = dataset.states_at(
         torch.arange(count), settings.seed, motion=settings.motion
     )
 
-    def rendered(camera: Camera, rig: Rig) -> Rendered:
-        return worn(states, rig, camera, settings.variety, (settings.seed, 3))
+    def rendered(camera: PinholeCamera, rig: CameraRig) -> RenderedFrames:
+        return augmented_frames(
+            states, rig, camera, settings.variety, (settings.seed, 3)
+        )
 
-    camera = Camera(settings.pixels, settings.pitch_um)
-    return imaged.imaged(lens, camera, settings.rig, rendered, fwhm_nm=fwhm_nm)
+    camera = PinholeCamera(settings.pixels, settings.pitch_um)
+    return imaged.image_first_frames(
+        lens, camera, settings.rig, rendered, fwhm_nm=fwhm_nm
+    )
 
 
-def _write_layers(path: Path, made: Rendered, step_um: float, about: Provenance) -> int:
+def _write_layers(
+    path: Path, made: RenderedFrames, step_um: float, about: Provenance
+) -> int:
     """The occupied layers of the first frame, as image formation takes them."""
     frame = scene.Frames(
         made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1]
@@ -187,7 +206,7 @@ def _write_layers(path: Path, made: Rendered, step_um: float, about: Provenance)
     return len(layers.depth_um)
 
 
-def _table(made: Rendered) -> str:
+def _table(made: RenderedFrames) -> str:
     """Labels as comma-separated values, a frame a line."""
     labels = made.labels
     marks = [f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"]
@@ -229,7 +248,7 @@ def _table(made: Rendered) -> str:
 
 
 def contact_sheet(
-    made: Rendered, path: Path, *, columns: int = 6, most: int = 24
+    made: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
 ) -> None:
     """A picture of frames, with depth and pupil masks of the first row below."""
     import cv2

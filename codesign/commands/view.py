@@ -11,17 +11,17 @@ import numpy as np
 
 from codesign.commands import budget as budgets
 from codesign.network import Architecture
-from codesign.train import Candidate, pareto
-from metalens.ground import report, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import StoreError
+from codesign.train import EvaluatedCandidate, pareto_front
+from metalens.core import report, store
+from metalens.core.arrays import Array
+from metalens.core.errors import StoreError
 from metalens.view import (
-    Axis,
-    Curves,
-    Images,
-    Numbers,
+    CurvePanel,
+    ImagePanel,
     Panel,
-    Points,
+    PointPanel,
+    SliderAxis,
+    TablePanel,
     at_brightest,
     lens_panels,
 )
@@ -29,7 +29,7 @@ from metalens.view import (
 LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
 
 
-def panels(path: Path) -> list[Panel]:
+def run_panels(path: Path) -> list[Panel]:
     """A run's folder, finished or not.
 
     Raises:
@@ -43,7 +43,7 @@ def panels(path: Path) -> list[Panel]:
     )
     shown = [*_training(entries), *_searched(entries), *_networks(result)]
     if (path / ANSWERS).is_file():
-        shown += answers(path / ANSWERS)
+        shown += prediction_panels(path / ANSWERS)
     shown += _bound(result)
     if (path / LENS).is_file():
         shown += lens_panels(path / LENS)
@@ -94,7 +94,7 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
     if "mmacs" in shown and len(budgets) > 1:
         shown["mmacs"] = _in_turn(x, lines["mmacs"], budgets)
     return [
-        Curves(f"Training: {said[name]}", x, "step", curves, "")
+        CurvePanel(f"Training: {said[name]}", x, "step", curves, "")
         for name, curves in shown.items()
     ]
 
@@ -125,18 +125,21 @@ def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
     if not births:
         return []
     tried = [
-        Candidate(_architecture(e.get("architecture", {})), e["error"], e["mmacs"])
+        EvaluatedCandidate(
+            _architecture(e.get("architecture", {})), e["error"], e["mmacs"]
+        )
         for e in births
     ]
     front = [
-        next(i for i, one in enumerate(tried) if one is best) for best in pareto(tried)
+        next(i for i, one in enumerate(tried) if one is best)
+        for best in pareto_front(tried)
     ]
     notes = [
         dict(_layers(e["architecture"])) if e.get("architecture") else {}
         for e in births
     ]
     return [
-        Points(
+        PointPanel(
             "Networks of the searches",
             [e["mmacs"] for e in births],
             [e["error"] for e in births],
@@ -189,7 +192,7 @@ def _bound(result: dict[str, Any]) -> list[Panel]:
         "noise a thousandth of its power. Readers of real frames collect less."
     )
     return [
-        Curves(
+        CurvePanel(
             "Bound on the depth of a window",
             x,
             "depth / mm",
@@ -201,7 +204,7 @@ def _bound(result: dict[str, Any]) -> list[Panel]:
     ]
 
 
-def answers(path: Path) -> list[Panel]:
+def prediction_panels(path: Path) -> list[Panel]:
     """Test frames and what the networks said of them, beside the truth."""
     stored = store.load(path, "answers")
     held, count = stored.arrays, len(stored.arrays["frames"])
@@ -209,12 +212,12 @@ def answers(path: Path) -> list[Panel]:
         str(stored.attributes[f"network_{i}"]) for i in range(len(held["told_slip_um"]))
     ]
     axes = [
-        Axis("network", names),
-        Axis("frame", list(range(count))),
-        Axis("shown", ["truth", "answer"], blink=True),
+        SliderAxis("network", names),
+        SliderAxis("frame", list(range(count))),
+        SliderAxis("shown", ["truth", "answer"], blink=True),
     ]
     shown: list[Panel] = [
-        Images(
+        ImagePanel(
             "Frames of the test",
             held["frames"],
             axes[1:2],
@@ -231,7 +234,7 @@ def answers(path: Path) -> list[Panel]:
             )
             scaled = both * (1e-3 if unit == "mm" else 1.0)
             shown.append(
-                Images(
+                ImagePanel(
                     title,
                     scaled,
                     axes,
@@ -252,7 +255,7 @@ def answers(path: Path) -> list[Panel]:
     words = "Slippage of the eye; z is along the axis of the camera."
     return [
         *shown,
-        Numbers(
+        TablePanel(
             "Answers",
             ("network", "frame", *head, "90 % interval of z / mm"),
             rows,
@@ -275,7 +278,9 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
     )
     table = [[row.get(name, "") for name in names] for row in rows]
     shown: list[Panel] = [
-        Numbers("Networks of the run", [report.in_words(name) for name in names], table)
+        TablePanel(
+            "Networks of the run", [report.in_words(name) for name in names], table
+        )
     ]
     drawn = [
         (f"budget {row['budget_mmacs']:g}", _layers(held))
@@ -289,18 +294,18 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
             for i, (what, _) in enumerate(drawn[0][1])
         ]
         words = "Blocks of each stage: side of the kernel × expansion of the channels."
-        shown.append(Numbers("Layers of the networks", head, lines, words))
+        shown.append(TablePanel("Layers of the networks", head, lines, words))
     return shown
 
 
-def scene(path: Path) -> list[Panel]:
+def scene_panels(path: Path) -> list[Panel]:
     """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of
     every frame.
     """
     held = store.load(path, "scene").arrays
     count = len(held["radiance"])
     frames, full = (
-        [Axis("frame", list(range(count)))],
+        [SliderAxis("frame", list(range(count)))],
         float(np.iinfo(held["radiance"].dtype).max),
     )
     far = (
@@ -325,7 +330,7 @@ def scene(path: Path) -> list[Panel]:
         for i in range(count)
     ]
     return [
-        Images(
+        ImagePanel(
             "Rendered eyes",
             held["radiance"].sum(1, dtype=float) / full,
             frames,
@@ -333,7 +338,7 @@ def scene(path: Path) -> list[Panel]:
             "of full light",
             across="pixels",
         ),
-        Images(
+        ImagePanel(
             "Depth",
             depth_mm,
             frames,
@@ -342,7 +347,7 @@ def scene(path: Path) -> list[Panel]:
             across="pixels",
             from_least=True,
         ),
-        Images(
+        ImagePanel(
             "Pupil",
             held["pupil"] / full,
             frames,
@@ -350,7 +355,7 @@ def scene(path: Path) -> list[Panel]:
             "share of the pixel",
             across="pixels",
         ),
-        Numbers(
+        TablePanel(
             "Labels",
             ("frame", *head),
             rows,
@@ -359,12 +364,12 @@ def scene(path: Path) -> list[Panel]:
     ]
 
 
-def layers(path: Path) -> list[Panel]:
+def layer_panels(path: Path) -> list[Panel]:
     """The layers of one frame, as images are formed of them."""
     held = store.load(path, "layers").arrays
-    axis = [Axis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
+    axis = [SliderAxis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
     return [
-        Images(
+        ImagePanel(
             "Light of a layer",
             held["radiance"],
             axis,
@@ -372,7 +377,7 @@ def layers(path: Path) -> list[Panel]:
             "of full light",
             across="pixels",
         ),
-        Images(
+        ImagePanel(
             "What a layer covers",
             held["coverage"],
             axis,
@@ -383,19 +388,19 @@ def layers(path: Path) -> list[Panel]:
     ]
 
 
-def image(path: Path) -> list[Panel]:
+def image_panels(path: Path) -> list[Panel]:
     """Scenes and what a lens makes of them, and the PSFs over field and depth that did
     it.
     """
     stored = store.load(path, "image")
     held, about = stored.arrays, stored.attributes
-    frames = Axis("frame", list(range(len(held["scene"]))))
+    frames = SliderAxis("frame", list(range(len(held["scene"]))))
     both = np.stack([held["scene"], held["image"]], axis=1)
-    shown = Axis("shown", ["scene", "image"], blink=True)
-    names = [Axis("depth", (1e-3 * held["depth_um"]).tolist(), "mm")]
+    shown = SliderAxis("shown", ["scene", "image"], blink=True)
+    names = [SliderAxis("depth", (1e-3 * held["depth_um"]).tolist(), "mm")]
     names += [
-        Axis("field, down", held["y_deg"].tolist(), "deg"),
-        Axis("field, across", held["x_deg"].tolist(), "deg"),
+        SliderAxis("field, down", held["y_deg"].tolist(), "deg"),
+        SliderAxis("field, across", held["x_deg"].tolist(), "deg"),
     ]
     psf, step = held["psf"] / held["psf"].max(), float(about["pitch_um"])
     parts = [
@@ -406,8 +411,8 @@ def image(path: Path) -> list[Panel]:
     words = f"Relative L2 error of a texture, {float(about['error']):.2g} together; outside: light beyond the windows."
     unit = "light, as of the scene"
     return [
-        Images("Scene and image", both, [frames, shown], step, unit),
-        Images(
+        ImagePanel("Scene and image", both, [frames, shown], step, unit),
+        ImagePanel(
             "Image less scene",
             held["image"] - held["scene"],
             [frames],
@@ -415,7 +420,7 @@ def image(path: Path) -> list[Panel]:
             unit,
             signed=True,
         ),
-        Images(
+        ImagePanel(
             "Points of the field",
             psf,
             at_brightest(names, psf),
@@ -423,11 +428,11 @@ def image(path: Path) -> list[Panel]:
             "of the highest peak",
             optics=True,
         ),
-        Numbers("Error of the image", ("cause", "error"), parts, words),
+        TablePanel("Error of the image", ("cause", "error"), parts, words),
     ]
 
 
-def budget(path: Path) -> list[Panel]:
+def budget_panels(path: Path) -> list[Panel]:
     """Every link from pillar to answer with its error."""
     rows = [
         (
@@ -438,7 +443,7 @@ def budget(path: Path) -> list[Panel]:
             "yes" if row.counted else "no",
             row.method,
         )
-        for row in budgets.load(path)
+        for row in budgets.load_budget(path)
     ]
     shown = [
         tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row)
@@ -455,7 +460,7 @@ def budget(path: Path) -> list[Panel]:
     words = (
         "The last row is the root of the sum of squares of those that are in the sum."
     )
-    return [Numbers("Error of every link", head, shown, words)]
+    return [TablePanel("Error of every link", head, shown, words)]
 
 
 _PAIRS = (

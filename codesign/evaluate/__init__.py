@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.evaluate import experiment_plots as experiment_plots
@@ -18,36 +18,36 @@ if TYPE_CHECKING:
     from codesign.evaluate.field_page import FieldSetting as FieldSetting
     from codesign.evaluate.gaze_experiment import AXIAL as AXIAL
     from codesign.evaluate.gaze_experiment import LATERAL as LATERAL
-    from codesign.evaluate.gaze_experiment import Result as Result
-    from codesign.evaluate.gaze_experiment import experiment as experiment
-    from codesign.evaluate.optics import Scenes as Scenes
-    from codesign.evaluate.optics import Setting as Setting
+    from codesign.evaluate.gaze_experiment import RunResult as RunResult
+    from codesign.evaluate.gaze_experiment import run_experiment as run_experiment
+    from codesign.evaluate.optics import MeasurementSettings as MeasurementSettings
+    from codesign.evaluate.optics import SensitivityScenes as SensitivityScenes
     from codesign.evaluate.paper import ROLES as ROLES
-    from codesign.evaluate.paper import Line as Line
-    from codesign.evaluate.paper import Measured as Measured
+    from codesign.evaluate.paper import ClaimLine as ClaimLine
+    from codesign.evaluate.paper import MeasuredNumber as MeasuredNumber
     from codesign.evaluate.reader import ReaderConfig as ReaderConfig
-    from codesign.evaluate.reader import judged as judged
+    from codesign.evaluate.reader import judge_lenses as judge_lenses
     from codesign.evaluate.shown import ExperimentConfig as ExperimentConfig
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "AXIAL": "gaze_experiment",
         "ExperimentConfig": "shown",
         "LATERAL": "gaze_experiment",
-        "Line": "paper",
-        "Measured": "paper",
+        "ClaimLine": "paper",
+        "MeasuredNumber": "paper",
         "ROLES": "paper",
         "ReaderConfig": "reader",
-        "Result": "gaze_experiment",
-        "Scenes": "optics",
-        "Setting": "optics",
-        "experiment": "gaze_experiment",
+        "RunResult": "gaze_experiment",
+        "SensitivityScenes": "optics",
+        "MeasurementSettings": "optics",
+        "run_experiment": "gaze_experiment",
         "FieldSetting": "field_page",
         "experiment_plots": "",
         "field_page": "",
         "gaze_experiment": "",
-        "judged": "reader",
+        "judge_lenses": "reader",
         "imaged": "",
         "optics": "",
         "paper": "",

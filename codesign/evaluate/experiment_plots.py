@@ -7,35 +7,37 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from codesign.adapt import Source
+from codesign.adapt import FinishedRun
 from codesign.batches import EXPERIMENT
 from codesign.evaluate.gaze_experiment import (
     AXIAL,
     LATERAL,
-    Result,
-    lighting,
-    ready,
+    RunResult,
+    experiment_sensors,
+    image_frames,
+    prepare_run,
     render_subject,
     states_of,
-    through,
 )
 from codesign.evaluate.shown import ExperimentConfig
-from metalens.ground import report
+from metalens.core import report
 
 COLOURS = ("#e9812b", "#1f6feb", "#2a9d8f", "#6d597a")
 
 
 @torch.no_grad()
-def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> bytes:
+def plot_samples(
+    source: FinishedRun, config: ExperimentConfig, *, subjects: int = 4
+) -> bytes:
     """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is
     (green) and as it is read (red).
     """
     scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
-    prepared, slips = ready(source, image=config.image), config.slips_mm
-    sensor = lighting([source], config)[0]
+    prepared, slips = prepare_run(source, image=config.image), config.slips_mm
+    sensor = experiment_sensors([source], config)[0]
     points = len(config.stimuli_deg)
     count = min(subjects, config.subjects)
-    figure, axes = report.canvas(
+    figure, axes = report.make_figure(
         count, len(slips), size=(1.25 * len(slips), 1.3 * count), squeeze=False
     )
     net.eval()
@@ -43,7 +45,7 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
         rows = torch.arange(len(slips)) * points + (points // 2 + 5 * subject) % points
         states, _ = states_of(config, subject, scenes)
         made = render_subject(states[rows], config, subject, scenes)
-        seen = through(source, made, prepared, seed=subject, sensor=sensor)
+        seen = image_frames(source, made, prepared, seed=subject, sensor=sensor)
         logits = net(seen.frames, source.architecture).mask_logits
         for column, slip in enumerate(slips):
             ax = axes[subject, column]
@@ -64,15 +66,15 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
             ax.grid(visible=False)
             if subject == 0:
                 ax.set_title(f"dx {slip[0]:g}, dz {slip[2]:g}", fontsize=7)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def ambiguity(result: Result) -> bytes:
+def plot_ambiguity(result: RunResult) -> bytes:
     """Fig. 10: pupil centres of all stimuli under axial and lateral slippage, and their
     means with ranges.
     """
     trial, percent = result.trial, result.centre * 100
-    figure, axes = report.canvas(1, 3, size=(10.5, 3.2))
+    figure, axes = report.make_figure(1, 3, size=(10.5, 3.2))
     for ax, kind, along in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
         keep = trial.group(kind)
         dots = ax.scatter(
@@ -104,14 +106,14 @@ def ambiguity(result: Result) -> bytes:
     )
     axes[2].invert_yaxis()
     axes[2].legend(fontsize=6)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def errors(results: Sequence[Result]) -> bytes:
+def plot_gaze_errors(results: Sequence[RunResult]) -> bytes:
     """Fig. 11: mean gaze error at every stimulus, as the size of its marker, under
     axial and lateral slippage.
     """
-    figure, axes = report.canvas(1, 2, size=(10.5, 3.8))
+    figure, axes = report.make_figure(1, 2, size=(10.5, 3.8))
     for ax, kind in zip(axes, (AXIAL, LATERAL), strict=True):
         for i, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
             trial, shift = result.trial, (i - (len(results) - 1) / 2) * 1.1
@@ -143,4 +145,4 @@ def errors(results: Sequence[Result]) -> bytes:
             ncols=len(results),
             fontsize=7,
         )
-    return report.png(figure)
+    return report.figure_png(figure)

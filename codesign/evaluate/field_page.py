@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from metalens.aberrations import OverField, frequencies_per_mm, over_field
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
-from metalens.ground.report import Table, canvas, png
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
+from metalens.core.report import Table, figure_png, make_figure
 from metalens.lens import Lens
 
 CAPTIONS = {
@@ -68,7 +68,7 @@ class FieldSetting:
         )
 
 
-def values(found: OverField) -> dict[str, Any]:
+def field_values(found: OverField) -> dict[str, Any]:
     """Every number of one lens, ready for JSON: None where there is none."""
     arrays = {
         name: _plain(np.asarray(getattr(found, name)))
@@ -84,7 +84,7 @@ def _plain(array: Array) -> Any:
     return float(array) if math.isfinite(array) else None
 
 
-def tables(seen: Mapping[str, OverField]) -> list[Table]:
+def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
     """Rays and light over the field angle, and the MTF."""
     head = (
         "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
@@ -132,9 +132,9 @@ def _told(value: float, digits: int) -> str:
     return shown.removeprefix("-") if float(shown) == 0 else shown
 
 
-def picture(seen: Mapping[str, OverField]) -> bytes:
+def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
     """Distortion, foci and light over the field angle."""
-    figure, panels = canvas(1, 3, size=(10.5, 3.4))
+    figure, panels = make_figure(1, 3, size=(10.5, 3.4))
     for name, one in seen.items():
         order = np.argsort(one.angles_deg)
         angle = one.angles_deg[order]
@@ -163,13 +163,13 @@ def picture(seen: Mapping[str, OverField]) -> bytes:
     panels[0].legend(fontsize=7)
     for panel in panels:
         panel.set_xlabel("field angle / °")
-    return png(figure)
+    return figure_png(figure)
 
 
 def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
     """MTF over the field angle, a panel for each frequency."""
     frequencies = next(iter(seen.values())).frequencies_per_mm
-    figure, panels = canvas(
+    figure, panels = make_figure(
         1,
         len(frequencies),
         size=(1 + 3.2 * len(frequencies), 3.2),
@@ -190,4 +190,4 @@ def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
         )
     panels[0, 0].set_ylabel("modulation")
     panels[0, 0].legend(fontsize=7)
-    return png(figure)
+    return figure_png(figure)

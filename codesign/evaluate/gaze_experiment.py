@@ -18,37 +18,37 @@ from typing import Literal
 import numpy as np
 import torch
 
-from codesign.adapt import Source
+from codesign.adapt import FinishedRun
 from codesign.adapt import train as retraining
-from codesign.batches import EXPERIMENT, EyeScenes, as_batch, irradiance
+from codesign.batches import EXPERIMENT, EyeScenes, as_batch, sensor_irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
 from codesign.evaluate.shown import ExperimentConfig
-from codesign.evaluate.shown import Result as Result
-from codesign.evaluate.shown import Trial as Trial
+from codesign.evaluate.shown import ExperimentTrials as ExperimentTrials
+from codesign.evaluate.shown import RunResult as RunResult
 from codesign.eye import (
     POPULATION,
-    Rendered,
-    Rig,
-    States,
+    CameraRig,
+    EyeStates,
+    RenderedFrames,
     drawn_of_people,
     render_dressed,
 )
 from codesign.eye import population as eye
 from codesign.gaze import (
-    Calibrator,
-    Person,
-    Readings,
-    Sphere,
+    CalibratedPerson,
+    NetworkReadings,
+    PersonCalibrator,
+    SphereCalibrator,
     angle_deg,
     face_angles,
     shared,
 )
-from codesign.network import losses, recalibrate
+from codesign.network import losses, recalibrate_batch_norm
 from codesign.optics import formed
-from codesign.train import Answers, Seen, assess, frame_wide, read_out
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, PropagationError, SceneError
+from codesign.train import Predictions, SensorFrames, assess, frame_wide, read_out
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, PropagationError, SceneError
 from metalens.image import Imager, Sensor, UniformImager, low_snr
 
 # streams of the random generator
@@ -64,7 +64,7 @@ BEFORE, EACH = (
 
 def states_of(
     config: ExperimentConfig, subject: int, scenes: EyeScenes
-) -> tuple[States, Trial]:
+) -> tuple[EyeStates, ExperimentTrials]:
     """All frames of one subject: slippage states outermost, stimuli within.
 
     Raises:
@@ -79,7 +79,7 @@ def states_of(
         )
     n = len(stimuli) * len(slips)
     rng = np.random.default_rng([config.seed, subject, LOOKS])
-    person = eye.draw(
+    person = eye.draw_states(
         1,
         (config.seed, PEOPLE, subject),
         motion=replace(scenes.settings.motion, scale=0.0),
@@ -106,13 +106,15 @@ def states_of(
             np.clip(1 + 0.05 * rng.standard_normal(n), 0.8, 1.15)
         ),
     )
-    trial = Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
+    trial = ExperimentTrials(
+        np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state]
+    )
     return turned_to(states, looks, scenes.rig), trial
 
 
 def render_subject(
-    states: States, config: ExperimentConfig, subject: int, scenes: EyeScenes
-) -> Rendered:
+    states: EyeStates, config: ExperimentConfig, subject: int, scenes: EyeScenes
+) -> RenderedFrames:
     """Frames of one subject with the variety of training, worn by a person: spectacles
     and make-up stay on from frame to frame, before the stage's own camera.
     """
@@ -123,7 +125,7 @@ def render_subject(
     return render_dressed(states, worn, rig=scenes.rig, camera=scenes.camera)
 
 
-def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
+def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
     """States whose visual axes point along angles (n, 2) across and down, in the frame
     of the face: to 1e-5 degrees.
 
@@ -139,7 +141,7 @@ def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
     )
     for _ in range(TURNS):
         miss = looks_deg - face_angles(
-            eye.directions(found, rig)[1].numpy(), rig.elevation_rad
+            eye.eye_axes(found, rig)[1].numpy(), rig.elevation_rad
         )
         found = replace(
             found, gaze_rad=found.gaze_rad + torch.from_numpy(np.radians(miss))
@@ -147,25 +149,25 @@ def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
     return replace(found, mount_rad=states.mount_rad)
 
 
-def through(
-    source: Source,
-    made: Rendered,
+def image_frames(
+    source: FinishedRun,
+    made: RenderedFrames,
     prepared: UniformImager | Imager,
     *,
     seed: int,
     sensor: Sensor | None = None,
     quiet: bool = False,
-) -> Seen:
+) -> SensorFrames:
     """Rendered frames through a run's lens and sensor, with noise of a seed or
     ``quiet``.
 
     Args:
-        sensor: of :func:`lighting`; the run's own without it.
+        sensor: of :func:`experiment_sensors`; the run's own without it.
     """
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
-    light = irradiance(batch.frames, prepared, margin=margin)
+    light = sensor_irradiance(batch.frames, prepared, margin=margin)
     noise = torch.Generator().manual_seed(seed)
     pitch = trainer.model.pitch_um
     pixels = read_out(
@@ -177,16 +179,18 @@ def through(
         quiet=quiet,
     )
     wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
-    return Seen(
+    return SensorFrames(
         pixels,
-        losses.framed(batch.mask, wide),
+        losses.mask_in_frame(batch.mask, wide),
         batch.slip_mm,
         trainer.inner.batch,
         wide=wide,
     )
 
 
-def lighting(sources: Sequence[Source], config: ExperimentConfig) -> list[Sensor]:
+def experiment_sensors(
+    sources: Sequence[FinishedRun], config: ExperimentConfig
+) -> list[Sensor]:
     """Every run's sensor in the light of the experiment.
 
     Dim light is one exposure and one background for all runs: those at which a pixel of
@@ -222,12 +226,12 @@ def lighting(sources: Sequence[Source], config: ExperimentConfig) -> list[Sensor
 
 
 @torch.no_grad()
-def experiment(
-    sources: Sequence[Source],
+def run_experiment(
+    sources: Sequence[FinishedRun],
     config: ExperimentConfig,
     *,
     names: Sequence[str] | None = None,
-) -> Iterator[tuple[int, list[Result]]]:
+) -> Iterator[tuple[int, list[RunResult]]]:
     """Run the experiment, subject by subject.
 
     Yields:
@@ -241,15 +245,15 @@ def experiment(
     """
     _check(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
-    trials: list[Trial] = []
+    trials: list[ExperimentTrials] = []
     visible: list[Array] = []
-    answers: list[list[Answers]] = [[] for _ in sources]
-    on_fine: list[list[Answers]] = [[] for _ in sources]
-    prepared = [ready(source, image=config.image) for source in sources]
+    answers: list[list[Predictions]] = [[] for _ in sources]
+    on_fine: list[list[Predictions]] = [[] for _ in sources]
+    prepared = [prepare_run(source, image=config.image) for source in sources]
     fine = [finer_imager(source) for source in sources]
-    sensors = lighting(sources, config)
+    sensors = experiment_sensors(sources, config)
     how = [
-        calibrator(source, imager, config, sensor)
+        run_calibrator(source, imager, config, sensor)
         for source, imager, sensor in zip(sources, prepared, sensors, strict=True)
     ]
     for subject in range(config.subjects):
@@ -264,14 +268,16 @@ def experiment(
         for kept, source, imager, sensor in each:
             if imager is None:
                 continue
-            seen = through(source, made, imager, seed=NOISE + subject, sensor=sensor)
+            seen = image_frames(
+                source, made, imager, seed=NOISE + subject, sensor=sensor
+            )
             kept.append(_answers(source, seen))
         if subject + 1 < config.subjects:
             yield subject + 1, []
-    whole = joined(trials)
+    whole = join_subjects(trials)
     labels = names or [f"run {i + 1}" for i in range(len(sources))]
     above = [
-        formed.above(source.run.trainer.optics, one)
+        formed.image_tolerance_problem(source.run.trainer.optics, one)
         for source, one in zip(sources, prepared, strict=True)
     ]
     seen_mm, results = np.concatenate(visible), []
@@ -286,20 +292,23 @@ def experiment(
     yield config.subjects, results
 
 
-def _answers(source: Source, seen: Seen) -> Answers:
-    return assess.predict(
+def _answers(source: FinishedRun, seen: SensorFrames) -> Predictions:
+    return assess.predict_frames(
         source.run.trainer.model.net, source.architecture, seen, source.settings.inner
     )
 
 
-def joined(trials: Sequence[Trial]) -> Trial:
+def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
     """Frames of several subjects, one after the other."""
-    return Trial(
-        *(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__)
+    return ExperimentTrials(
+        *(
+            np.concatenate([getattr(t, f) for t in trials])
+            for f in ExperimentTrials.__slots__
+        )
     )
 
 
-def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
+def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
     if not sources:
         raise ConfigError("no run to evaluate; give one run folder or more")
     views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
@@ -322,8 +331,8 @@ def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
             )
 
 
-def ready(
-    source: Source, *, image: Literal["true", "trained"] = "true"
+def prepare_run(
+    source: FinishedRun, *, image: Literal["true", "trained"] = "true"
 ) -> UniformImager | Imager:
     """The imager of a run's lens, of a retraining the made one; its network set to
     statistics of training frames, as
@@ -336,13 +345,13 @@ def ready(
     trainer = source.run.trainer
     if source.made is None:
         measured = assess.training_frames(trainer)
-        recalibrate(trainer.model.net, source.architecture, measured)
+        recalibrate_batch_norm(trainer.model.net, source.architecture, measured)
     else:
-        retraining.settle(trainer, source)
+        retraining.recalibrate_on_lenses(trainer, source)
     settings, scenes = trainer.optics, source.settings.scenes
     seen = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
-    return formed.imager(
+    return formed.make_imager(
         seen,
         trainer.model.coefficients_rad,
         size,
@@ -351,16 +360,16 @@ def ready(
     )
 
 
-def finer_imager(source: Source) -> Imager | None:
+def finer_imager(source: FinishedRun) -> Imager | None:
     """The true image of a run's lens at a quarter of the run's tolerance; None where it
     cannot be formed so precisely, or the run was trained on a uniform image.
     """
-    settings = assess.finer(source.run.trainer.optics)
+    settings = assess.finer_image(source.run.trainer.optics)
     if settings is None:
         return None
     scenes = source.settings.scenes
     try:
-        made = formed.imager(
+        made = formed.make_imager(
             settings,
             source.run.trainer.model.coefficients_rad,
             scenes.pixels + 2 * scenes.margin,
@@ -372,18 +381,22 @@ def finer_imager(source: Source) -> Imager | None:
     return made if isinstance(made, Imager) else None
 
 
-def sphere(source: Source, config: ExperimentConfig) -> Sphere:
+def sphere_calibrator(
+    source: FinishedRun, config: ExperimentConfig
+) -> SphereCalibrator:
     """Calibrates before a run's camera by pupil and slippage alone."""
-    return Sphere(source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed)
+    return SphereCalibrator(
+        source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed
+    )
 
 
 @torch.no_grad()
-def calibrator(
-    source: Source,
+def run_calibrator(
+    source: FinishedRun,
     imager: UniformImager | Imager,
     config: ExperimentConfig,
     sensor: Sensor,
-) -> Calibrator:
+) -> PersonCalibrator:
     """How people are calibrated whom a run's network reads: by what people have in
     common, if it tells the axis.
 
@@ -406,16 +419,20 @@ def calibrator(
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
         some = states[torch.from_numpy(rows)]
         made = render_subject(some, theirs, BEFORE + person, scenes)
-        seen = through(source, made, imager, seed=2 * NOISE + person, sensor=sensor)
+        seen = image_frames(
+            source, made, imager, seed=2 * NOISE + person, sensor=sensor
+        )
         found.append(_answers(source, seen))
         looked.append(trial.stimulus_deg[rows])
         if found[0].axis is None:
-            return sphere(source, config)
+            return sphere_calibrator(source, config)
     who = np.repeat(np.arange(config.people), [len(one) for one in looked])
-    return shared.learn(read_from(found, source), np.concatenate(looked), who)
+    return shared.learn_population(
+        read_from(found, source), np.concatenate(looked), who
+    )
 
 
-def read_from(kept: Sequence[Answers], source: Source) -> Readings:
+def read_from(kept: Sequence[Predictions], source: FinishedRun) -> NetworkReadings:
     """A run's answers to frames one after the other, in the units that gaze is
     calibrated in.
     """
@@ -426,21 +443,24 @@ def read_from(kept: Sequence[Answers], source: Source) -> Readings:
     axes = [a.axis for a in kept if a.axis is not None]
     tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
     angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
-    return Readings(centre * source.run.window_um * 1e-3, slip, angles)
+    return NetworkReadings(centre * source.run.window_um * 1e-3, slip, angles)
 
 
 def _result(
     name: str,
-    source: Source,
-    kept: list[Answers],
-    trial: Trial,
+    source: FinishedRun,
+    kept: list[Predictions],
+    trial: ExperimentTrials,
     config: ExperimentConfig,
-    how: Calibrator,
-) -> Result:
+    how: PersonCalibrator,
+) -> RunResult:
     read = read_from(kept, source)
-    predicted, judged = calibrated(read, trial, config, how)
-    told, _ = calibrated(
-        replace(read, slip_mm=trial.slip_mm), trial, config, sphere(source, config)
+    predicted, judged = calibrated_gaze(read, trial, config, how)
+    told, _ = calibrated_gaze(
+        replace(read, slip_mm=trial.slip_mm),
+        trial,
+        config,
+        sphere_calibrator(source, config),
     )
     error, told_error = (
         np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
@@ -451,7 +471,7 @@ def _result(
         torch.cat([getattr(a, f) for a in kept]).double().numpy()
         for f in ("centre", "iou")
     )
-    return Result(
+    return RunResult(
         name,
         mmacs,
         trial,
@@ -466,28 +486,40 @@ def _result(
     )
 
 
-def calibrated(
-    read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator
+def calibrated_gaze(
+    read: NetworkReadings,
+    trial: ExperimentTrials,
+    config: ExperimentConfig,
+    how: PersonCalibrator,
 ) -> tuple[Array, Array]:
     """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that
     it never saw.
     """
-    judged = ~np.isin(np.arange(len(read)), calibrating(trial, config))
-    return answered(taught(read, trial, config, how), read, trial), judged
+    judged = ~np.isin(np.arange(len(read)), calibration_frames(trial, config))
+    return predicted_gaze(
+        calibrate_subjects(read, trial, config, how), read, trial
+    ), judged
 
 
-def taught(
-    read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator
-) -> dict[int, Person]:
-    """Every subject's calibration by number, on the stimuli of :func:`calibrating`."""
-    known = calibrating(trial, config)
+def calibrate_subjects(
+    read: NetworkReadings,
+    trial: ExperimentTrials,
+    config: ExperimentConfig,
+    how: PersonCalibrator,
+) -> dict[int, CalibratedPerson]:
+    """Every subject's calibration by number, on the stimuli of :func:`calibration_frames`."""
+    known = calibration_frames(trial, config)
     mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
     return {
         s: how.person(read[rows], trial.stimulus_deg[rows]) for s, rows in mine.items()
     }
 
 
-def answered(people: Mapping[int, Person], read: Readings, trial: Trial) -> Array:
+def predicted_gaze(
+    people: Mapping[int, CalibratedPerson],
+    read: NetworkReadings,
+    trial: ExperimentTrials,
+) -> Array:
     """(n, 2) gaze of frames, each by its subject's calibration."""
     predicted = np.empty((len(read), 2))
     for subject in np.unique(trial.subject):
@@ -496,7 +528,7 @@ def answered(people: Mapping[int, Person], read: Readings, trial: Trial) -> Arra
     return predicted
 
 
-def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
+def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Array:
     """Numbers of the frames that subjects are calibrated on: a share of their stimuli,
     in every slippage state.
     """
@@ -507,7 +539,7 @@ def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
         rng = np.random.default_rng([config.seed, int(subject), POINTS])
         count = round(config.share * len(points))
         if config.points == "spread":
-            chosen = spread(
+            chosen = farthest_points(
                 config.stimuli_deg[points], count, first=int(rng.integers(len(points)))
             )
         else:
@@ -516,7 +548,7 @@ def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
     return np.concatenate(known)
 
 
-def spread(places: Array, count: int, *, first: int) -> Array:
+def farthest_points(places: Array, count: int, *, first: int) -> Array:
     """(count,) numbers of places (n, 2) that cover them: each next one is the farthest
     from all before it.
     """

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from codesign.eye import Camera, Rendered, Rig
-from metalens.ground import report, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import SceneError
-from metalens.ground.store import Provenance
+from codesign.eye import CameraRig, PinholeCamera, RenderedFrames
+from metalens.core import report, store
+from metalens.core.arrays import Array
+from metalens.core.errors import SceneError
+from metalens.core.store import Provenance
 from metalens.image import Grid, Imager, imager
 from metalens.lens import Lens
 from metalens.psf import Source, spectrum
@@ -27,7 +27,7 @@ NODES = 3  # PSFs that are kept along x, y and depth: first, middle, last
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Imaged:
+class ImagedFrames:
     """Frames and their images.
 
     scene, image: (frames, y, x), the image scaled to the light of the scenes. psf:
@@ -60,7 +60,7 @@ def margin_of(pitch_um: float) -> int:
 
 def lens_imager(
     lens: Lens,
-    camera: Camera,
+    camera: PinholeCamera,
     depths_um: tuple[float, float],
     *,
     fwhm_nm: float = 0.0,
@@ -90,14 +90,14 @@ def source_of(lens: Lens, fwhm_nm: float) -> Source | None:
 
 
 @torch.no_grad()
-def imaged(
+def image_first_frames(
     lens: Lens,
-    camera: Camera,
-    rig: Rig,
-    rendered: Callable[[Camera, Rig], Rendered],
+    camera: PinholeCamera,
+    rig: CameraRig,
+    rendered: Callable[[PinholeCamera, CameraRig], RenderedFrames],
     *,
     fwhm_nm: float = 0.0,
-) -> Imaged:
+) -> ImagedFrames:
     """Image the first frames.
 
     Args:
@@ -113,7 +113,7 @@ def imaged(
             imaged over this field to 3 %, see :func:`metalens.image.imager`.
     """
     margin = margin_of(camera.pitch_um)
-    wide = Camera(camera.pixels + 2 * margin, camera.pitch_um)
+    wide = PinholeCamera(camera.pixels + 2 * margin, camera.pitch_um)
     made = rendered(wide, replace(rig, sensor_distance_um=lens.reduced_um))
     seen = made.frames.depth_um[made.frames.coverage > 0]
     if float(seen.min()) <= 0:
@@ -135,7 +135,7 @@ def imaged(
     )
     psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
     y_um, x_um = optics.plan.y_um.numpy()[rows], optics.plan.x_um.numpy()[columns]
-    return Imaged(
+    return ImagedFrames(
         plain.numpy().astype(np.float32),
         (light * (plain.sum() / light.sum())).numpy().astype(np.float32),
         psf.numpy().astype(np.float32),
@@ -145,12 +145,14 @@ def imaged(
         camera.pitch_um,
         optics.error,
         {name: float(value) for name, value in optics.parts.items()},
-        spectrum.beyond(source_of(lens, fwhm_nm), lens.proxy.wavelengths_um),
+        spectrum.outside_library_text(
+            source_of(lens, fwhm_nm), lens.proxy.wavelengths_um
+        ),
         optics.above(TOLERANCE),
     )
 
 
-def write(folder: Path, found: Imaged, about: Provenance) -> None:
+def write_images(folder: Path, found: ImagedFrames, about: Provenance) -> None:
     """image.h5 (kind ``image``) and image.png."""
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
     arrays = {name: np.asarray(getattr(found, name)) for name in names}
@@ -158,12 +160,12 @@ def write(folder: Path, found: Imaged, about: Provenance) -> None:
         f"error_{k}": v for k, v in found.parts.items()
     }
     store.save(folder / "image.h5", "image", arrays, attributes=said, provenance=about)
-    store.write_bytes(folder / "image.png", picture(found))
+    store.write_bytes(folder / "image.png", plot_image(found))
 
 
-def picture(found: Imaged) -> bytes:
+def plot_image(found: ImagedFrames) -> bytes:
     """The first frame: scene, image, and what the lens took away and added."""
-    figure, axes = report.canvas(1, 3, size=(9.6, 3.3))
+    figure, axes = report.make_figure(1, 3, size=(9.6, 3.3))
     apart = found.image[0] - found.scene[0]
     top, most = float(found.scene[0].max()), float(np.abs(apart).max())
     half = found.pitch_um * len(apart) / 2000
@@ -175,4 +177,4 @@ def picture(found: Imaged) -> bytes:
         one.set(title=title, xlabel="x on the sensor / mm")
         one.grid(visible=False)
     figure.colorbar(last, ax=axes[2], label="light, as of the scene")
-    return report.png(figure)
+    return report.figure_png(figure)

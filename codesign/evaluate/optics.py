@@ -12,9 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import Camera, Rendered, Rig, States, Triplets, triplets
+from codesign.eye import (
+    CameraRig,
+    EyeStates,
+    PinholeCamera,
+    RenderedFrames,
+    SeparabilityTriplets,
+    render_triplets,
+)
 from codesign.optics import formed
-from metalens.ground.errors import ConfigError, SceneError
+from metalens.core.errors import ConfigError, SceneError
 from metalens.image import (
     Grid,
     Imager,
@@ -31,7 +38,7 @@ WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class MeasurementSettings:
     """How lenses are measured.
 
     depths_mm, count: of I(z); left out, the depths over which the first lens goes from
@@ -83,7 +90,7 @@ class Setting:
                 f"{self.radius_um}: need lengths above 0, and a window of four samples or more"
             )
 
-    def about(self, lens: Lens) -> "Filled":
+    def about(self, lens: Lens) -> "ResolvedSettings":
         """These with what was left to the lens."""
         near, far = (
             (1e3 * z for z in self.depths_mm)
@@ -103,12 +110,12 @@ class Setting:
             "sample_um": sample,
             "window_um": max(4, round(window / sample)) * sample,
         }
-        return Filled(**own, step_um=reach.depth_step_um(lens, near))
+        return ResolvedSettings(**own, step_um=reach.depth_step_um(lens, near))
 
 
 @dataclass(frozen=True, slots=True)
-class Filled(Setting):
-    """A :class:`Setting` with nothing left to the lens. step_um: of the difference in
+class ResolvedSettings(MeasurementSettings):
+    """A :class:`MeasurementSettings` with nothing left to the lens. step_um: of the difference in
     Eq. 11.
     """
 
@@ -121,7 +128,7 @@ class Filled(Setting):
 
 
 @dataclass(frozen=True, slots=True)
-class Scenes:
+class SensitivityScenes:
     """What the sensitivity of whole scenes is measured on.
 
     count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the
@@ -161,7 +168,7 @@ class Scenes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Axial:
+class AxialInformation:
     """Honest axial information of one lens.
 
     information: (angles, binnings, depths) per mm², over sub-pixel positions.
@@ -178,14 +185,20 @@ class Axial:
     slices: Tensor
 
 
-def axial(lens: Lens, setting: Setting | None = None) -> Axial:
+def measure_axial_information(
+    lens: Lens, setting: MeasurementSettings | None = None
+) -> AxialInformation:
     """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the
     PSF engine.
 
     What the setting leaves out is that of this lens: to compare lenses, take
     :meth:`Setting.about` of one.
     """
-    s = setting if isinstance(setting, Filled) else (setting or Setting()).about(lens)
+    s = (
+        setting
+        if isinstance(setting, ResolvedSettings)
+        else (setting or MeasurementSettings()).about(lens)
+    )
     depths = np.linspace(1e3 * s.depths_mm[0], 1e3 * s.depths_mm[1], s.count)
     both = np.sort(np.concatenate([depths, depths + s.step_um]))
     samples = round(s.window_um / s.sample_um)
@@ -217,7 +230,7 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
     )
     inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
     slices = intensity[0, 0].sum(1)
-    return Axial(
+    return AxialInformation(
         torch.stack(values, 1),
         inside * share.clamp(max=1.0),
         float(stack.error),
@@ -284,7 +297,7 @@ class SceneEnergy:
 
 
 def scene_energies(
-    lenses: Sequence[Lens], states: States, settings: Scenes | None = None
+    lenses: Sequence[Lens], states: EyeStates, settings: SensitivityScenes | None = None
 ) -> list[SceneEnergy]:
     """Table 1: how much the images of the same scenes change with gaze and with axial
     slip.
@@ -298,7 +311,7 @@ def scene_energies(
     """
     if not lenses:
         raise SceneError("no lens to evaluate; give at least one")
-    settings = settings or Scenes()
+    settings = settings or SensitivityScenes()
     distance = lenses[0].reduced_um
     for number, lens in enumerate(lenses):
         if abs(lens.reduced_um / distance - 1) > 1e-3:
@@ -328,7 +341,9 @@ def scene_energies(
     return out
 
 
-def lens_imager(lens: Lens, views: Sequence[Rendered], settings: Scenes) -> Imager:
+def lens_imager(
+    lens: Lens, views: Sequence[RenderedFrames], settings: SensitivityScenes
+) -> Imager:
     """The true image of a lens at one wavelength, on the pixels of the scenes and over
     the depths that they hold.
     """
@@ -337,28 +352,31 @@ def lens_imager(lens: Lens, views: Sequence[Rendered], settings: Scenes) -> Imag
     return imager(lens, grid, layers=lens.layers, tolerance=settings.image_tolerance)
 
 
-def depths_of(views: Sequence[Rendered]) -> tuple[float, float]:
+def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
     """Nearest and farthest surface that is seen, um."""
     seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
     return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
 def scene_views(
-    states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0
-) -> Triplets:
+    states: EyeStates,
+    settings: SensitivityScenes,
+    *,
+    sensor_distance_um: float = 2000.0,
+) -> SeparabilityTriplets:
     """Anchor, gaze and slip views of the states."""
-    return triplets(
+    return render_triplets(
         states,
         gaze_step_rad=math.radians(settings.gaze_step_deg),
         slip_step_um=1e3 * settings.slip_step_mm,
-        rig=replace(Rig(), sensor_distance_um=sensor_distance_um),
-        camera=Camera(settings.pixels, settings.pitch_um),
+        rig=replace(CameraRig(), sensor_distance_um=sensor_distance_um),
+        camera=PinholeCamera(settings.pixels, settings.pitch_um),
     )
 
 
 def energies_of(
     optics: scene.UniformImager | Imager,
-    views: Triplets,
+    views: SeparabilityTriplets,
     *,
     light: float = 1.0,
     image_error: float = math.nan,
@@ -384,7 +402,7 @@ def energies_of(
 
 def lens_basis(
     lens: Lens,
-    views: Sequence[Rendered],
+    views: Sequence[RenderedFrames],
     *,
     pitch_um: float,
     window_um: float = 288.0,

@@ -13,8 +13,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import config
-from metalens.ground.errors import StoreError
+from metalens.core import config
+from metalens.core.errors import StoreError
 
 ROLES = (
     "proposed",
@@ -25,7 +25,7 @@ ROLES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class PaperClaim:
     """A number or picture of the paper.
 
     place: table, figure or section. value: nan where the paper prints a picture only.
@@ -48,14 +48,14 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class Claims:
+class PaperClaims:
     """The content of claims.toml."""
 
-    claim: tuple[Claim, ...]
+    claim: tuple[PaperClaim, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredNumber:
     """A number of ours with its 95 % interval (nan: none) and the conditions that it
     holds for.
     """
@@ -67,14 +67,14 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class ClaimLine:
     """A claim and what stands beside it.
 
     ours: None where it was not measured. picture: file of ours, '' for none.
     """
 
-    claim: Claim
-    ours: Measured | None
+    claim: PaperClaim
+    ours: MeasuredNumber | None
     picture: str = ""
 
     @property
@@ -110,27 +110,29 @@ class Line:
         return c.place, c.what, paper, f"{self.ours.value:.3g}{span}", ratio, conditions
 
 
-def claims() -> tuple[Claim, ...]:
+def load_claims() -> tuple[PaperClaim, ...]:
     """Every claim, in the order of the paper."""
     text = (
         resources.files("codesign")
         .joinpath("data", "claims.toml")
         .read_text(encoding="utf-8")
     )
-    return config.loads(text, Claims, where="claims.toml").claim
+    return config.loads(text, PaperClaims, where="claims.toml").claim
 
 
-def lines(measured: Mapping[str, Measured], folder: Path | None = None) -> list[Line]:
+def claim_lines(
+    measured: Mapping[str, MeasuredNumber], folder: Path | None = None
+) -> list[ClaimLine]:
     """Every claim beside what was measured; pictures are looked for in ``folder``."""
     out = []
-    for claim in claims():
+    for claim in load_claims():
         name = claim.key.removeprefix("picture/")
         there = claim.picture and folder is not None and (folder / name).is_file()
-        out.append(Line(claim, measured.get(claim.key), name if there else ""))
+        out.append(ClaimLine(claim, measured.get(claim.key), name if there else ""))
     return out
 
 
-def of_experiment(path: Path) -> dict[str, Measured]:
+def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     """Measurements in an experiment.json whose runs are named by :data:`ROLES`.
 
     Raises:
@@ -138,7 +140,7 @@ def of_experiment(path: Path) -> dict[str, Measured]:
     """
     told = _json(path, "runs", "ratios", "settings")
     about = told["settings"]
-    found: dict[str, Measured] = {}
+    found: dict[str, MeasuredNumber] = {}
     for run in told["runs"]:
         words = f"{about['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {about['seed']}"
         for key, name in (
@@ -149,7 +151,9 @@ def of_experiment(path: Path) -> dict[str, Measured]:
         ):
             low, high = run.get(f"{name}_interval", (math.nan, math.nan))
             if run[name] is not None:  # a network without a mask has no overlap
-                found[f"{key}/{run['name']}"] = Measured(run[name], low, high, words)
+                found[f"{key}/{run['name']}"] = MeasuredNumber(
+                    run[name], low, high, words
+                )
     for entry in told["ratios"]:
         if entry["against"] != "hyperbolic":
             continue
@@ -160,13 +164,13 @@ def of_experiment(path: Path) -> dict[str, Measured]:
         ):
             if entry["quantity"] == name:
                 low, high = entry["interval"]
-                found[f"{key}/ratio"] = Measured(
+                found[f"{key}/ratio"] = MeasuredNumber(
                     entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
                 )
     return found
 
 
-def of_dim(bright: Path, dim: Path) -> dict[str, Measured]:
+def of_dim(bright: Path, dim: Path) -> dict[str, MeasuredNumber]:
     """The 15 dB test from an experiment in good light and one in dim light.
 
     Raises:
@@ -179,18 +183,18 @@ def of_dim(bright: Path, dim: Path) -> dict[str, Measured]:
     words = "gaze under axial slip, networks trained in good light"
     found = {}
     if "proposed" in poor:
-        found["dim/proposed"] = Measured(
+        found["dim/proposed"] = MeasuredNumber(
             poor["proposed"] / good["proposed"], conditions=words
         )
         for name in ("hyperbolic", "double_helix"):
             if name in poor:
-                found[f"dim/{name}"] = Measured(
+                found[f"dim/{name}"] = MeasuredNumber(
                     poor[name] / poor["proposed"], conditions=words
                 )
     return found
 
 
-def of_optics(path: Path) -> dict[str, Measured]:
+def of_optics(path: Path) -> dict[str, MeasuredNumber]:
     """Measurements in an optics.json whose lenses are named by :data:`ROLES`,
     hyperbolic first.
 
@@ -198,11 +202,11 @@ def of_optics(path: Path) -> dict[str, Measured]:
         StoreError: no such file, or of another version.
     """
     told = _json(path, "lenses", "angles_deg", "normalisation")
-    found: dict[str, Measured] = {}
+    found: dict[str, MeasuredNumber] = {}
     base = told["lenses"].get("hyperbolic")
     for name, values in told["lenses"].items():
         for kind, (value, low, high) in values["scene_ratios"].items():
-            found[f"scenes/{kind}/{name}"] = Measured(
+            found[f"scenes/{kind}/{name}"] = MeasuredNumber(
                 value, low, high, "same states, images of equal light"
             )
         if base is None:
@@ -212,13 +216,13 @@ def of_optics(path: Path) -> dict[str, Measured]:
             words = (
                 f"honest I(z), {told['normalisation']} normalisation, pixels not binned"
             )
-            found[f"information/{angle:g}/{name}"] = Measured(
+            found[f"information/{angle:g}/{name}"] = MeasuredNumber(
                 one / other, conditions=words
             )
     return found
 
 
-def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, Measured]:
+def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumber]:
     """Fig. 8 a from the rows of result.json of the proposed and the hyperbolic run:
     errors at equal budgets.
     """
@@ -234,7 +238,7 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, Measured]:
     least = shared[0]
     error = ours[least]["axial_slip_mm"] / theirs[least]["axial_slip_mm"]
     found = {
-        "fig8a/error": Measured(
+        "fig8a/error": MeasuredNumber(
             error, conditions=f"axial slippage at {ours[least]['mmacs']:.1f} MMACs"
         )
     }
@@ -242,7 +246,7 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, Measured]:
     best = min(r["mmacs"] for r in theirs.values() if r["axial_slip_mm"] == goal)
     enough = [r["mmacs"] for r in ours.values() if r["axial_slip_mm"] <= goal]
     if enough:
-        found["fig8a/compute"] = Measured(
+        found["fig8a/compute"] = MeasuredNumber(
             min(enough) / best, conditions=f"axial slippage of {goal:.2f} mm or less"
         )
     return found

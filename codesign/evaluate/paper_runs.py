@@ -15,13 +15,13 @@ import torch
 from codesign.adapt import restore_weights
 from codesign.adapt import train as retraining
 from codesign.batches import CALIBRATION, TEST
-from codesign.evaluate.paper import Measured
-from codesign.gaze import Readings
+from codesign.evaluate.paper import MeasuredNumber
+from codesign.gaze import NetworkReadings
 from codesign.gaze import bench as gaze_test
-from codesign.network import Architecture, recalibrate
-from codesign.train import Run, Seen, assess
+from codesign.network import Architecture, recalibrate_batch_norm
+from codesign.train import CodesignRun, SensorFrames, assess
 from codesign.train import run as runs
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 
 PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
 # other people of as many frames, whose gaze tells what an axis that is read means
@@ -30,13 +30,13 @@ WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class RunKind:
     """What a finished run was: which parts did not move."""
 
     frozen: tuple[str, ...]
 
 
-def kind_of(folder: Path) -> Kind:
+def kind_of(folder: Path) -> RunKind:
     """Read from result.json.
 
     Raises:
@@ -44,7 +44,7 @@ def kind_of(folder: Path) -> Kind:
     """
     retraining.rows_of(folder)  # refuses what is missing, cut short or empty
     told = json.loads((folder / "result.json").read_text("utf-8"))
-    return Kind(tuple(told.get("frozen", ())))
+    return RunKind(tuple(told.get("frozen", ())))
 
 
 def image_tolerance(folders: Sequence[Path]) -> float:
@@ -52,12 +52,13 @@ def image_tolerance(folders: Sequence[Path]) -> float:
     of them is imaged at.
     """
     return max(
-        runs.load(folder / "run.toml").optics.image_tolerance for folder in folders
+        runs.load_run_settings(folder / "run.toml").optics.image_tolerance
+        for folder in folders
     )
 
 
 @torch.no_grad()
-def gaze(
+def gaze_errors(
     folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5
 ) -> list[dict[str, Any]]:
     """Gaze errors of every network of a finished run on people whom training never saw;
@@ -66,8 +67,8 @@ def gaze(
     Raises:
         TrainingError: no finished run, half written, or of another version.
     """
-    settings = runs.load(folder / "run.toml")
-    going = runs.resume(folder / "checkpoint.safetensors", settings)
+    settings = runs.load_run_settings(folder / "run.toml")
+    going = runs.resume_run(folder / "checkpoint.safetensors", settings)
     shown = _shown(going, TEST, people, each, seed)
     before = functools.cache(lambda: _shown(going, CALIBRATION, BEFORE, each, seed + 1))
     known = assess.training_frames(going.trainer)
@@ -75,10 +76,12 @@ def gaze(
     for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
         architecture = retraining.architecture_of(row["architecture"], going, folder)
         restore_weights(going, row, folder)
-        recalibrate(going.trainer.model.net, architecture, known)
+        recalibrate_batch_norm(going.trainer.model.net, architecture, known)
         read, how = _read(going, architecture, shown), None
         if read.axis_deg is not None:
-            how = gaze_test.learnt(before()[0], _read(going, architecture, before()))
+            how = gaze_test.learn_from_people(
+                before()[0], _read(going, architecture, before())
+            )
         found = gaze_test.gaze_errors(shown[0], read, how=how)
         out.append(
             {
@@ -93,28 +96,30 @@ def gaze(
 
 
 def _shown(
-    going: Run, stream: int, people: int, each: int, seed: int
-) -> tuple[gaze_test.People, Seen]:
+    going: CodesignRun, stream: int, people: int, each: int, seed: int
+) -> tuple[gaze_test.PeopleFrames, SensorFrames]:
     """People and their frames through a run's lens."""
-    test = gaze_test.people(going.scenes(stream), people, each, seed=seed)
-    return test, assess.frames(
+    test = gaze_test.simulate_people(going.scenes(stream), people, each, seed=seed)
+    return test, assess.sensor_frames(
         going.trainer, test, math.ceil(people * each / going.settings.inner.batch)
     )
 
 
 def _read(
-    going: Run, architecture: Architecture, shown: tuple[gaze_test.People, Seen]
-) -> Readings:
+    going: CodesignRun,
+    architecture: Architecture,
+    shown: tuple[gaze_test.PeopleFrames, SensorFrames],
+) -> NetworkReadings:
     """What a network of a run reads of their frames."""
     test, seen = shown
-    answers = assess.predict(
+    answers = assess.predict_frames(
         going.trainer.model.net, architecture, seen, going.settings.inner
     )
     return gaze_test.read_of(test, answers.centre, answers.slip_mm, answers.axis)
 
 
-def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
-    """Table 2 from gaze.json, {folder: {rows of :func:`gaze`}}: the first run is the
+def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
+    """Table 2 from gaze.json, {folder: {rows of :func:`gaze_errors`}}: the first run is the
     proposed one. Networks of others are not rebuilt here.
     """
     for entry in told.values():
@@ -127,14 +132,14 @@ def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
     return {}
 
 
-def _measured(row: Mapping[str, Any]) -> Measured:
+def _measured(row: Mapping[str, Any]) -> MeasuredNumber:
     words = f"{row['mmacs']:.1f} MMACs, {row['people']} synthetic people, seed {row['seed']}, {WORDS}"
-    return Measured(float(row["personal_deg"]), conditions=words)
+    return MeasuredNumber(float(row["personal_deg"]), conditions=words)
 
 
 def of_ablations(
     ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
-) -> dict[str, Measured]:
+) -> dict[str, MeasuredNumber]:
     """Fig. 8b: compute of a run with one part frozen over ours, at the best axial
     slippage that the frozen one reaches.
 
@@ -151,7 +156,7 @@ def of_ablations(
         ]
         if enough:
             words = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(enough):.1f} MMACs"
-            found[f"fig8b/{part}"] = Measured(
+            found[f"fig8b/{part}"] = MeasuredNumber(
                 float(best["mmacs"]) / min(enough), conditions=words
             )
     return found

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from codesign.evaluate.optics import Axial, Filled, SceneEnergy
-from metalens.ground.report import canvas, png
+from codesign.evaluate.optics import AxialInformation, ResolvedSettings, SceneEnergy
+from metalens.core.report import figure_png, make_figure
 from metalens.image import pixel_weights
 
 CAPTIONS = {
@@ -21,11 +21,13 @@ CAPTIONS = {
 HALF = 0.1875  # half width of the slices that is shown, of the window
 
 
-def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
+def plot_axial_information(
+    axial: Mapping[str, AxialInformation], setting: ResolvedSettings
+) -> bytes:
     """I(z) over depth on axis, a panel for each binning."""
     depths = np.linspace(*setting.depths_mm, setting.count)
     count = len(setting.binnings)
-    figure, panels = canvas(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
+    figure, panels = make_figure(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
     for k, (panel, binning) in enumerate(zip(panels[0], setting.binnings, strict=True)):
         for name, found in axial.items():
             mean = float(found.information[0, k].mean())
@@ -37,13 +39,15 @@ def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
         )
         panel.legend(fontsize=7, title="mean", title_fontsize=7)
     panels[0, 0].set_ylabel(f"I(z) / mm⁻² ({setting.normalisation})")
-    return png(figure)
+    return figure_png(figure)
 
 
-def slices(axial: Mapping[str, Axial], setting: Filled) -> bytes:
+def plot_depth_slices(
+    axial: Mapping[str, AxialInformation], setting: ResolvedSettings
+) -> bytes:
     """Light along x over depth, lenses down, binnings across."""
     shape = (len(axial), len(setting.binnings))
-    figure, panels = canvas(
+    figure, panels = make_figure(
         *shape,
         size=(1 + 2.6 * shape[1], 0.6 + 2.0 * shape[0]),
         squeeze=False,
@@ -76,15 +80,15 @@ def slices(axial: Mapping[str, Axial], setting: Filled) -> bytes:
         row[0].set_ylabel(f"{name}\ndepth / mm", fontsize=8)
     for panel in panels[-1]:
         panel.set_xlabel("x / µm")
-    return png(figure)
+    return figure_png(figure)
 
 
-def scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
+def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
     """The first scene through every lens: image, change with gaze, difference of gaze
     and slip.
     """
     titles = ("image", "(gaze − anchor)²", "(gaze − slip)²")
-    figure, panels = canvas(
+    figure, panels = make_figure(
         len(energies), 3, size=(8.4, 0.5 + 2.6 * len(energies)), squeeze=False
     )
     tops = [
@@ -111,4 +115,4 @@ def scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
             if place == 0:
                 panel.set_title(title)
         row[0].set_ylabel(name, fontsize=8)
-    return png(figure)
+    return figure_png(figure)

@@ -28,17 +28,17 @@ from codesign.batches import (
     PoolScenes,
     SceneConfig,
     depth_um,
-    fill,
-    irradiance,
+    render_pool,
+    sensor_irradiance,
 )
 from codesign.evaluate.imaged import lens_imager, margin_of
-from codesign.eye import Camera
+from codesign.eye import PinholeCamera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
-from codesign.train import Scenes, read_out
-from metalens.ground import threads
-from metalens.ground.errors import ConfigError
-from metalens.ground.report import Table
+from codesign.train import SceneSource, read_out
+from metalens.core import threads
+from metalens.core.errors import ConfigError
+from metalens.core.report import Table
 from metalens.image import Imager, Sensor, UniformImager
 from metalens.lens import Lens
 
@@ -102,9 +102,9 @@ class ReaderConfig:
         return margin_of(self.pitch_um)
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> PinholeCamera:
         """Samples of the frames."""
-        return Camera(self.pixels, self.pitch_um)
+        return PinholeCamera(self.pixels, self.pitch_um)
 
     @property
     def sensor(self) -> Sensor:
@@ -121,7 +121,7 @@ SLIP_SCALE_MM = torch.tensor([1.4, 1.2, 2.3])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Read:
+class ReaderResult:
     """What was read of the test frames through one lens; errors absolute, (frames,).
 
     axial_mm, lateral_mm: of the slippage. window_mm: of the windows' depths, mean of
@@ -179,7 +179,7 @@ class ReferenceReader(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Frames:
+class LensFrames:
     """Frames of one lens with their truth: pixels (n, 1, y, x), vergence (n, windows,
     windows), slip_mm (n, 3).
     """
@@ -190,17 +190,17 @@ class Frames:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Scenery:
+class JudgingScenes:
     """Scenes that are the same for every lens: to learn from, to calibrate and to
     judge.
     """
 
-    learn: Scenes
-    calibrate: Scenes
-    judge: Scenes
+    learn: SceneSource
+    calibrate: SceneSource
+    judge: SceneSource
 
 
-def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
+def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> JudgingScenes:
     """Render what all lenses of this sensor distance are judged on; size tells no
     depth.
 
@@ -220,17 +220,19 @@ def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
         for stream in (EXPERIMENT, VALIDATION, TEST)
     }
     pools = {
-        stream: fill(one, config.test if stream != EXPERIMENT else config.pool)
+        stream: render_pool(one, config.test if stream != EXPERIMENT else config.pool)
         for stream, one in of.items()
     }
     kept = {
         s: PoolScenes(p, config.margin, scenes.scale, config.seed + s)
         for s, p in pools.items()
     }
-    return Scenery(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
+    return JudgingScenes(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
 
 
-def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) -> Read:
+def train_reader(
+    optics: Imager | UniformImager, seen: JudgingScenes, config: ReaderConfig
+) -> ReaderResult:
     """Train the reader on images through ``optics`` and judge it; the same seed gives
     the same numbers.
     """
@@ -239,21 +241,24 @@ def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) ->
     torch.manual_seed(config.seed)
     try:
         made = ReferenceReader()
-        learn = frames(optics, seen.learn, config, config.frames)
+        learn = lens_frames(optics, seen.learn, config, config.frames)
         _learn_depth(made, learn)
         _learn_slip(made, learn)
         made.eval()
-        spare = frames(optics, seen.calibrate, config, config.test)
-        judged = frames(optics, seen.judge, config, config.test)
+        spare = lens_frames(optics, seen.calibrate, config, config.test)
+        judged = lens_frames(optics, seen.judge, config, config.test)
         return _judge(made, spare, judged, float(getattr(optics, "error", math.nan)))
     finally:
         torch.set_rng_state(state)
 
 
 @torch.no_grad()
-def frames(
-    optics: Imager | UniformImager, scenes: Scenes, config: ReaderConfig, count: int
-) -> Frames:
+def lens_frames(
+    optics: Imager | UniformImager,
+    scenes: SceneSource,
+    config: ReaderConfig,
+    count: int,
+) -> LensFrames:
     """``count`` frames of a stream through a lens onto the sensor, with noise of the
     batch's number.
     """
@@ -261,7 +266,7 @@ def frames(
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
     for number in range(count // BATCH):
         batch = scenes.batch(number, BATCH)
-        light = irradiance(batch.frames, optics, margin=config.margin)
+        light = sensor_irradiance(batch.frames, optics, margin=config.margin)
         noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
         pixels.append(
             read_out(
@@ -277,21 +282,21 @@ def frames(
             blur.window_vergence(depth_um(batch.frames, margin=config.margin))
         )
         slip.append(batch.slip_mm)
-    return Frames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
+    return LensFrames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
 
 
 def _learn_depth(
-    made: ReferenceReader, learn: Frames, *, passes: int = 4, batch: int = 64
+    made: ReferenceReader, learn: LensFrames, *, passes: int = 4, batch: int = 64
 ) -> None:
     for rows in _steps(
         made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01
     ):
         told, _ = made.branch(learn.pixels[rows])
-        losses.depth(told, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
+        losses.depth_loss(told, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
 
 
 def _learn_slip(
-    made: ReferenceReader, learn: Frames, *, passes: int = 12, batch: int = 128
+    made: ReferenceReader, learn: LensFrames, *, passes: int = 12, batch: int = 128
 ) -> None:
     features = _features(made, learn)
     truth = learn.slip_mm / SLIP_SCALE_MM
@@ -322,7 +327,7 @@ def _steps(
 
 
 @torch.no_grad()
-def _features(made: ReferenceReader, seen: Frames) -> Tensor:
+def _features(made: ReferenceReader, seen: LensFrames) -> Tensor:
     parts = [
         made.branch(seen.pixels[i : i + 256])[1]
         for i in range(0, len(seen.pixels), 256)
@@ -332,9 +337,9 @@ def _features(made: ReferenceReader, seen: Frames) -> Tensor:
 
 @torch.no_grad()
 def _judge(
-    made: ReferenceReader, spare: Frames, judged: Frames, image_error: float
-) -> Read:
-    def slip(seen: Frames) -> tuple[Tensor, Tensor]:
+    made: ReferenceReader, spare: LensFrames, judged: LensFrames, image_error: float
+) -> ReaderResult:
+    def slip(seen: LensFrames) -> tuple[Tensor, Tensor]:
         found = made.slip(_features(made, seen))
         return (found[:, :3] * SLIP_SCALE_MM - seen.slip_mm).abs(), found[:, 5].clamp(
             -4, 2
@@ -360,7 +365,7 @@ def _judge(
     inside = float((error[:, 2] <= reach * spread).float().mean())
     wide = float((reach * spread).mean())
     lateral, windows = error[:, :2].mean(1), window.mean((1, 2))
-    return Read(
+    return ReaderResult(
         error[:, 2],
         lateral,
         windows,
@@ -372,7 +377,7 @@ def _judge(
     )
 
 
-def table(found: dict[str, Read], config: ReaderConfig) -> Table:
+def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
     """A row a lens."""
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
     caption = (
@@ -410,7 +415,9 @@ def table(found: dict[str, Read], config: ReaderConfig) -> Table:
     return Table(head, rows, caption)
 
 
-def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str, Read]]:
+def judge_lenses(
+    lenses: dict[str, Lens], config: ReaderConfig
+) -> Iterator[tuple[str, ReaderResult]]:
     """Every lens by name, on the same scenes.
 
     Raises:
@@ -422,13 +429,13 @@ def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str,
         raise ConfigError(
             f"lenses of different sensor distances {distances} um: compare lenses of one distance"
         )
-    seen = scenery(config, sensor_distance_um=next(iter(distances.values())))
+    seen = render_scenes(config, sensor_distance_um=next(iter(distances.values())))
     near, far = config.depths_mm
     about = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
     for name, lens in lenses.items():
         yield (
             name,
-            read(
+            train_reader(
                 lens_imager(lens, config.camera, (near * 1e3, far * 1e3), **about),
                 seen,
                 config,
@@ -437,11 +444,11 @@ def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str,
 
 
 __all__ = [
-    "Read",
     "ReaderConfig",
+    "ReaderResult",
     "ReferenceReader",
-    "judged",
-    "read",
-    "scenery",
-    "table",
+    "judge_lenses",
+    "reader_table",
+    "render_scenes",
+    "train_reader",
 ]

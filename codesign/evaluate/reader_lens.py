@@ -14,7 +14,7 @@ Frames leave noise in it too. A step of fixed length for every term, as Adam has
 then in part a walk at random,
 whose aberrations cost more than the gradient wins. So the lens moves along the part of
 the running mean that is longer
-than noise alone would leave (:class:`Descent`), and stands where there is none.
+than noise alone would leave (:class:`ShrunkDescent`), and stands where there is none.
 
 On an image to 0.2 of the contrast the lens learns the errors of that image: its loss
 falls and what it is worth on
@@ -23,9 +23,9 @@ read 3 % better after 24 turns
 with a step of 0.15 rad, and 5 % with 0.6 rad (one seed).
 
 The branch is thrown away: what the lens is worth says a reader that begins anew
-(:func:`codesign.evaluate.reader.read`), and of the lenses passed, the start among them,
+(:func:`codesign.evaluate.reader.train_reader`), and of the lenses passed, the start among them,
 the best is kept
-(:func:`kept`).
+(:func:`best_round`).
 """
 
 import math
@@ -36,15 +36,15 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Scenes, depth_um, irradiance, samples
+from codesign.batches import SceneSource, depth_um, frame_samples, sensor_irradiance
 from codesign.evaluate.reader import ReaderConfig
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.optics import OpticsConfig, formed
-from codesign.train import Schedule, read_out
+from codesign.train import LearningRateSchedule, read_out
+from metalens.core import threads
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.field import node_light, normalised, term, with_psfs
-from metalens.ground import threads
-from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Imager, UniformImager
 
 
@@ -64,7 +64,9 @@ class LensTraining:
     turns: int = 24
     hold: int = 20
     batch: int = 32
-    phase: Schedule = field(default_factory=lambda: Schedule(0.6, 0.25, 1.0))
+    phase: LearningRateSchedule = field(
+        default_factory=lambda: LearningRateSchedule(0.6, 0.25, 1.0)
+    )
     anew: int = 8
     rate: float = 3e-3
     seed: int = 0
@@ -78,7 +80,7 @@ class LensTraining:
 
 
 @dataclass(slots=True)
-class Descent:
+class ShrunkDescent:
     """Steps along the running mean of gradients, shrunk by what noise alone would leave
     of it.
 
@@ -111,7 +113,7 @@ class Descent:
         return -unit * max(0.0, 1 - noise / max(float(unit @ unit), 1e-300))
 
 
-class Forms(Protocol):
+class LensImaging(Protocol):
     """What images frames of ``frame`` samples, margin included, through a lens of these
     coefficients.
     """
@@ -126,14 +128,14 @@ class Forms(Protocol):
     ) -> UniformImager | Imager: ...
 
 
-def trained(
+def train_lens(
     optics: OpticsConfig,
     start_rad: Tensor,
-    scenes: Scenes,
+    scenes: SceneSource,
     config: ReaderConfig,
     training: LensTraining,
     *,
-    forms: Forms = formed.imager,
+    forms: LensImaging = formed.make_imager,
 ) -> tuple[Tensor, list[float]]:
     """Coefficients at the start and after every turn, (turns + 1, polynomials) in rad,
     and the mean loss of every turn.
@@ -172,28 +174,28 @@ def trained(
 def _descended(
     optics: OpticsConfig,
     start_rad: Tensor,
-    scenes: Scenes,
+    scenes: SceneSource,
     config: ReaderConfig,
     training: LensTraining,
-    forms: Forms,
+    forms: LensImaging,
 ) -> tuple[Tensor, list[float]]:
     branch = BlurBranch(nn.BatchNorm2d(blur.FEATURES)).train()
     path, descent = (
         [start_rad.detach().double()],
-        Descent(torch.zeros_like(start_rad, dtype=torch.float64)),
+        ShrunkDescent(torch.zeros_like(start_rad, dtype=torch.float64)),
     )
     reads = torch.optim.AdamW(branch.parameters(), lr=training.rate, weight_decay=0.01)
-    frame, told = samples(scenes.batch(0, 1).frames), []
+    frame, told = frame_samples(scenes.batch(0, 1).frames), []
     planned: Imager | None = None
     for turn in range(training.turns):
         place, rate = path[-1], training.phase.at(turn / training.turns)
         if planned is None or turn % training.anew == 0:
             whole = planned = _planned(forms, optics, place, frame, scenes.margin)
         elif not torch.equal(place, path[-2]):
-            whole = moved(optics, planned, place)
+            whole = moved_image(optics, planned, place)
         mean, gathered = 0.0, torch.zeros_like(whole.stack)
         for step in range(turn * training.hold, (turn + 1) * training.hold):
-            reads.param_groups[0]["lr"] = Schedule(training.rate).at(
+            reads.param_groups[0]["lr"] = LearningRateSchedule(training.rate).at(
                 step / (training.turns * training.hold)
             )
             reads.zero_grad(set_to_none=True)
@@ -221,7 +223,7 @@ def _descended(
 
 
 def _planned(
-    forms: Forms, optics: OpticsConfig, place: Tensor, frame: int, margin: int
+    forms: LensImaging, optics: OpticsConfig, place: Tensor, frame: int, margin: int
 ) -> Imager:
     whole = forms(optics, place, frame, margin=margin)
     if not isinstance(whole, Imager):
@@ -230,7 +232,7 @@ def _planned(
 
 
 @torch.no_grad()
-def moved(optics: OpticsConfig, planned: Imager, place: Tensor) -> Imager:
+def moved_image(optics: OpticsConfig, planned: Imager, place: Tensor) -> Imager:
     """The image of a lens that has moved, its PSFs at the nodes and through the
     kernels' weights that were planned.
     """
@@ -240,14 +242,14 @@ def moved(optics: OpticsConfig, planned: Imager, place: Tensor) -> Imager:
     )
 
 
-def kept(
+def best_round(
     path: Tensor, turns: Sequence[int], error_mm: Callable[[Tensor], float]
 ) -> tuple[int, dict[int, float]]:
     """The turn of the least error, and {turn: error} of the start and of these turns;
     the first of equal ones.
 
     Args:
-        path: (turns + 1, polynomials) of :func:`trained`. error_mm: of a lens on frames
+        path: (turns + 1, polynomials) of :func:`train_lens`. error_mm: of a lens on frames
             that trained nothing.
     """
     told = {turn: error_mm(path[turn]) for turn in dict.fromkeys((0, *turns))}
@@ -258,7 +260,7 @@ def gone_backward(
     branch: BlurBranch,
     optics: OpticsConfig,
     whole: Imager,
-    scenes: Scenes,
+    scenes: SceneSource,
     config: ReaderConfig,
     training: LensTraining,
     *,
@@ -272,9 +274,9 @@ def gone_backward(
         The loss, and (rows, columns, depths, h, w); zeros without ``live``.
     """
     batch = scenes.batch(step, training.batch)
-    moved = formed.live(optics, whole) if live else None
+    moved = formed.make_differentiable_imager(optics, whole) if live else None
     with torch.set_grad_enabled(live):
-        light = irradiance(
+        light = sensor_irradiance(
             batch.frames, moved.ready if moved else whole, margin=scenes.margin
         )
         noise = torch.Generator().manual_seed(6_000_101 * (training.seed + 1) + step)
@@ -283,7 +285,7 @@ def gone_backward(
             light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False
         )
     found, _ = branch(seen)
-    loss = losses.depth(
+    loss = losses.depth_loss(
         found, blur.window_vergence(depth_um(batch.frames, margin=scenes.margin))
     )
     if not bool(torch.isfinite(loss.detach())):

@@ -1,7 +1,7 @@
 """A free-form lens from Eq. 6 itself: triplets of rendered eyes through the PSFs of the
 phase, and their Fisher matrix.
 
-For :func:`metalens.design.free_form.search.optimise`. The images are energy-matched as
+For :func:`metalens.design.free_form.search.optimize_free_form`. The images are energy-matched as
 in Table 1, and every entry of
 the Fisher matrix is relative to that of images without any blur, so that 0 is a lens
 that loses nothing to a pinhole.
@@ -10,9 +10,9 @@ that loses nothing to a pinhole.
 import torch
 from torch import Tensor
 
-from codesign.evaluate.optics import Scenes, scene_views
+from codesign.evaluate.optics import SensitivityScenes, scene_views
 from codesign.eye import states_at
-from metalens.design.free_form import Asked, Score
+from metalens.design.free_form import DesignScore, ResolvedFisherSettings
 from metalens.image import (
     OpticsLoss,
     Pupil,
@@ -30,7 +30,10 @@ class SceneObjective:
     """Eq. 6 of a phase on the pupil, over a fixed set of scenes."""
 
     def __init__(
-        self, pupil: Pupil, settings: Asked, scenes: Scenes | None = None
+        self,
+        pupil: Pupil,
+        settings: ResolvedFisherSettings,
+        scenes: SensitivityScenes | None = None,
     ) -> None:
         """Render the triplets once.
 
@@ -39,7 +42,7 @@ class SceneObjective:
                 ``settings.scenes`` scenes.
         """
         self.pupil, self.settings = pupil, settings
-        self.scenes = scenes or Scenes(
+        self.scenes = scenes or SensitivityScenes(
             count=settings.scenes, pitch_um=9.0, pixels=128, window_um=153.0
         )
         states = states_at(torch.arange(self.scenes.count), 100 + settings.seed)
@@ -87,11 +90,11 @@ class SceneObjective:
         found, energy = self.evaluate(phase_rad, focus_um)
         return found.value, energy
 
-    def judge(self, phase_rad: Tensor, focus_um: float) -> Score:
+    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
         """Minus Eq. 6 as the figure to climb."""
         with torch.no_grad():
             found, energy = self.evaluate(phase_rad, focus_um)
-        return Score(-found.value[None], energy)
+        return DesignScore(-found.value[None], energy)
 
     def evaluate(self, phase_rad: Tensor, focus_um: float) -> tuple[OpticsLoss, Tensor]:
         """The loss with its parts, and the encircled energy at every depth."""

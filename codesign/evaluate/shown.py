@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from codesign.gaze import Calibrator
+    from codesign.gaze import PersonCalibrator
 
 Points = Literal["random", "spread"]
 AXIAL, LATERAL = "axial", "lateral"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Trial:
+class ExperimentTrials:
     """Of every frame (n,): subject, stimulus, slippage state; and what was true.
 
     stimulus_deg: (n, 2). slip_mm: (n, 3).
@@ -123,7 +123,7 @@ class ExperimentConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Result:
+class RunResult:
     """One run in the experiment.
 
     slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,).
@@ -143,7 +143,7 @@ class Result:
 
     name: str
     mmacs: float
-    trial: Trial
+    trial: ExperimentTrials
     slip_mm: Array
     centre: Array
     iou: Array
@@ -151,10 +151,10 @@ class Result:
     predicted_deg: Array
     told_deg: Array
     reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    how: "Calibrator | None" = None
+    how: "PersonCalibrator | None" = None
     visible_mm: Array | None = None
     above: str = ""
-    finer: "Result | None" = None
+    finer: "RunResult | None" = None
 
     @property
     def within(self) -> Array:

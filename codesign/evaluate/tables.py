@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.evaluate.optics import Axial, Filled, SceneEnergy
-from metalens.ground.report import Table
+from codesign.evaluate.optics import AxialInformation, ResolvedSettings, SceneEnergy
+from metalens.core.report import Table
 
 KINDS = ("gaze", "slip", "separability")
 PAPER_SCENES = {
@@ -27,7 +27,7 @@ PAPER_AXIAL = {  # Table 3, averaged over 16-26 mm
 }
 
 
-def ratio(
+def scene_ratio(
     values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
     """Ratio of means over scenes and its 95 % interval, by a paired bootstrap over the
@@ -40,21 +40,24 @@ def ratio(
     return float(a.mean() / b.mean()), float(low), float(high)
 
 
-def ratios(
+def lens_ratios(
     scenes: Mapping[str, SceneEnergy],
 ) -> dict[str, dict[str, tuple[float, float, float]]]:
     """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1."""
     first = next(iter(scenes.values()))
     return {
         name: {
-            kind: ratio(getattr(energy, kind), getattr(first, kind)) for kind in KINDS
+            kind: scene_ratio(getattr(energy, kind), getattr(first, kind))
+            for kind in KINDS
         }
         for name, energy in scenes.items()
     }
 
 
-def values(
-    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled
+def table_values(
+    axial: Mapping[str, AxialInformation],
+    scenes: Mapping[str, SceneEnergy],
+    setting: ResolvedSettings,
 ) -> dict[str, Any]:
     """Every number of the tables, ready for JSON."""
     out: dict[str, Any] = {
@@ -64,7 +67,7 @@ def values(
         "normalisation": setting.normalisation,
         "lenses": {},
     }
-    compared = ratios(scenes)
+    compared = lens_ratios(scenes)
     for name, found in axial.items():
         energy = scenes[name]
         out["lenses"][name] = {
@@ -83,8 +86,10 @@ def values(
     return out
 
 
-def failures(
-    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled
+def table_failures(
+    axial: Mapping[str, AxialInformation],
+    scenes: Mapping[str, SceneEnergy],
+    setting: ResolvedSettings,
 ) -> list[str]:
     """What of the numbers misses its tolerance, in words."""
     asked = setting.tolerance
@@ -96,10 +101,10 @@ def failures(
     return above + [f"{name}: {one.above}" for name, one in scenes.items() if one.above]
 
 
-def tables(
-    axial: Mapping[str, Axial],
+def format_tables(
+    axial: Mapping[str, AxialInformation],
     scenes: Mapping[str, SceneEnergy],
-    setting: Filled,
+    setting: ResolvedSettings,
     *,
     spread: Sequence[str] = (),
 ) -> list[Table]:
@@ -109,7 +114,11 @@ def tables(
     return [_axial(axial, setting, spread), _scenes(scenes)]
 
 
-def _axial(axial: Mapping[str, Axial], setting: Filled, spread: Sequence[str]) -> Table:
+def _axial(
+    axial: Mapping[str, AxialInformation],
+    setting: ResolvedSettings,
+    spread: Sequence[str],
+) -> Table:
     low, high = setting.depths_mm
     caption = (
         f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
@@ -150,7 +159,7 @@ def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
     first = next(iter(scenes))
     caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
     rows: list[tuple[str, ...]] = []
-    for name, found in ratios(scenes).items():
+    for name, found in lens_ratios(scenes).items():
         one = scenes[name]
         parts = [
             f"{value:.2f} [{low:.2f}, {high:.2f}]"

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.eye import dataset as dataset
@@ -11,65 +11,65 @@ if TYPE_CHECKING:
     from codesign.eye import population as population
     from codesign.eye import renderer as renderer
     from codesign.eye import textures as textures
-    from codesign.eye.dataset import Triplets as Triplets
+    from codesign.eye.dataset import SeparabilityTriplets as SeparabilityTriplets
     from codesign.eye.dataset import ambiguity_pairs as ambiguity_pairs
+    from codesign.eye.dataset import render_triplets as render_triplets
     from codesign.eye.dataset import states_at as states_at
-    from codesign.eye.dataset import triplets as triplets
     from codesign.eye.population import POPULATION as POPULATION
-    from codesign.eye.population import Motion as Motion
-    from codesign.eye.population import Rig as Rig
-    from codesign.eye.population import States as States
-    from codesign.eye.population import Trait as Trait
+    from codesign.eye.population import CameraRig as CameraRig
+    from codesign.eye.population import EyeStates as EyeStates
+    from codesign.eye.population import MotionRanges as MotionRanges
+    from codesign.eye.population import SubjectTrait as SubjectTrait
     from codesign.eye.population import mean_eye_um as mean_eye_um
-    from codesign.eye.population import parameters as parameters
-    from codesign.eye.renderer import Camera as Camera
-    from codesign.eye.renderer import Labels as Labels
-    from codesign.eye.renderer import Rendered as Rendered
+    from codesign.eye.population import model_parameters as model_parameters
+    from codesign.eye.renderer import FrameLabels as FrameLabels
+    from codesign.eye.renderer import PinholeCamera as PinholeCamera
+    from codesign.eye.renderer import RenderedFrames as RenderedFrames
     from codesign.eye.renderer import render as render
-    from codesign.eye.view import View as View
+    from codesign.eye.view import CameraView as CameraView
     from codesign.eye.view import face_axes as face_axes
     from codesign.eye.worn import CAUSES as CAUSES
-    from codesign.eye.worn import Worn as Worn
-    from codesign.eye.worn import drawn as drawn
+    from codesign.eye.worn import DrawnAugmentations as DrawnAugmentations
+    from codesign.eye.worn import apply_augmentations as apply_augmentations
+    from codesign.eye.worn import augment_irises as augment_irises
+    from codesign.eye.worn import augmented_cameras as augmented_cameras
+    from codesign.eye.worn import draw_augmentations as draw_augmentations
     from codesign.eye.worn import drawn_of_people as drawn_of_people
-    from codesign.eye.worn import dressed as dressed
-    from codesign.eye.worn import pigmented as pigmented
     from codesign.eye.worn import render_dressed as render_dressed
-    from codesign.eye.worn import viewed as viewed
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "CAUSES": "worn",
-        "Camera": "renderer",
-        "Labels": "renderer",
-        "Motion": "population",
+        "PinholeCamera": "renderer",
+        "FrameLabels": "renderer",
+        "MotionRanges": "population",
         "POPULATION": "population",
-        "Rendered": "renderer",
-        "Rig": "population",
-        "States": "population",
-        "Trait": "population",
-        "Triplets": "dataset",
+        "RenderedFrames": "renderer",
+        "CameraRig": "population",
+        "EyeStates": "population",
+        "SubjectTrait": "population",
+        "SeparabilityTriplets": "dataset",
         "ambiguity_pairs": "dataset",
         "dataset": "",
         "landmarks": "",
         "model": "",
-        "dressed": "worn",
-        "drawn": "worn",
+        "apply_augmentations": "worn",
+        "draw_augmentations": "worn",
         "drawn_of_people": "worn",
         "face_axes": "view",
         "mean_eye_um": "population",
-        "parameters": "population",
+        "model_parameters": "population",
         "population": "",
         "render": "renderer",
         "render_dressed": "worn",
         "renderer": "",
         "states_at": "dataset",
         "textures": "",
-        "triplets": "dataset",
-        "View": "view",
-        "Worn": "worn",
-        "pigmented": "worn",
-        "viewed": "worn",
+        "render_triplets": "dataset",
+        "CameraView": "view",
+        "DrawnAugmentations": "worn",
+        "augment_irises": "worn",
+        "augmented_cameras": "worn",
     },
 )

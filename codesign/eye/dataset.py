@@ -10,31 +10,33 @@ import torch
 from torch import Tensor
 
 from codesign.eye import population as eye
-from codesign.eye.population import Motion, Rig, States
-from codesign.eye.renderer import Camera, Rendered, render
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import SceneError
-from metalens.ground.reading import reader
-from metalens.ground.store import Provenance
+from codesign.eye.population import CameraRig, EyeStates, MotionRanges
+from codesign.eye.renderer import PinholeCamera, RenderedFrames, render
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import SceneError
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
 from metalens.image import Frames
 
 
-def states_at(indices: Tensor, seed: int, *, motion: Motion | None = None) -> States:
+def states_at(
+    indices: Tensor, seed: int, *, motion: MotionRanges | None = None
+) -> EyeStates:
     """State number i of the endless set of a seed: the same whoever asks for it, alone
     or among others.
     """
-    parts = [eye.draw(1, (seed, int(i)), motion=motion) for i in indices]
-    return States(
+    parts = [eye.draw_states(1, (seed, int(i)), motion=motion) for i in indices]
+    return EyeStates(
         *(
             torch.cat([getattr(part, name) for part in parts])
-            for name in States.__slots__
+            for name in EyeStates.__slots__
         )
     )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Triplets:
+class SeparabilityTriplets:
     """Anchor, gaze+ and slip+ renderings of the same subjects (paper Sec. 3.6), and the
     steps between them.
 
@@ -42,23 +44,23 @@ class Triplets:
     names.
     """
 
-    anchor: Rendered
-    gaze: Rendered
-    slip: Rendered
+    anchor: RenderedFrames
+    gaze: RenderedFrames
+    slip: RenderedFrames
     gaze_step_rad: float
     slip_step_um: float
     directions: tuple[str, str]
 
 
-def triplets(
-    states: States,
+def render_triplets(
+    states: EyeStates,
     *,
     directions: tuple[str, str] = ("gaze_x", "slip_z"),
     gaze_step_rad: float = 3.5e-5,
     slip_step_um: float = 1.0,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
-) -> Triplets:
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
+) -> SeparabilityTriplets:
     """Finite-difference triplets in the linear regime, at one exposure.
 
     Accuracy:
@@ -97,13 +99,13 @@ def triplets(
         render(s, rig=rig, camera=camera, exposed=states)
         for s in (states, turned, moved)
     ]
-    return Triplets(
+    return SeparabilityTriplets(
         views[0], views[1], views[2], gaze_step_rad, slip_step_um, directions
     )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ambiguity:
+class AmbiguousPairs:
     """Pairs of states of one subject whose pupil centroids coincide on the sensor
     (paper Sec. 3.6).
 
@@ -112,8 +114,8 @@ class Ambiguity:
     tried: pairs that were looked at to find these.
     """
 
-    first: States
-    second: States
+    first: EyeStates
+    second: EyeStates
     distance_px: Tensor
     tried: int
 
@@ -122,12 +124,12 @@ def ambiguity_pairs(
     count: int,
     seed: int,
     *,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
-    motion: Motion | None = None,
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
+    motion: MotionRanges | None = None,
     tolerance_px: float = 0.1,
     least_slip_um: float = 800.0,
-) -> Ambiguity:
+) -> AmbiguousPairs:
     """Pairs of distinct slip and gaze whose visible pupil has the same centroid within
     ``tolerance_px``.
 
@@ -139,8 +141,12 @@ def ambiguity_pairs(
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
     """
-    rig, camera, motion = rig or Rig(), camera or Camera(), motion or Motion()
-    kept: list[tuple[States, States, Tensor]] = []
+    rig, camera, motion = (
+        rig or CameraRig(),
+        camera or PinholeCamera(),
+        motion or MotionRanges(),
+    )
+    kept: list[tuple[EyeStates, EyeStates, Tensor]] = []
     found = tried = 0
     while found < count:
         if tried > 50 * max(found, 64):
@@ -149,7 +155,8 @@ def ambiguity_pairs(
             )
         batch = max(32, count - found)
         first, second = (
-            eye.draw(batch, (seed, tried, part), motion=motion) for part in (0, 1)
+            eye.draw_states(batch, (seed, tried, part), motion=motion)
+            for part in (0, 1)
         )
         tried += batch
         second = replace(first, slip_um=second.slip_um)
@@ -163,15 +170,22 @@ def ambiguity_pairs(
         kept.append((first[rows], second[rows], distance[rows]))
         found += len(rows)
     joined = [
-        States(*(torch.cat([getattr(k[i], n) for k in kept]) for n in States.__slots__))
+        EyeStates(
+            *(torch.cat([getattr(k[i], n) for k in kept]) for n in EyeStates.__slots__)
+        )
         for i in (0, 1)
     ]
-    return Ambiguity(joined[0], joined[1], torch.cat([k[2] for k in kept]), tried)
+    return AmbiguousPairs(joined[0], joined[1], torch.cat([k[2] for k in kept]), tried)
 
 
 def _returned(
-    first: States, second: States, *, rig: Rig, camera: Camera, tolerance_px: float
-) -> tuple[States, Tensor, Tensor]:
+    first: EyeStates,
+    second: EyeStates,
+    *,
+    rig: CameraRig,
+    camera: PinholeCamera,
+    tolerance_px: float,
+) -> tuple[EyeStates, Tensor, Tensor]:
     """``second`` with the gaze that brings its centroid to that of ``first``: Newton
     steps on rendered masks.
     """
@@ -207,7 +221,7 @@ def _returned(
 
 
 def _centroids(
-    states: States, gaze_rad: Tensor, rig: Rig, camera: Camera
+    states: EyeStates, gaze_rad: Tensor, rig: CameraRig, camera: PinholeCamera
 ) -> tuple[Tensor, Tensor]:
     labels = render(replace(states, gaze_rad=gaze_rad), rig=rig, camera=camera).labels
     return labels.centroid_px, labels.visible
@@ -215,7 +229,7 @@ def _centroids(
 
 def write_shard(
     path: str | Path,
-    rendered: Rendered,
+    rendered: RenderedFrames,
     *,
     seed: int,
     provenance: Provenance | None = None,
@@ -241,7 +255,7 @@ def write_shard(
     )
 
 
-@reader
+@typed_reader
 def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
     """Frames, pupil masks and labels by name of a shard.
 

@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 SHIFT = 4  # binary places of a pixel that strokes are drawn to
 ARC = np.linspace(0, 1, 5)  # along a lash
 SHADES = (110, 160, 210, 255)  # of lashes in turn, of 255
 
 
-def lashes(opening: Tensor, draws: Array) -> Tensor:
+def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
     """(y, x) in [0, 1]: strokes rooted on the margins of an opening of the lids (y, x),
     one pixel of 200 thick.
 
@@ -62,7 +62,7 @@ def lashes(opening: Tensor, draws: Array) -> Tensor:
     return torch.from_numpy(canvas).float() / 255
 
 
-def patches(size: int, draws: Array) -> Tensor:
+def soft_patches(size: int, draws: Array) -> Tensor:
     """(y, x) in [0, 1): one to three ellipses of soft edges, half 5 to 25 % of the
     frame, striped as hair is.
     """

@@ -27,8 +27,8 @@ from codesign.eye import inline as render_inline
 from codesign.eye import lanes as render_lanes
 from codesign.eye import model
 from codesign.eye.lanes import SETTINGS, f32, inside
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 COLUMNS = 16  # of a tile: a vector register of float32, or two
 ROWS, DUAL_ROWS = (
@@ -276,7 +276,7 @@ def render(
     multiplied by the coverage.
     """
     rest = (parameters, scale, bank, u, w, light, cover, depth, pupil)
-    threads.split(
+    threads.run_split(
         len(parameters) * -(-len(w) // ROWS),
         lambda first, end: frames(first, end, *rest),
     )
@@ -292,7 +292,7 @@ def differentiate(
     skin and eye; their tangents.
     """
     rest = (parameters, bank, u, w, out)
-    threads.split(
+    threads.run_split(
         len(parameters) * -(-len(w) // DUAL_ROWS),
         lambda first, end: tangents(first, end, *rest),
     )

@@ -16,7 +16,7 @@ SETTLED_UM = 1e-6  # from the wanted point on the iris: 1e-9 of a tangent
 NEAREST_UM = 500.0
 
 
-def project(points_um: Tensor) -> Tensor:
+def project_points(points_um: Tensor) -> Tensor:
     """(..., 2) tangents x / z, y / z of points (..., 3)."""
     return points_um[..., :2] / points_um[..., 2:].clamp_min(NEAREST_UM)
 
@@ -52,7 +52,7 @@ def landmark_points(p: Tensor) -> Tensor:
         centre + ring * axis + radius * way for way in (across, below, -across, -below)
     ]
     points.append(centre + (v[:, model.CORNEA_D] + v[:, model.CORNEA_R]) * axis)
-    return project(torch.stack(points, 1))
+    return project_points(torch.stack(points, 1))
 
 
 def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
@@ -76,7 +76,7 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
     lift = (
         p[:, None, model.PUPIL_D, None] + 550.0
     )  # entrance pupil: the pupil seems nearer by 0.55 mm, 13 % larger
-    straight = project(
+    straight = project_points(
         centre
         + lift * axis
         + 1.13 * (iris_um[..., :1] * across + iris_um[..., 1:] * below)

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from codesign.eye import model
 from codesign.eye.textures import KINDS, VARIANTS
-from codesign.eye.view import View, face_axes, seen_axes
-from metalens.ground.errors import SceneError
+from codesign.eye.view import CameraView, face_axes, seen_axes
+from metalens.core.errors import SceneError
 
 
 @dataclass(frozen=True, slots=True)
-class Trait:
+class SubjectTrait:
     """A number of a subject: normal with this mean and deviation, cut at the limits."""
 
     mean: float
@@ -37,125 +37,133 @@ class Trait:
     source: str = ""
 
 
-POPULATION: Mapping[str, Trait] = {
-    "size": Trait(
+POPULATION: Mapping[str, SubjectTrait] = {
+    "size": SubjectTrait(
         1.0,
         0.03,
         0.9,
         1.1,
         "common factor of all radii: axial length 24.2 +- 0.85 mm (Le Grand; Olsen 2007)",
     ),
-    "sclera_radius_um": Trait(
+    "sclera_radius_um": SubjectTrait(
         12000, 200, 11300, 12700, "Le Grand full theoretical eye: 12.3 mm; 24 mm globe"
     ),
-    "cornea_radius_um": Trait(
+    "cornea_radius_um": SubjectTrait(
         7800, 200, 7000, 8600, "Gullstrand 7.7, Le Grand 7.8; +- 0.25 mm in adults"
     ),
-    "limbus_radius_um": Trait(
+    "limbus_radius_um": SubjectTrait(
         5900, 150, 5400, 6400, "visible iris 11.8 +- 0.4 mm (Caroline and Andre 2002)"
     ),
-    "pupil_radius_um": Trait(
+    "pupil_radius_um": SubjectTrait(
         1900, 500, 900, 3600, "2-7 mm pupils; Watson and Yellott 2012"
     ),
-    "pupil_behind_um": Trait(
+    "pupil_behind_um": SubjectTrait(
         3600,
         150,
         3100,
         4200,
         "pupil behind the corneal apex (Gullstrand 3.6 mm; G&E K = 4.2 mm)",
     ),
-    "index": Trait(
+    "index": SubjectTrait(
         1.3375,
         0.0,
         1.3375,
         1.3375,
         "cornea and aqueous as one (Guestrin and Eizenman 2006)",
     ),
-    "kappa_x_rad": Trait(
+    "kappa_x_rad": SubjectTrait(
         math.radians(5.0),
         math.radians(1.5),
         0.0,
         0.17,
         "visual axis nasal of the optic axis (G&E)",
     ),
-    "kappa_y_rad": Trait(
+    "kappa_y_rad": SubjectTrait(
         math.radians(1.5),
         math.radians(1.0),
         -0.05,
         0.1,
         "visual axis above the optic axis (G&E)",
     ),
-    "depth_um": Trait(
+    "depth_um": SubjectTrait(
         0,
         1000,
         -3000,
         3000,
         "pupil depth beside the rig's; the paper's 16-26 mm is 3 sigma with slip",
     ),
-    "lid_thickness_um": Trait(950, 150, 600, 1400, "lid shell outside the globe"),
-    "fissure_upper_um": Trait(
+    "lid_thickness_um": SubjectTrait(
+        950, 150, 600, 1400, "lid shell outside the globe"
+    ),
+    "fissure_upper_um": SubjectTrait(
         5000,
         700,
         3300,
         6800,
         "fissure height 10 mm (Farkas 1994), above the pupil's centre",
     ),
-    "fissure_lower_um": Trait(
+    "fissure_lower_um": SubjectTrait(
         5900, 500, 4700, 7000, "lower margin at or just below the limbus"
     ),
-    "fissure_half_um": Trait(
+    "fissure_half_um": SubjectTrait(
         11600,
         350,
         10700,
         12400,
         "half chord between the canthi: 30 mm along the curve (Farkas)",
     ),
-    "fissure_skew_um": Trait(
+    "fissure_skew_um": SubjectTrait(
         850, 400, -500, 2000, "peak of the upper margin nasal, of the lower temporal"
     ),
-    "fissure_middle_um": Trait(
+    "fissure_middle_um": SubjectTrait(
         400, 350, -600, 1400, "the temporal canthus is farther from the pupil"
     ),
-    "crease_um": Trait(2600, 700, 900, 4500, "upper lid fold above the margin"),
-    "plane_um": Trait(7000, 800, 5000, 9500, "face plane behind the corneal apex"),
-    "iris": Trait(
+    "crease_um": SubjectTrait(2600, 700, 900, 4500, "upper lid fold above the margin"),
+    "plane_um": SubjectTrait(
+        7000, 800, 5000, 9500, "face plane behind the corneal apex"
+    ),
+    "iris": SubjectTrait(
         0.34,
         0.09,
         0.14,
         0.6,
         "albedo at 850 nm: dark irises are bright in the near infrared",
     ),
-    "iris_contrast": Trait(0.34, 0.10, 0.1, 0.7, "texture, relative"),
-    "sclera": Trait(0.62, 0.06, 0.45, 0.8, "albedo at 850 nm"),
-    "veins": Trait(0.16, 0.06, 0.02, 0.4, "vessels are faint beyond 800 nm"),
-    "skin": Trait(
+    "iris_contrast": SubjectTrait(0.34, 0.10, 0.1, 0.7, "texture, relative"),
+    "sclera": SubjectTrait(0.62, 0.06, 0.45, 0.8, "albedo at 850 nm"),
+    "veins": SubjectTrait(0.16, 0.06, 0.02, 0.4, "vessels are faint beyond 800 nm"),
+    "skin": SubjectTrait(
         0.52,
         0.08,
         0.3,
         0.72,
         "albedo at 850 nm, 0.4-0.65: melanin hardly absorbs (Angelopoulou 2001)",
     ),
-    "pores": Trait(0.10, 0.03, 0.03, 0.22, "texture, relative"),
-    "lashes": Trait(0.9, 0.25, 0.1, 1.5, "opacity of the lash picture"),
-    "brow": Trait(0.8, 0.3, 0.0, 1.5, "opacity of the brow"),
-    "pupil": Trait(
+    "pores": SubjectTrait(0.10, 0.03, 0.03, 0.22, "texture, relative"),
+    "lashes": SubjectTrait(0.9, 0.25, 0.1, 1.5, "opacity of the lash picture"),
+    "brow": SubjectTrait(0.8, 0.3, 0.0, 1.5, "opacity of the brow"),
+    "pupil": SubjectTrait(
         0.018, 0.008, 0.004, 0.06, "off-axis lamps: hardly any red-eye light"
     ),
-    "glint": Trait(
+    "glint": SubjectTrait(
         0.5,
         0.2,
         0.0,
         1.2,
         "tear-film reflection of the flood LEDs; not used by the tracker",
     ),
-    "ambient": Trait(0.12, 0.08, 0.0, 0.5, "diffuse light in units of a LED at 20 mm"),
-    "exposure": Trait(0.5, 0.08, 0.3, 0.75, "level set by the automatic exposure"),
+    "ambient": SubjectTrait(
+        0.12, 0.08, 0.0, 0.5, "diffuse light in units of a LED at 20 mm"
+    ),
+    "exposure": SubjectTrait(
+        0.5, 0.08, 0.3, 0.75, "level set by the automatic exposure"
+    ),
 }
 TEXTURES = ("iris", "vein", "skin", "fine", "lash", "offset_x", "offset_y", "turn")
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class CameraRig:
     """Camera and lamps on the glasses.
 
     distance_um: lens to pupil when nothing slipped. The paper's bench sits 2 cm below
@@ -193,7 +201,7 @@ class Rig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class States:
+class EyeStates:
     """Subjects and what their eyes and glasses do: gaze (phi, theta), torsion omega,
     slip t (paper Sec. 3.6).
 
@@ -243,8 +251,8 @@ class States:
     def __len__(self) -> int:
         return len(self.traits)
 
-    def __getitem__(self, rows: slice | Tensor) -> "States":
-        return States(*(getattr(self, name)[rows] for name in self.__slots__))
+    def __getitem__(self, rows: slice | Tensor) -> "EyeStates":
+        return EyeStates(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def trait(self, name: str) -> Tensor:
         """(n,) values of one trait."""
@@ -252,7 +260,7 @@ class States:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionRanges:
     """Ranges that states are drawn from, uniform within +- each value.
 
     slip_um: along the camera's x, y and z. tilt: of the small mounting turns.
@@ -267,17 +275,17 @@ class Motion:
     mount_rad: float = math.radians(1.0)
     aperture: tuple[float, float] = (0.75, 1.1)
     scale: float = 0.0
-    population: Mapping[str, Trait] = field(default_factory=lambda: POPULATION)
+    population: Mapping[str, SubjectTrait] = field(default_factory=lambda: POPULATION)
 
 
-def draw(
-    count: int, seed: int | tuple[int, ...], *, motion: Motion | None = None
-) -> States:
+def draw_states(
+    count: int, seed: int | tuple[int, ...], *, motion: MotionRanges | None = None
+) -> EyeStates:
     """Random subjects in random states; the same seed gives the same states.
 
     ``motion.scale`` s > 0 draws the scale factor of each state uniformly in 1 +- s.
     """
-    rng, motion = np.random.default_rng(seed), motion or Motion()
+    rng, motion = np.random.default_rng(seed), motion or MotionRanges()
     columns = []
     for trait in motion.population.values():
         value = trait.mean + trait.sd * rng.standard_normal(count)
@@ -301,16 +309,16 @@ def draw(
         rng.uniform(*motion.aperture, count),
         1 + rng.uniform(-1, 1, count) * motion.scale,
     )
-    return States(*(torch.from_numpy(np.asarray(value, float)) for value in values))
+    return EyeStates(*(torch.from_numpy(np.asarray(value, float)) for value in values))
 
 
-def parameters(
-    states: States,
-    rig: Rig,
+def model_parameters(
+    states: EyeStates,
+    rig: CameraRig,
     *,
     pixel_rad: float,
-    exposed: States | None = None,
-    view: View | None = None,
+    exposed: EyeStates | None = None,
+    view: CameraView | None = None,
 ) -> Tensor:
     """(n, COUNT) parameters of :mod:`codesign.eye.model` in float64, differentiable in
     gaze, torsion, slip, mount.
@@ -422,7 +430,7 @@ def _row(places: Mapping[int, Tensor]) -> Tensor:
     return torch.cat(columns, 1)
 
 
-def mean_eye_um(rig: Rig) -> tuple[tuple[float, float, float], float]:
+def mean_eye_um(rig: CameraRig) -> tuple[tuple[float, float, float], float]:
     """Rotation centre of the population's mean eye before this camera, and how far its
     pupil lies from that centre.
     """
@@ -446,8 +454,8 @@ def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Te
     return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
 
 
-def directions(
-    states: States, rig: Rig, view: View | None = None
+def eye_axes(
+    states: EyeStates, rig: CameraRig, view: CameraView | None = None
 ) -> tuple[Tensor, Tensor]:
     """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors."""
     axis, across, down = _turned(_face(rig, states, view), states)
@@ -461,7 +469,7 @@ def directions(
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
-def _axes(rig: Rig, view: View | None) -> Tensor:
+def _axes(rig: CameraRig, view: CameraView | None) -> Tensor:
     """(3, 1 or n, 3) axes of the face before the camera, or before each of the cameras
     of a view.
     """
@@ -473,7 +481,7 @@ def _axes(rig: Rig, view: View | None) -> Tensor:
 
 
 def _face(
-    rig: Rig, states: States, view: View | None = None
+    rig: CameraRig, states: EyeStates, view: CameraView | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Axes of the face in the camera's frame: right, down, and out towards the viewer."""
     right, down, out = (
@@ -483,7 +491,7 @@ def _face(
 
 
 def _nominal_centre(
-    rig: Rig, depth_um: Tensor, behind_um: Tensor, view: View | None = None
+    rig: CameraRig, depth_um: Tensor, behind_um: Tensor, view: CameraView | None = None
 ) -> Tensor:
     out = _axes(rig, view)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
@@ -492,7 +500,11 @@ def _nominal_centre(
 
 
 def _exposure_depth(
-    rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States, view: View | None
+    rig: CameraRig,
+    depth_um: Tensor,
+    behind_um: Tensor,
+    states: EyeStates,
+    view: CameraView | None,
 ) -> Tensor:
     """(n,) distance of the face for which exposure and edges are set, without
     derivatives.
@@ -505,7 +517,7 @@ def _exposure_depth(
 
 
 def _turned(
-    face: tuple[Tensor, Tensor, Tensor], states: States
+    face: tuple[Tensor, Tensor, Tensor], states: EyeStates
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Optic axis and iris axes after the least rotation that points the eye (Listing's
     law), then torsion about it.

@@ -10,17 +10,23 @@ from torch import Tensor
 
 from codesign.eye import model, textures
 from codesign.eye.landmarks import NAMES, iris_to_camera, landmark_points
-from codesign.eye.population import Rig, States, _turn, directions, parameters
-from codesign.eye.view import View
-from metalens.ground.arrays import Array
-from metalens.ground.errors import SceneError
+from codesign.eye.population import (
+    CameraRig,
+    EyeStates,
+    _turn,
+    eye_axes,
+    model_parameters,
+)
+from codesign.eye.view import CameraView
+from metalens.core.arrays import Array
+from metalens.core.errors import SceneError
 from metalens.image import Frames
 
 MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z")  # rad, rad, um, um, um
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class PinholeCamera:
     """The pinhole grid that frames are rendered on: the image side of the lens, turned
     upright.
 
@@ -36,13 +42,13 @@ class Camera:
                 f"camera of {self.pixels} pixels of {self.pitch_um} um: need 1-8192 pixels, pitch above 0"
             )
 
-    def tangents(self, rig: Rig) -> Array:
+    def tangents(self, rig: CameraRig) -> Array:
         """(pixels,) tangents of the rays through the pixel centres along one side."""
         return (np.arange(self.pixels) - (self.pixels - 1) / 2) * (
             self.pitch_um / rig.sensor_distance_um
         )
 
-    def position_px(self, tangent: Tensor, rig: Rig) -> Tensor:
+    def position_px(self, tangent: Tensor, rig: CameraRig) -> Tensor:
         """Pixel coordinates (x, y) of tangents; the first pixel's centre is 0."""
         return (
             tangent * (rig.sensor_distance_um / self.pitch_um) + (self.pixels - 1) / 2
@@ -50,7 +56,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Labels:
+class FrameLabels:
     """What is true of each frame, in the camera's frame; lengths with the scale of the
     state applied.
 
@@ -79,14 +85,14 @@ class Labels:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rendered:
+class RenderedFrames:
     """frames: near and far sheet. pupil: (n, y, x) visible share of pupil in every
     pixel. labels: of every frame.
     """
 
     frames: Frames
     pupil: Tensor
-    labels: Labels
+    labels: FrameLabels
 
     def pinhole(self) -> Tensor:
         """(n, y, x) what a perfect lens would show."""
@@ -94,14 +100,14 @@ class Rendered:
 
 
 def render(
-    states: States,
+    states: EyeStates,
     *,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
     texture_seed: int = 0,
-    exposed: States | None = None,
-    view: View | None = None,
-) -> Rendered:
+    exposed: EyeStates | None = None,
+    view: CameraView | None = None,
+) -> RenderedFrames:
     """Render states with labels, masks and depth (float32); compiled, on all threads of
     numba.
 
@@ -116,8 +122,8 @@ def render(
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
     """
-    rig, camera = rig or Rig(), camera or Camera()
-    p = parameters(
+    rig, camera = rig or CameraRig(), camera or PinholeCamera()
+    p = model_parameters(
         states,
         rig,
         pixel_rad=camera.pitch_um / rig.sensor_distance_um,
@@ -126,13 +132,18 @@ def render(
     )
     wide = np.ones(len(states)) if view is None else view.wide.numpy()
     frames, mask = _compiled(p, states.scale, rig, camera, texture_seed, wide)
-    return Rendered(
+    return RenderedFrames(
         frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view)
     )
 
 
 def _compiled(
-    p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int, wide: Array
+    p: Tensor,
+    scale: Tensor,
+    rig: CameraRig,
+    camera: PinholeCamera,
+    seed: int,
+    wide: Array,
 ) -> tuple[Frames, Tensor]:
     from codesign.eye import kernel as render_kernel
 
@@ -147,27 +158,29 @@ def _compiled(
             slice(first, end),
         )
         out = (light[run], cover[run], depth[run], pupil[run])
-        render_kernel.render(values[run], factor[run], textures.pairs(seed), t, t, *out)
+        render_kernel.render(
+            values[run], factor[run], textures.packed_bank(seed), t, t, *out
+        )
     return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(
         pupil[:, 0]
     )
 
 
 def _labels(
-    states: States,
+    states: EyeStates,
     p: Tensor,
     mask: Tensor,
     *,
-    rig: Rig,
-    camera: Camera,
-    view: View | None,
-) -> Labels:
+    rig: CameraRig,
+    camera: PinholeCamera,
+    view: CameraView | None,
+) -> FrameLabels:
     p, scale = p.detach(), states.scale[:, None]
     wide = torch.ones_like(states.scale) if view is None else view.wide
     across = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
     centre = p[:, model.CENTRE : model.CENTRE + 3]
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
-    optic, visual = directions(states, rig, view)
+    optic, visual = eye_axes(states, rig, view)
     here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     middle_and_rim = camera.position_px(
         iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig
@@ -180,7 +193,7 @@ def _labels(
     grid = torch.arange(camera.pixels, dtype=torch.float64)
     sums = [(line * grid).sum(1) / weight.clamp_min(1e-9) for line in (columns, rows)]
     centroid = torch.where(weight[:, None] > 1e-6, torch.stack(sums, 1), middle)
-    return Labels(
+    return FrameLabels(
         slip_um=scale * across * (here + states.slip_um) - here,
         shift_um=scale * across * (_seen_place(states, rig) + states.slip_um) - here,
         optic_axis=optic.detach(),
@@ -194,7 +207,7 @@ def _labels(
     )
 
 
-def _seen_place(states: States, rig: Rig) -> Tensor:
+def _seen_place(states: EyeStates, rig: CameraRig) -> Tensor:
     """(n, 3) where a pupil that looks straight ahead stands before a camera turned by
     its mounting; not slipped.
     """
@@ -221,7 +234,7 @@ def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sensitivities:
+class FrameSensitivities:
     """Frames and their exact derivatives along two motions.
 
     frames: as rendered. first, second: derivative of every field of ``frames`` (per
@@ -233,14 +246,14 @@ class Sensitivities:
     second: Frames
 
 
-def sensitivities(
-    states: States,
+def render_sensitivities(
+    states: EyeStates,
     motions: tuple[str, str] = ("gaze_x", "slip_z"),
     *,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
     texture_seed: int = 0,
-) -> Sensitivities:
+) -> FrameSensitivities:
     """Derivatives of the rendered sheets by forward-mode dual numbers, compiled
     (float32).
 
@@ -251,14 +264,14 @@ def sensitivities(
     """
     from codesign.eye import kernel as render_kernel
 
-    rig, camera = rig or Rig(), camera or Camera()
+    rig, camera = rig or CameraRig(), camera or PinholeCamera()
     packed = torch.stack(parameter_tangents(states, motions, rig=rig, camera=camera), 1)
     n, size = len(states), camera.pixels
     t = camera.tangents(rig).astype(np.float32)
     out = np.empty((n, 3, 5, size, size), np.float32)
     render_kernel.differentiate(
         packed.numpy().astype(np.float32),
-        textures.pairs(texture_seed),
+        textures.packed_bank(texture_seed),
         t,
         t,
         out.reshape(n, 15, size, size),
@@ -267,7 +280,7 @@ def sensitivities(
     value, first, second = (torch.from_numpy(out[:, k]) for k in range(3))
     hidden = torch.stack([1 - value[:, 2], value[:, 2]], 1)
     turns = [torch.stack([-d[:, 2], d[:, 2]], 1) for d in (first, second)]
-    return Sensitivities(
+    return FrameSensitivities(
         Frames(value[:, :2], hidden, value[:, 3:] * scale),
         Frames(first[:, :2], turns[0], first[:, 3:] * scale),
         Frames(second[:, :2], turns[1], second[:, 3:] * scale),
@@ -275,7 +288,11 @@ def sensitivities(
 
 
 def parameter_tangents(
-    states: States, motions: tuple[str, str], *, rig: Rig, camera: Camera
+    states: EyeStates,
+    motions: tuple[str, str],
+    *,
+    rig: CameraRig,
+    camera: PinholeCamera,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Parameters (n, COUNT) and their derivatives along two motions."""
     for name in motions:
@@ -288,7 +305,7 @@ def parameter_tangents(
             gaze_rad=states.gaze_rad + change[:, :2],
             slip_um=states.slip_um + change[:, 2:],
         )
-        return parameters(
+        return model_parameters(
             moved, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
         )
 
@@ -302,8 +319,8 @@ def parameter_tangents(
     return values, slopes[0], slopes[1]
 
 
-def twin(
-    p: Tensor, rig: Rig, camera: Camera, *, texture_seed: int = 0
+def render_in_torch(
+    p: Tensor, rig: CameraRig, camera: PinholeCamera, *, texture_seed: int = 0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The compiled frames again, in torch and the dtype of ``p``: exact,
     differentiable, and slow.
@@ -314,7 +331,7 @@ def twin(
     Returns:
         light, coverage, depth (n, 2, y, x) and pupil (n, y, x).
     """
-    bank = torch.tensor(textures.bank(texture_seed), dtype=p.dtype)
+    bank = torch.tensor(textures.texture_bank(texture_seed), dtype=p.dtype)
     t = torch.from_numpy(camera.tangents(rig)).to(p)
     q = p.mT[:, :, None, None]
     dx, dy, dz = model.ray(t, t[:, None])
@@ -332,11 +349,11 @@ def twin(
 
 __all__ = [
     "NAMES",
-    "Camera",
-    "Labels",
-    "Rendered",
-    "Sensitivities",
+    "FrameLabels",
+    "FrameSensitivities",
+    "PinholeCamera",
+    "RenderedFrames",
     "render",
-    "sensitivities",
-    "twin",
+    "render_in_torch",
+    "render_sensitivities",
 ]

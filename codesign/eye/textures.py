@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy import ndimage
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 SIZE = 256  # of every picture, a power of two; periodic
 VARIANTS = 16  # of each kind
@@ -17,7 +17,7 @@ KINDS = ("iris", "vein", "skin", "fine", "lash")
 
 
 @functools.lru_cache(maxsize=2)
-def bank(seed: int = 0) -> Array:
+def texture_bank(seed: int = 0) -> Array:
     """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants
     of a kind together; about 1 s.
     """
@@ -33,17 +33,17 @@ def bank(seed: int = 0) -> Array:
 
 
 @functools.lru_cache(maxsize=2)
-def pairs(seed: int = 0) -> Array:
+def packed_bank(seed: int = 0) -> Array:
     """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its
     right neighbour, flat.
     """
-    steps = np.round(bank(seed) * STEPS).astype(np.int32)
+    steps = np.round(texture_bank(seed) * STEPS).astype(np.int32)
     out = ((steps & 0xFFFF) | (np.roll(steps, -1, axis=2) << 16)).ravel()
     out.flags.writeable = False
     return out
 
 
-def noise(
+def periodic_noise(
     rng: np.random.Generator,
     *,
     power: float,
@@ -71,12 +71,14 @@ def _iris(rng: np.random.Generator) -> Array:
     rho = (np.arange(rings) / (rings - 1))[:, None]
     fibres = np.tanh(
         0.9
-        * noise(rng, power=0.7, stretch=rng.uniform(5, 11), shape=(2 * rings, turns))[
-            :rings
-        ]
+        * periodic_noise(
+            rng, power=0.7, stretch=rng.uniform(5, 11), shape=(2 * rings, turns)
+        )[:rings]
     )
-    clouds = noise(rng, power=1.4, stretch=2.0, shape=(2 * rings, turns))[:rings]
-    wave = 0.28 + 0.05 * np.tanh(noise(rng, power=1.2, shape=(4, turns))[:1])
+    clouds = periodic_noise(rng, power=1.4, stretch=2.0, shape=(2 * rings, turns))[
+        :rings
+    ]
+    wave = 0.28 + 0.05 * np.tanh(periodic_noise(rng, power=1.2, shape=(4, turns))[:1])
     collarette = np.exp(-(((rho - wave) / 0.045) ** 2))
     furrows = sum(
         np.exp(
@@ -85,7 +87,8 @@ def _iris(rng: np.random.Generator) -> Array:
                     (
                         rho
                         - at
-                        - 0.02 * np.tanh(noise(rng, power=1.5, shape=(4, turns))[:1])
+                        - 0.02
+                        * np.tanh(periodic_noise(rng, power=1.5, shape=(4, turns))[:1])
                     )
                     / 0.016
                 )
@@ -185,14 +188,17 @@ def _vessel(
 def _skin(rng: np.random.Generator) -> Array:
     """Blotches and shallow folds that run across."""
     return np.asarray(
-        np.tanh(0.6 * noise(rng, power=1.4) + 0.5 * noise(rng, power=1.1, stretch=4.0))
+        np.tanh(
+            0.6 * periodic_noise(rng, power=1.4)
+            + 0.5 * periodic_noise(rng, power=1.1, stretch=4.0)
+        )
     )
 
 
 def _fine(rng: np.random.Generator) -> Array:
     """Pores and the net of fine lines."""
-    pores = noise(rng, power=0.8)
-    lines = np.abs(noise(rng, power=1.1, stretch=rng.uniform(0.4, 1.6))) - 0.8
+    pores = periodic_noise(rng, power=0.8)
+    lines = np.abs(periodic_noise(rng, power=1.1, stretch=rng.uniform(0.4, 1.6))) - 0.8
     return np.asarray(np.tanh(0.5 * pores + 0.9 * lines))
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class View:
+class CameraView:
     """Another camera for each of n frames; its lamps go with it, and the nominal pupil
     lies where the rig's does.
 
@@ -47,7 +47,7 @@ def face_axes(elevation_rad: float) -> Tensor:
     )
 
 
-def seen_axes(elevation_rad: float, view: View) -> Tensor:
+def seen_axes(elevation_rad: float, view: CameraView) -> Tensor:
     """(n, 3, 3) of :func:`face_axes` as these cameras see them: Rz(roll) [axes after
     Ry(side) at elevation - tilt].
     """

@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from codesign.eye.hair import lashes, patches
-from codesign.eye.population import POPULATION, Rig, States
-from codesign.eye.renderer import Camera, Labels, Rendered, render
-from codesign.eye.view import View
-from metalens.ground.arrays import Array
+from codesign.eye.hair import draw_lashes, soft_patches
+from codesign.eye.population import POPULATION, CameraRig, EyeStates
+from codesign.eye.renderer import FrameLabels, PinholeCamera, RenderedFrames, render
+from codesign.eye.view import CameraView
+from metalens.core.arrays import Array
 from metalens.image import Frames
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class FrameAugmentation:
     """Something that a frame may have: in this share of them at variety 2, its size
     drawn evenly from a range.
 
@@ -38,122 +38,124 @@ class Cause:
     what: str
 
 
-CAUSES: Mapping[str, Cause] = {
-    "tilt": Cause(
+CAUSES: Mapping[str, FrameAugmentation] = {
+    "tilt": FrameAugmentation(
         0.7,
         -30.0,
         50.0,
         "deg",
         "the camera sees the face from below or above its usual place",
     ),
-    "liner": Cause(
+    "liner": FrameAugmentation(
         0.25,
         0.3,
         0.9,
         "opacity",
         "dark line along the lids' margins: liner, mascara, dense lashes",
     ),
-    "lid_shadow": Cause(
+    "lid_shadow": FrameAugmentation(
         0.25, 0.15, 0.6, "opacity", "darkened upper lid: eye shadow, a deep socket"
     ),
-    "rim": Cause(
+    "rim": FrameAugmentation(
         0.2, 0.03, 0.10, "frame widths", "band of a spectacle frame before the face"
     ),
-    "reflection": Cause(
+    "reflection": FrameAugmentation(
         0.25, 0.15, 0.8, "radiance", "windows and lamps mirrored in spectacle glass"
     ),
-    "glints": Cause(
+    "glints": FrameAugmentation(
         0.4, 0.4, 1.2, "radiance", "mirror images of lamps on the cornea and the tears"
     ),
-    "gradient": Cause(
+    "gradient": FrameAugmentation(
         0.6,
         0.1,
         0.7,
         "of the mean light",
         "light that falls off from one side to the other",
     ),
-    "shade": Cause(
+    "shade": FrameAugmentation(
         0.25,
         0.2,
         0.7,
         "of the light",
         "shadow with a soft edge, of brow, nose or frame",
     ),
-    "movement": Cause(
+    "movement": FrameAugmentation(
         0.3,
         0.008,
         0.04,
         "frame widths",
         "the eye or the camera moves during the exposure",
     ),
-    "vignette": Cause(
+    "vignette": FrameAugmentation(
         0.4,
         0.1,
         0.8,
         "of the light",
         "another camera's corners are darker than its middle",
     ),
-    "saturation": Cause(
+    "saturation": FrameAugmentation(
         0.25,
         0.01,
         0.15,
         "of the pixels",
         "the brightest part of the frame is at the camera's white",
     ),
-    "tone": Cause(
+    "tone": FrameAugmentation(
         0.5,
         -0.6,
         0.6,
         "logarithm of gamma",
         "another camera's curve: dark parts lifted or crushed",
     ),
-    "side": Cause(
+    "side": FrameAugmentation(
         0.6, -40.0, 40.0, "deg", "the camera sees the face from its left or right"
     ),
-    "roll": Cause(0.5, -25.0, 25.0, "deg", "the camera is turned about its axis"),
-    "wide": Cause(
+    "roll": FrameAugmentation(
+        0.5, -25.0, 25.0, "deg", "the camera is turned about its axis"
+    ),
+    "wide": FrameAugmentation(
         0.7,
         1.1,
         2.2,
         "times the field",
         "a wider field: the whole opening of the lids, lashes and brow",
     ),
-    "iris": Cause(
+    "iris": FrameAugmentation(
         0.35,
         0.08,
         0.5,
         "of the albedo",
         "irises little brighter than the pupil, as some are beyond 900 nm",
     ),
-    "overhang": Cause(
+    "overhang": FrameAugmentation(
         0.5,
         0.5,
         1.0,
         "opacity",
         "dark lashes from the lids' margins, across the eye and its lids",
     ),
-    "socket": Cause(
+    "socket": FrameAugmentation(
         0.3,
         0.2,
         0.75,
         "of the light",
         "the eye lies darker than the skin: deep sockets, lamps from the side",
     ),
-    "patch": Cause(
+    "patch": FrameAugmentation(
         0.4,
         0.4,
         0.95,
         "opacity",
         "dark places of the skin: brow, hair, nostril, socket",
     ),
-    "retina": Cause(
+    "retina": FrameAugmentation(
         0.2,
         0.02,
         0.25,
         "radiance",
         "light from the retina, of lamps near the camera's axis",
     ),
-    "veil": Cause(
+    "veil": FrameAugmentation(
         0.4,
         0.02,
         0.2,
@@ -172,7 +174,7 @@ TAPS = 15  # of the kernel of a movement, at most its length
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Worn:
+class DrawnAugmentations:
     """What each of n frames has: ``size`` by cause, 0 where it is off.
 
     draws: by cause, (n, 12) independent draws in [0, 1) that place it.
@@ -181,21 +183,23 @@ class Worn:
     size: Mapping[str, Array]
     draws: Mapping[str, Array]
 
-    def __getitem__(self, rows: Array | slice) -> "Worn":
+    def __getitem__(self, rows: Array | slice) -> "DrawnAugmentations":
         """Those of some frames."""
         parts = (
             {name: held[rows] for name, held in of.items()}
             for of in (self.size, self.draws)
         )
-        return Worn(*parts)
+        return DrawnAugmentations(*parts)
 
-    def from_one_view(self) -> "Worn":
+    def from_one_view(self) -> "DrawnAugmentations":
         """The same before the stage's own camera: no cause of :data:`VIEWS`."""
         still = {n: 0 * v if n in VIEWS else v for n, v in self.size.items()}
-        return Worn(still, self.draws)
+        return DrawnAugmentations(still, self.draws)
 
 
-def drawn_of_people(who: Array, variety: float, seed: tuple[int, ...]) -> Worn:
+def drawn_of_people(
+    who: Array, variety: float, seed: tuple[int, ...]
+) -> DrawnAugmentations:
     """What frames of some people have before the camera of one stage.
 
     One draw a person, but movement, which is drawn for every frame.
@@ -203,17 +207,19 @@ def drawn_of_people(who: Array, variety: float, seed: tuple[int, ...]) -> Worn:
     Args:
         who: (n,) number of the person in each frame, from 0.
     """
-    people = drawn(
+    people = draw_augmentations(
         int(who.max()) + 1, variety, np.random.default_rng((*seed, 0))
     ).from_one_view()
-    each = drawn(len(who), variety, np.random.default_rng((*seed, 1)))
+    each = draw_augmentations(len(who), variety, np.random.default_rng((*seed, 1)))
     worn = people[who]
     size, draws = dict(worn.size), dict(worn.draws)
     size["movement"], draws["movement"] = each.size["movement"], each.draws["movement"]
-    return Worn(size, draws)
+    return DrawnAugmentations(size, draws)
 
 
-def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
+def draw_augmentations(
+    count: int, variety: float, generator: np.random.Generator
+) -> DrawnAugmentations:
     """Causes of ``count`` frames; off everywhere up to variety 1. The same generator
     draws the same at any variety.
     """
@@ -222,21 +228,32 @@ def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
         on = generator.random(count) < min(cause.share * max(variety - 1.0, 0.0), 1.0)
         size[name] = np.where(on, generator.uniform(cause.low, cause.high, count), 0.0)
         draws[name] = generator.random((count, 12))
-    return Worn(size, draws)
+    return DrawnAugmentations(size, draws)
 
 
-def render_dressed(states: States, worn: Worn, *, rig: Rig, camera: Camera) -> Rendered:
+def render_dressed(
+    states: EyeStates,
+    worn: DrawnAugmentations,
+    *,
+    rig: CameraRig,
+    camera: PinholeCamera,
+) -> RenderedFrames:
     """Frames of states with all that they have; bare ones where nothing is on."""
     if not any(size.any() for size in worn.size.values()):
         return render(states, rig=rig, camera=camera)
-    plain = render(pigmented(states, worn), rig=rig, camera=camera, view=viewed(worn))
-    return dressed(plain, worn)
+    plain = render(
+        augment_irises(states, worn),
+        rig=rig,
+        camera=camera,
+        view=augmented_cameras(worn),
+    )
+    return apply_augmentations(plain, worn)
 
 
-def viewed(worn: Worn) -> View:
+def augmented_cameras(worn: DrawnAugmentations) -> CameraView:
     """The cameras that the frames are rendered from."""
     tilt, side, roll, wide = (torch.from_numpy(worn.size[name]) for name in VIEWS)
-    return View(
+    return CameraView(
         torch.deg2rad(tilt),
         torch.deg2rad(side),
         torch.deg2rad(roll),
@@ -244,16 +261,18 @@ def viewed(worn: Worn) -> View:
     )
 
 
-def pigmented(states: States, worn: Worn) -> States:
+def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
     """The states with the irises that some frames have."""
     traits, size = states.traits.clone(), torch.from_numpy(worn.size["iris"])
     traits[:, list(POPULATION).index("iris")] *= torch.where(size > 0, size, 1.0)
     return replace(states, traits=traits)
 
 
-def dressed(made: Rendered, worn: Worn) -> Rendered:
-    """Rendered frames with what is worn but the causes of :func:`viewed` and
-    :func:`pigmented`: those came before.
+def apply_augmentations(
+    made: RenderedFrames, worn: DrawnAugmentations
+) -> RenderedFrames:
+    """Rendered frames with what is worn but the causes of :func:`augmented_cameras` and
+    :func:`augment_irises`: those came before.
 
     Light, coverage and depth of both sheets change, and the pupil's mask where
     something hides or moves it; of the
@@ -274,7 +293,7 @@ def dressed(made: Rendered, worn: Worn) -> Rendered:
     ):
         for step in steps:
             step(light, cover, depth, pupil, grid, worn, made.labels)
-    return Rendered(
+    return RenderedFrames(
         Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil)
     )
 
@@ -285,7 +304,7 @@ def _grid(pixels: int) -> tuple[Tensor, Tensor]:
     return line[None], line[:, None]
 
 
-def _on(worn: Worn, name: str) -> list[tuple[int, float, Array]]:
+def _on(worn: DrawnAugmentations, name: str) -> list[tuple[int, float, Array]]:
     """(frame, size, draws) of every frame that has a cause."""
     size, draws = worn.size[name], worn.draws[name]
     return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
@@ -297,8 +316,8 @@ def _made_up(
     depth: Tensor,
     pupil: Tensor,
     grid: object,
-    worn: Worn,
-    of: Labels,
+    worn: DrawnAugmentations,
+    of: FrameLabels,
 ) -> None:
     """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin
     above, up to 12 % of the frame.
@@ -321,8 +340,8 @@ def _grown(
     depth: Tensor,
     pupil: Tensor,
     grid: object,
-    worn: Worn,
-    of: Labels,
+    worn: DrawnAugmentations,
+    of: FrameLabels,
 ) -> None:
     """A darker eye, light of the retina, dark places of the skin, lashes over both
     sheets; masks stay outlines.
@@ -332,9 +351,9 @@ def _grown(
     for i, radiance, _ in _on(worn, "retina"):
         light[i, 1] += radiance * pupil[i]
     for i, opacity, draws in _on(worn, "patch"):
-        light[i, 0] *= 1 - opacity * patches(int(light.shape[-1]), draws)
+        light[i, 0] *= 1 - opacity * soft_patches(int(light.shape[-1]), draws)
     for i, opacity, draws in _on(worn, "overhang"):
-        light[i] *= 1 - opacity * lashes(cover[i, 1], draws)
+        light[i] *= 1 - opacity * draw_lashes(cover[i, 1], draws)
 
 
 def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
@@ -352,8 +371,15 @@ def _soft(picture: Tensor, width: float) -> Tensor:
     return F.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
-def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
-            of: Labels) -> None:  # fmt: skip
+def _glints(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: tuple[Tensor, Tensor],
+    worn: DrawnAugmentations,
+    of: FrameLabels,
+) -> None:
     """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is
     seen of the eye.
     """
@@ -370,8 +396,8 @@ def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tu
             )
 
 
-def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
-         of: Labels) -> None:  # fmt: skip
+def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: DrawnAugmentations,
+         of: FrameLabels) -> None:  # fmt: skip
     """Uneven light and shadows: a factor on both sheets."""
     x, y = grid
     for i, change, draws in _on(worn, "gradient"):
@@ -383,8 +409,15 @@ def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple
         light[i] *= 1 - taken * torch.sigmoid(away / edge)
 
 
-def _spectacles(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
-                of: Labels) -> None:  # fmt: skip
+def _spectacles(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: tuple[Tensor, Tensor],
+    worn: DrawnAugmentations,
+    of: FrameLabels,
+) -> None:
     """Mirrored windows on the glass, then the rim before all: an arc that hides what is
     behind it.
     """
@@ -442,8 +475,8 @@ def _moved(
     depth: Tensor,
     pupil: Tensor,
     grid: object,
-    worn: Worn,
-    of: Labels,
+    worn: DrawnAugmentations,
+    of: FrameLabels,
 ) -> None:
     """Both sheets and the mask averaged along a line: what the pixels collect while the
     picture moves.
@@ -464,8 +497,15 @@ def _moved(
         )
 
 
-def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
-              of: Labels) -> None:  # fmt: skip
+def _recorded(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: tuple[Tensor, Tensor],
+    worn: DrawnAugmentations,
+    of: FrameLabels,
+) -> None:
     """As another camera gives it: stray light, darker corners, white from some level
     on, a curve from black to white.
 
@@ -510,7 +550,7 @@ def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     return torch.from_numpy(kernel / kernel.sum()).float()
 
 
-def _labels(labels: Labels, before: Tensor, after: Tensor) -> Labels:
+def _labels(labels: FrameLabels, before: Tensor, after: Tensor) -> FrameLabels:
     """Centroid and visible share of the pupil as its mask is now."""
     was, now = before.sum((1, 2)).double(), after.sum((1, 2)).double()
     share = torch.where(was > 1e-6, now / was.clamp_min(1e-9), torch.ones_like(was))

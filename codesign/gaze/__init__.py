@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.gaze import bench as bench
@@ -11,26 +11,26 @@ if TYPE_CHECKING:
     from codesign.gaze import shared as shared
     from codesign.gaze.bench import GazeErrors as GazeErrors
     from codesign.gaze.personal import PersonalGaze as PersonalGaze
-    from codesign.gaze.personal import Sphere as Sphere
+    from codesign.gaze.personal import SphereCalibrator as SphereCalibrator
     from codesign.gaze.personal import angle_deg as angle_deg
-    from codesign.gaze.readings import Calibrator as Calibrator
-    from codesign.gaze.readings import Person as Person
-    from codesign.gaze.readings import Readings as Readings
+    from codesign.gaze.readings import CalibratedPerson as CalibratedPerson
+    from codesign.gaze.readings import NetworkReadings as NetworkReadings
+    from codesign.gaze.readings import PersonCalibrator as PersonCalibrator
     from codesign.gaze.readings import face_angles as face_angles
-    from codesign.gaze.shared import Own as Own
-    from codesign.gaze.shared import People as People
+    from codesign.gaze.shared import MixedModelPerson as MixedModelPerson
+    from codesign.gaze.shared import PopulationPrior as PopulationPrior
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Calibrator": "readings",
+        "PersonCalibrator": "readings",
         "GazeErrors": "bench",
-        "Own": "shared",
-        "People": "shared",
-        "Person": "readings",
+        "MixedModelPerson": "shared",
+        "PopulationPrior": "shared",
+        "CalibratedPerson": "readings",
         "PersonalGaze": "personal",
-        "Readings": "readings",
-        "Sphere": "personal",
+        "NetworkReadings": "readings",
+        "SphereCalibrator": "personal",
         "angle_deg": "personal",
         "bench": "",
         "face_angles": "readings",

@@ -5,7 +5,7 @@ With a population eye the error is that of anatomy, 3 degrees whatever the lens.
 test takes several frames of each
 of several people, calibrates on a fifth of them (the paper's 20 % of the points), and
 judges the rest. Where the optic
-axis is read too, :func:`learnt` makes a calibrator of what other people's frames tell.
+axis is read too, :func:`learn_from_people` makes a calibrator of what other people's frames tell.
 """
 
 import math
@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.batches import Batch, EyeScenes, as_batch
+from codesign.batches import EyeScenes, FrameBatch, as_batch
 from codesign.eye import (
-    Labels,
-    States,
-    Worn,
+    DrawnAugmentations,
+    EyeStates,
+    FrameLabels,
     drawn_of_people,
     render,
     render_dressed,
@@ -27,14 +27,14 @@ from codesign.eye import (
 from codesign.eye import population as eye
 from codesign.gaze import shared
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
-from codesign.gaze.personal import Sphere, angle_deg
-from codesign.gaze.readings import Calibrator, Readings, face_angles
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
+from codesign.gaze.personal import SphereCalibrator, angle_deg
+from codesign.gaze.readings import NetworkReadings, PersonCalibrator, face_angles
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class People:
+class PeopleFrames:
     """Frames of ``people`` people, ``each`` one after the other; see
     :class:`codesign.train.inner.Scenes`.
 
@@ -42,9 +42,9 @@ class People:
     """
 
     scenes: EyeScenes
-    states: States
-    worn: Worn
-    labels: Labels
+    states: EyeStates
+    worn: DrawnAugmentations
+    labels: FrameLabels
     people: int
 
     @property
@@ -62,7 +62,7 @@ class People:
         """Frames of a person."""
         return len(self.states) // self.people
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """Frames of a step."""
         rows = slice(step * size, (step + 1) * size)
         made = render_dressed(
@@ -74,12 +74,14 @@ class People:
         return as_batch(made, self.margin)
 
 
-def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
+def simulate_people(
+    scenes: EyeScenes, count: int, each: int, *, seed: int
+) -> PeopleFrames:
     """``count`` people who look and slip in ``each`` ways; one mounting of the camera a
     person, no change of scale.
     """
-    subjects = eye.draw(count, (seed, 21), motion=scenes.settings.motion)
-    moves = eye.draw(count * each, (seed, 22), motion=scenes.settings.motion)
+    subjects = eye.draw_states(count, (seed, 21), motion=scenes.settings.motion)
+    moves = eye.draw_states(count * each, (seed, 22), motion=scenes.settings.motion)
     rows = torch.arange(count).repeat_interleave(each)
     mine = subjects[rows]
     states = replace(
@@ -92,7 +94,7 @@ def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
     )
     worn = drawn_of_people(rows.numpy(), scenes.settings.variety, (seed, 23))
     labels = render(states, rig=scenes.rig, camera=camera).labels
-    return People(scenes, states, worn, labels, count)
+    return PeopleFrames(scenes, states, worn, labels, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +118,8 @@ class GazeErrors:
 
 
 def read_of(
-    test: People, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None
-) -> Readings:
+    test: PeopleFrames, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None
+) -> NetworkReadings:
     """What a network found in the frames, in the units that gaze is calibrated in.
 
     Args:
@@ -132,25 +134,35 @@ def read_of(
         if axis is None
         else face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
     )
-    return Readings(centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles)
+    return NetworkReadings(
+        centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles
+    )
 
 
-def looked_deg(test: People) -> Array:
+def looked_deg(test: PeopleFrames) -> Array:
     """(n, 2) angles of the visual axes, across and down in the frame of the face."""
     return face_angles(test.labels.visual_axis.numpy(), test.scenes.rig.elevation_rad)
 
 
-def learnt(before: People, read: Readings) -> shared.People:
+def learn_from_people(
+    before: PeopleFrames, read: NetworkReadings
+) -> shared.PopulationPrior:
     """What the frames of other people tell of gaze, by which a person is calibrated.
 
     Raises:
         TrainingError: too few people or frames, or readings without an axis.
     """
-    return shared.learn(read, looked_deg(before), np.arange(len(read)) // before.each)
+    return shared.learn_population(
+        read, looked_deg(before), np.arange(len(read)) // before.each
+    )
 
 
 def calibrated_error_deg(
-    test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2
+    test: PeopleFrames,
+    read: NetworkReadings,
+    *,
+    how: PersonCalibrator | None = None,
+    share: float = 0.2,
 ) -> float:
     """Mean angle between read and true visual axes, deg, over the frames that no
     calibration used.
@@ -160,7 +172,10 @@ def calibrated_error_deg(
             regressor (paper Sec. 3.3).
         share: part of each person's frames that calibrates.
     """
-    how, known = how or Sphere(test.scenes.rig), max(3, round(share * test.each))
+    how, known = (
+        how or SphereCalibrator(test.scenes.rig),
+        max(3, round(share * test.each)),
+    )
     looked, errors = looked_deg(test), []
     for first in range(0, test.people * test.each, test.each):
         mine = np.arange(first, first + known)
@@ -171,7 +186,11 @@ def calibrated_error_deg(
 
 
 def gaze_errors(
-    test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2
+    test: PeopleFrames,
+    read: NetworkReadings,
+    *,
+    how: PersonCalibrator | None = None,
+    share: float = 0.2,
 ) -> GazeErrors:
     """Gaze from what a network found in the frames.
 
@@ -190,11 +209,11 @@ def gaze_errors(
             f"{known} of {test.each} frames a person calibrate: need 3 or more, and some to judge"
         )
     camera = test.scenes.camera.pitch_um * test.scenes.camera.pixels / 32
-    true = Readings(
+    true = NetworkReadings(
         ((test.labels.pupil_px - 15.5) * camera * 1e-3).numpy(),
         (test.labels.slip_um * 1e-3).numpy(),
     )
-    sphere = Sphere(test.scenes.rig)
+    sphere = SphereCalibrator(test.scenes.rig)
     found, floor = (
         _angles(test, read, how or sphere, known),
         _angles(test, true, sphere, known),
@@ -203,7 +222,7 @@ def gaze_errors(
 
 
 def _angles(
-    test: People, read: Readings, how: Calibrator, known: int
+    test: PeopleFrames, read: NetworkReadings, how: PersonCalibrator, known: int
 ) -> tuple[float, float, float]:
     labels = test.labels
     pupil_mm, slip_mm = torch.from_numpy(read.pupil_mm), torch.from_numpy(read.slip_mm)
@@ -231,7 +250,7 @@ def _angles(
 
 
 def _fitted(
-    test: People,
+    test: PeopleFrames,
     centre: Tensor,
     radius: float,
     rows: Tensor,

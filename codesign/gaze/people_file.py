@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from codesign.gaze.shared import Mixed, People
-from metalens.ground import store
-from metalens.ground.errors import StoreError
-from metalens.ground.reading import reader
+from codesign.gaze.shared import MixedModel, PopulationPrior
+from metalens.core import store
+from metalens.core.errors import StoreError
+from metalens.core.reading import typed_reader
 
 KIND = "people"
 SHAPES = {
@@ -25,8 +25,8 @@ SHAPES = {
 }
 
 
-def save(
-    path: Path, people: People, *, provenance: store.Provenance | None = None
+def save_people(
+    path: Path, people: PopulationPrior, *, provenance: store.Provenance | None = None
 ) -> None:
     """Write a file of kind ``people``: β, τ² and σ² in deg and deg², middle and spread
     of the readings in deg and mm.
@@ -44,8 +44,8 @@ def save(
     )
 
 
-@reader
-def load(path: Path) -> People:
+@typed_reader
+def load_people(path: Path) -> PopulationPrior:
     """Read a file of kind ``people``.
 
     Raises:
@@ -67,5 +67,5 @@ def load(path: Path) -> People:
         raise StoreError(
             f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again"
         )
-    model = Mixed(found["mean"], found["variance"], found["noise"])
-    return People(model, found["middle"], found["spread"])
+    model = MixedModel(found["mean"], found["variance"], found["noise"])
+    return PopulationPrior(model, found["middle"], found["spread"])

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from codesign.eye import Rig
+from codesign.eye import CameraRig
 from codesign.eye import population as eye
 from codesign.gaze import regressor
 from codesign.gaze.axis import EyeGeometry, angle_rad, optical_axis
-from codesign.gaze.readings import Readings, face_angles
-from codesign.gaze.regressor import Regressor
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
+from codesign.gaze.readings import NetworkReadings, face_angles
+from codesign.gaze.regressor import ResidualRegressor
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
 
 # What people differ by, standard deviations: centre of the eye 1 mm each way (mounting
 # and head), its radius 0.6 mm
@@ -54,7 +54,7 @@ class PersonalGaze:
     mean: EyeGeometry
     elevation_rad: float
     own: Array
-    rest: Regressor | None
+    rest: ResidualRegressor | None
 
     def sphere(self, pupil_mm: Array, slip_mm: Array) -> Array:
         """(n, 2) gaze of the fitted sphere alone, deg."""
@@ -69,7 +69,7 @@ class PersonalGaze:
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
 
-    def __call__(self, read: Readings) -> Array:
+    def __call__(self, read: NetworkReadings) -> Array:
         """(n, 2) gaze across and down, deg, of pupil and slippage."""
         first = self.sphere(read.pupil_mm, read.slip_mm)
         if self.rest is None:
@@ -78,23 +78,23 @@ class PersonalGaze:
 
 
 @dataclass(frozen=True, slots=True)
-class Sphere:
-    """Calibrates by pupil and slippage alone (:func:`fit`).
+class SphereCalibrator:
+    """Calibrates by pupil and slippage alone (:func:`calibrate_person`).
 
     hidden: neurons of the regressor; 0 for none. seed: of its first weights.
     """
 
-    rig: Rig
+    rig: CameraRig
     hidden: int = 10
     seed: int = 0
 
-    def person(self, read: Readings, gaze_deg: Array) -> PersonalGaze:
+    def person(self, read: NetworkReadings, gaze_deg: Array) -> PersonalGaze:
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
 
         Raises:
             TrainingError: fewer than 3 points.
         """
-        return fit(
+        return calibrate_person(
             read.pupil_mm,
             read.slip_mm,
             gaze_deg,
@@ -104,19 +104,19 @@ class Sphere:
         )
 
 
-def mean_geometry(rig: Rig) -> EyeGeometry:
+def mean_geometry(rig: CameraRig) -> EyeGeometry:
     """The population's mean eye before this camera."""
     centre, radius = eye.mean_eye_um(rig)
     x, y, z = (1e-3 * v for v in centre)
     return EyeGeometry((x, y, z), 1e-3 * radius, 1e-3 * rig.sensor_distance_um)
 
 
-def fit(
+def calibrate_person(
     pupil_mm: Array,
     slip_mm: Array,
     gaze_deg: Array,
     *,
-    rig: Rig,
+    rig: CameraRig,
     hidden: int = 10,
     seed: int = 0,
 ) -> PersonalGaze:
@@ -159,7 +159,9 @@ def fit(
     penalty = _penalty(features, missed, gaze_deg, hidden=hidden, seed=seed)
     return replace(
         person,
-        rest=regressor.fit(features, missed, hidden=hidden, penalty=penalty, seed=seed),
+        rest=regressor.fit_regressor(
+            features, missed, hidden=hidden, penalty=penalty, seed=seed
+        ),
     )
 
 
@@ -177,7 +179,7 @@ def _penalty(
         for number in range(FOLDS):
             out = fold == number
             if out.any() and (~out).sum() >= 3:
-                made = regressor.fit(
+                made = regressor.fit_regressor(
                     features[~out],
                     missed[~out],
                     hidden=hidden,
@@ -193,11 +195,11 @@ def _penalty(
 
 def angle_deg(one: Array, other: Array) -> Array:
     """(n,) angle between directions given by their angles across and down, deg."""
-    a, b = (torch.from_numpy(direction(np.radians(v))) for v in (one, other))
+    a, b = (torch.from_numpy(gaze_direction(np.radians(v))) for v in (one, other))
     return np.asarray(np.degrees(angle_rad(a, b).numpy()))
 
 
-def direction(angles_rad: Array) -> Array:
+def gaze_direction(angles_rad: Array) -> Array:
     """(n, 3) unit vectors right, down and out of the face, of angles (n, 2) across and
     down.
     """

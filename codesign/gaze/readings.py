@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 
 from codesign.eye import face_axes
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Readings:
+class NetworkReadings:
     """Of n frames.
 
     pupil_mm: (n, 2) pupil on the sensor, upright image, from the lens axis. slip_mm:
@@ -28,25 +28,25 @@ class Readings:
     def __len__(self) -> int:
         return len(self.pupil_mm)
 
-    def __getitem__(self, rows: Array | slice) -> "Readings":
-        return Readings(
+    def __getitem__(self, rows: Array | slice) -> "NetworkReadings":
+        return NetworkReadings(
             self.pupil_mm[rows],
             self.slip_mm[rows],
             None if self.axis_deg is None else self.axis_deg[rows],
         )
 
 
-class Person(Protocol):
+class CalibratedPerson(Protocol):
     """A calibrated person."""
 
-    def __call__(self, read: Readings) -> Array:
+    def __call__(self, read: NetworkReadings) -> Array:
         """(n, 2) gaze across and down, deg."""
 
 
-class Calibrator(Protocol):
+class PersonCalibrator(Protocol):
     """A way to calibrate people."""
 
-    def person(self, read: Readings, gaze_deg: Array) -> Person:
+    def person(self, read: NetworkReadings, gaze_deg: Array) -> CalibratedPerson:
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down."""
 
 

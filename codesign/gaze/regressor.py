@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Regressor:
+class ResidualRegressor:
     """tanh layer and linear layer on standardised features and targets.
 
     inside: (features + 1, hidden). outside: (hidden + 1, targets). features, targets:
@@ -33,7 +33,7 @@ class Regressor:
         )
 
 
-def fit(
+def fit_regressor(
     features: Array,
     targets: Array,
     *,
@@ -41,7 +41,7 @@ def fit(
     penalty: float = 3e-4,
     seed: int = 0,
     steps: int = 200,
-) -> Regressor:
+) -> ResidualRegressor:
     """Least squares with a penalty on the weights, by Levenberg-Marquardt with exact
     derivatives.
 
@@ -82,7 +82,7 @@ def fit(
         return np.concatenate([_jacobian(inside, outside, x), np.diag(weight)])
 
     found = least_squares(residual, start, slope, method="lm", max_nfev=steps)
-    return Regressor(*parts(found.x), *scales)
+    return ResidualRegressor(*parts(found.x), *scales)
 
 
 def _forward(inside: Array, outside: Array, x: Array) -> Array:

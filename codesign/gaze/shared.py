@@ -9,7 +9,7 @@ gaze follows them as
 
 (Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all,
 u_p is of one person. β, τ²
-and σ² come from people whom nobody judges (:func:`learn`: expectation maximisation); a
+and σ² come from people whom nobody judges (:func:`learn_population`: expectation maximisation); a
 person's u_p is its mean under
 that prior, given a few frames. So terms by which people hardly differ, as how a network
 misreads large slippage, need
@@ -20,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from codesign.gaze.readings import Readings
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
+from codesign.gaze.readings import NetworkReadings
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
 
 # of expectation maximisation: answers stand by then, variances near 0 still fall
 ROUNDS = 40
@@ -34,7 +34,7 @@ LEAST = 1e-9  # deg²: a variance that people do not show stays above 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mixed:
+class MixedModel:
     """What people have in common, and how far they differ.
 
     mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of answers in
@@ -66,9 +66,9 @@ class Mixed:
         ) / self.noise[k], cov
 
 
-def mixed(
+def fit_mixed_model(
     design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS
-) -> Mixed:
+) -> MixedModel:
     """The model of greatest likelihood, from ``rounds`` of expectation maximisation.
 
     Args:
@@ -85,7 +85,7 @@ def mixed(
             "two people or more, and more frames than terms"
         )
     mean = np.linalg.lstsq(design, answers, rcond=None)[0]
-    found = Mixed(
+    found = MixedModel(
         mean,
         np.repeat(first[:, None], 2, 1),
         np.maximum((answers - design @ mean).var(0), LEAST),
@@ -95,7 +95,9 @@ def mixed(
     return found
 
 
-def _again(found: Mixed, design: Array, answers: Array, people: list[Array]) -> Mixed:
+def _again(
+    found: MixedModel, design: Array, answers: Array, people: list[Array]
+) -> MixedModel:
     """One round: u of everybody given the model, then the model given them (both with
     their covariances).
     """
@@ -117,26 +119,26 @@ def _again(found: Mixed, design: Array, answers: Array, people: list[Array]) -> 
             for rows, (_, cov) in zip(people, told, strict=True)
         )
         noise[k] = (left + unsure) / len(design) + LEAST
-    return Mixed(mean, variance, noise)
+    return MixedModel(mean, variance, noise)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class People:
+class PopulationPrior:
     """What a network's readings tell of gaze, over people.
 
     model: of the terms. middle, spread: (7,) of the readings over people, the unit of
     every term.
     """
 
-    model: Mixed
+    model: MixedModel
     middle: Array
     spread: Array
 
-    def terms(self, read: Readings) -> Array:
+    def terms(self, read: NetworkReadings) -> Array:
         """(n, 36) the constant, the readings in their units, and their products."""
         return _terms(_together(read), self.middle, self.spread)
 
-    def person(self, read: Readings, gaze_deg: Array) -> "Own":
+    def person(self, read: NetworkReadings, gaze_deg: Array) -> "MixedModelPerson":
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
 
         Raises:
@@ -146,24 +148,28 @@ class People:
             raise TrainingError(
                 f"a personal calibration from {len(read)} points, need 3 or more"
             )
-        return Own(self, self.model.own(self.terms(read), gaze_deg - _axis(read)))
+        return MixedModelPerson(
+            self, self.model.own(self.terms(read), gaze_deg - _axis(read))
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Own:
+class MixedModelPerson:
     """A calibrated person. people: the prior. coefficients: (36, 2) of this person's
     terms, deg.
     """
 
-    people: People
+    people: PopulationPrior
     coefficients: Array
 
-    def __call__(self, read: Readings) -> Array:
+    def __call__(self, read: NetworkReadings) -> Array:
         """(n, 2) gaze across and down, deg."""
         return np.asarray(_axis(read) + self.people.terms(read) @ self.coefficients)
 
 
-def learn(read: Readings, gaze_deg: Array, person: Array) -> People:
+def learn_population(
+    read: NetworkReadings, gaze_deg: Array, person: Array
+) -> PopulationPrior:
     """What readings of many people tell of gaze.
 
     Args:
@@ -178,12 +184,14 @@ def learn(read: Readings, gaze_deg: Array, person: Array) -> People:
     design = _terms(together, middle, spread)
     first = np.full(design.shape[1], OTHERS_DEG**2)
     first[0] = KAPPA_DEG**2
-    return People(
-        mixed(design, gaze_deg - _axis(read), person, first=first), middle, spread
+    return PopulationPrior(
+        fit_mixed_model(design, gaze_deg - _axis(read), person, first=first),
+        middle,
+        spread,
     )
 
 
-def _axis(read: Readings) -> Array:
+def _axis(read: NetworkReadings) -> Array:
     if read.axis_deg is None:
         raise TrainingError(
             "the readings hold no optic axis, which gaze is told from here; calibrate by the sphere"
@@ -191,7 +199,7 @@ def _axis(read: Readings) -> Array:
     return read.axis_deg
 
 
-def _together(read: Readings) -> Array:
+def _together(read: NetworkReadings) -> Array:
     return np.concatenate([_axis(read), read.pupil_mm, read.slip_mm], 1)
 
 

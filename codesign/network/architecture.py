@@ -2,7 +2,7 @@
 after Howard et al. 2019).
 
 An :class:`Architecture` names depth, kernel, expansion, width and resolution;
-:func:`blocks` turns it into the
+:func:`active_blocks` turns it into the
 inverted residuals that the network builds and the cost model counts.
 """
 
@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 Activation = Literal["relu", "hardswish"]
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class StageSpace:
     """A run of blocks of equal width; the first one strides.
 
     channels: at width 1.
@@ -33,7 +33,7 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class BlockSpec:
     """One inverted residual: expand 1x1, depthwise k x k, squeeze-excite, project 1x1.
 
     squeeze: channels inside squeeze-and-excitation, 0 for none.
@@ -54,7 +54,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Space:
+class SearchSpace:
     """Everything that can vary, and what stays.
 
     resolution: (least, largest) scale of the input; the search moves in steps of 0.1,
@@ -66,13 +66,13 @@ class Space:
     """
 
     stem_channels: int = field(default=16, metadata={"above": 0})
-    stages: tuple[Stage, ...] = field(
+    stages: tuple[StageSpace, ...] = field(
         default_factory=lambda: (
-            Stage(24, 2, False, "relu"),
-            Stage(40, 2, True, "relu"),
-            Stage(80, 2, False, "hardswish"),
-            Stage(112, 1, True, "hardswish"),
-            Stage(160, 1, True, "hardswish"),
+            StageSpace(24, 2, False, "relu"),
+            StageSpace(40, 2, True, "relu"),
+            StageSpace(80, 2, False, "hardswish"),
+            StageSpace(112, 1, True, "hardswish"),
+            StageSpace(160, 1, True, "hardswish"),
         )
     )
     kernels: tuple[int, ...] = (3, 5, 7)
@@ -121,7 +121,7 @@ class Architecture:
     resolution: float = 1.0
 
 
-def divisible(channels: float, divisor: int = 8) -> int:
+def round_channels(channels: float, divisor: int = 8) -> int:
     """Channels rounded to a multiple of ``divisor``, never losing more than a tenth
     (MobileNet convention).
     """
@@ -129,7 +129,7 @@ def divisible(channels: float, divisor: int = 8) -> int:
     return rounded + divisor if rounded < 0.9 * channels else rounded
 
 
-def check(space: Space, architecture: Architecture) -> Architecture:
+def check_architecture(space: SearchSpace, architecture: Architecture) -> Architecture:
     """``architecture`` if it belongs to ``space``.
 
     Raises:
@@ -161,12 +161,14 @@ def check(space: Space, architecture: Architecture) -> Architecture:
     return architecture
 
 
-def stem_channels(space: Space, architecture: Architecture) -> int:
+def stem_channels(space: SearchSpace, architecture: Architecture) -> int:
     """Channels after the first convolution."""
-    return divisible(space.stem_channels * architecture.width)
+    return round_channels(space.stem_channels * architecture.width)
 
 
-def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
+def active_blocks(
+    space: SearchSpace, architecture: Architecture
+) -> list[list[BlockSpec]]:
     """The active blocks, stage by stage."""
     inputs = stem_channels(space, architecture)
     deepest = max(space.depths)
@@ -177,12 +179,12 @@ def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
         row = []
         for j in range(depth):
             slot = i * deepest + j
-            hidden = divisible(inputs * architecture.expansions[slot])
-            outputs = divisible(stage.channels * architecture.width)
-            squeeze = divisible(hidden / 4) if stage.squeeze else 0
+            hidden = round_channels(inputs * architecture.expansions[slot])
+            outputs = round_channels(stage.channels * architecture.width)
+            squeeze = round_channels(hidden / 4) if stage.squeeze else 0
             stride = stage.stride if j == 0 else 1
             row.append(
-                Block(
+                BlockSpec(
                     architecture.kernels[slot],
                     inputs,
                     hidden,
@@ -197,17 +199,19 @@ def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
     return result
 
 
-def largest(space: Space) -> Architecture:
+def largest_architecture(space: SearchSpace) -> Architecture:
     """The member that holds all others as slices."""
     return _uniform(space, max)
 
 
-def smallest(space: Space) -> Architecture:
+def smallest_architecture(space: SearchSpace) -> Architecture:
     """The cheapest member."""
     return _uniform(space, min)
 
 
-def sample(space: Space, generator: np.random.Generator) -> Architecture:
+def sample_architecture(
+    space: SearchSpace, generator: np.random.Generator
+) -> Architecture:
     """A member drawn evenly over every choice."""
     return Architecture(
         depths=tuple(int(v) for v in generator.choice(space.depths, len(space.stages))),
@@ -216,12 +220,12 @@ def sample(space: Space, generator: np.random.Generator) -> Architecture:
             int(v) for v in generator.choice(space.expansions, space.slots)
         ),
         width=float(generator.choice(space.widths)),
-        resolution=float(generator.choice(resolutions(space))),
+        resolution=float(generator.choice(search_resolutions(space))),
     )
 
 
-def mutate(
-    space: Space,
+def mutate_architecture(
+    space: SearchSpace,
     architecture: Architecture,
     generator: np.random.Generator,
     *,
@@ -232,7 +236,7 @@ def mutate(
     Where no active entry changed, one that can change is drawn from its other values.
     The only member of a space is its own neighbour.
     """
-    other = sample(space, generator)
+    other = sample_architecture(space, generator)
     child = replace(
         architecture,
         depths=_mix(architecture.depths, other.depths, generator, rate),
@@ -243,7 +247,9 @@ def mutate(
         if generator.random() < rate
         else architecture.resolution,
     )
-    if active(space, child) != active(space, architecture):
+    if canonical_architecture(space, child) != canonical_architecture(
+        space, architecture
+    ):
         return child
     neighbours = _neighbours(space, architecture)
     if not neighbours:
@@ -251,7 +257,7 @@ def mutate(
     return neighbours[int(generator.integers(len(neighbours)))]
 
 
-def _neighbours(space: Space, architecture: Architecture) -> list[Architecture]:
+def _neighbours(space: SearchSpace, architecture: Architecture) -> list[Architecture]:
     """Every other network that differs from this one in a single entry."""
     found = []
     choices: dict[str, tuple[Any, ...]] = {
@@ -266,19 +272,21 @@ def _neighbours(space: Space, architecture: Architecture) -> list[Architecture]:
                 changed: Any = {name: (*row[:i], value, *row[i + 1 :])}
                 found.append(replace(architecture, **changed))
     found += [replace(architecture, width=width) for width in space.widths]
-    found += [replace(architecture, resolution=r) for r in resolutions(space)]
-    here = active(space, architecture)
-    return [one for one in found if active(space, one) != here]
+    found += [replace(architecture, resolution=r) for r in search_resolutions(space)]
+    here = canonical_architecture(space, architecture)
+    return [one for one in found if canonical_architecture(space, one) != here]
 
 
-def resolutions(space: Space) -> tuple[float, ...]:
+def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
     """The input scales that the search tries, 0.1 apart."""
     low, high = space.resolution
     count = int((high - low) / 0.1 + 1e-9) + 1
     return tuple(round(low + 0.1 * i, 3) for i in range(count))
 
 
-def active(space: Space, architecture: Architecture) -> Architecture:
+def canonical_architecture(
+    space: SearchSpace, architecture: Architecture
+) -> Architecture:
     """The same network with every idle slot set to the least choice: equal networks
     compare equal.
     """
@@ -298,7 +306,7 @@ def active(space: Space, architecture: Architecture) -> Architecture:
     )
 
 
-def _uniform(space: Space, pick: Callable[[Any], Any]) -> Architecture:
+def _uniform(space: SearchSpace, pick: Callable[[Any], Any]) -> Architecture:
     return Architecture(
         depths=(pick(space.depths),) * len(space.stages),
         kernels=(pick(space.kernels),) * space.slots,

@@ -16,11 +16,11 @@ from codesign.network.windows import (
     ROWS,
     STEP_FEATURES,
     STEP_MACS,
-    spectra,
+    gradient_statistics,
     spectra_macs,
     step_of,
-    steps,
     window_content,
+    window_spectra,
 )
 
 FEATURES = (
@@ -45,7 +45,7 @@ VERGENCE_PER_M, VERGENCE_UNIT_PER_M = (
 )  # 1 / depth of a face before the camera: mean and spread
 
 
-def macs(size: int) -> int:
+def blur_branch_macs(size: int) -> int:
     """Multiply-accumulates of the branch for a square frame of ``size`` pixels: waves,
     steps, layers.
     """
@@ -99,7 +99,7 @@ def depth_mm(vergence: Tensor) -> Tensor:
     return 1e3 / (vergence * VERGENCE_UNIT_PER_M + VERGENCE_PER_M).clamp(1, 200)
 
 
-class Around(nn.Module):
+class NeighbourMixer(nn.Module):
     """What its neighbours tell of a window, added to what it tells itself: x +
     mix(hardswish(depthwise(x))).
     """
@@ -116,7 +116,7 @@ class Around(nn.Module):
         return x + added
 
 
-class Overall(nn.Module):
+class GlobalContext(nn.Module):
     """What all windows together tell, added to each: x + give(hardswish(take(mean and
     spread over the windows))).
     """
@@ -161,7 +161,9 @@ class BlurBranch(nn.Module):
         self.first = nn.Conv2d(FEATURES + PLACES, HIDDEN[0], 1)
         self.gain = nn.Parameter(torch.ones(HIDDEN[0], GRID, GRID))
         self.offset = nn.Parameter(torch.zeros(HIDDEN[0], GRID, GRID))
-        pairs = ((Around(HIDDEN[0]), Overall(HIDDEN[0])) for _ in range(BLOCKS))
+        pairs = (
+            (NeighbourMixer(HIDDEN[0]), GlobalContext(HIDDEN[0])) for _ in range(BLOCKS)
+        )
         self.together = nn.Sequential(*(block for pair in pairs for block in pair))
         self.second = nn.Conv2d(HIDDEN[0], HIDDEN[1], 1)
         self.depth = nn.Conv2d(HIDDEN[1], 2 + BESIDE, 1)
@@ -181,8 +183,10 @@ class BlurBranch(nn.Module):
         """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID,
         GRID), and its mean.
         """
-        power, mean = spectra(frames)
-        told = self.norm(torch.cat([torch.log(power + FLOOR), mean, steps(frames)], 1))
+        power, mean = window_spectra(frames)
+        told = self.norm(
+            torch.cat([torch.log(power + FLOOR), mean, gradient_statistics(frames)], 1)
+        )
         told = torch.cat(
             [told, self.place + torch.zeros_like(mean)], 1
         )  # of as many frames, traced too

@@ -19,13 +19,13 @@ from torch import Tensor
 from codesign.network import blur
 from codesign.network.architecture import (
     Architecture,
-    Block,
-    Space,
-    blocks,
+    BlockSpec,
+    SearchSpace,
+    active_blocks,
     stem_channels,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 
 # widths of the heads; the networks and the count share them
 LEAST_SIZE = 16  # pixels along the edge of an input
@@ -35,7 +35,7 @@ POINT_FEATURES = 3 * POINTS  # their places, and how wide their maps are
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class MacPolynomial:
     """Multiply-accumulates as a polynomial of the sizes of the feature maps.
 
     per_pixel: {total stride: multiply-accumulates per output pixel at that stride}.
@@ -54,13 +54,13 @@ class Cost:
             macs * (-(-size // stride)) ** 2 for stride, macs in self.per_pixel.items()
         ]
         if self.blur:
-            parts.append(np.vectorize(blur.macs, otypes=[np.int64])(size))
+            parts.append(np.vectorize(blur.blur_branch_macs, otypes=[np.int64])(size))
         return np.asarray(sum(parts) + self.constant)
 
 
-def backbone(
-    stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: int = 3
-) -> Cost:
+def backbone_cost(
+    stem: int, rows: Iterable[BlockSpec], *, inputs: int = 1, stem_kernel: int = 3
+) -> MacPolynomial:
     """Cost of a stem of stride 2 and the blocks behind it."""
     per_pixel, constant, stride = {2: inputs * stem * stem_kernel**2}, 0, 2
     for block in rows:
@@ -70,13 +70,13 @@ def backbone(
         wide = block.hidden * (block.kernel**2 + block.outputs)
         per_pixel[stride] = per_pixel.get(stride, 0) + wide
         constant += 2 * block.hidden * block.squeeze
-    return Cost(per_pixel, constant)
+    return MacPolynomial(per_pixel, constant)
 
 
-def network(space: Space, architecture: Architecture) -> Cost:
+def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomial:
     """Cost of backbone, blur branch, perception head and calibration head."""
-    rows = blocks(space, architecture)
-    body = backbone(
+    rows = active_blocks(space, architecture)
+    body = backbone_cost(
         stem_channels(space, architecture), [b for row in rows for b in row]
     )
     per_pixel = dict(body.per_pixel)
@@ -94,10 +94,10 @@ def network(space: Space, architecture: Architecture) -> Cost:
     told = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
     heads = told * SLIP_HIDDEN + SLIP_HIDDEN * ((3 + 2) * SLIP_HIDDEN + 3 * 3)
     heads += blur.content_macs(MASK_CHANNELS)
-    return Cost(per_pixel, body.constant + heads, blur=True)
+    return MacPolynomial(per_pixel, body.constant + heads, blur=True)
 
 
-def lateral_strides(space: Space) -> list[tuple[int, int]]:
+def lateral_strides(space: SearchSpace) -> list[tuple[int, int]]:
     """(stage, total stride) of the features that the mask is decoded from: the last
     stage of every stride.
     """
@@ -108,7 +108,7 @@ def lateral_strides(space: Space) -> list[tuple[int, int]]:
     return [(stage, stride) for stride, stage in last.items()]
 
 
-def total_stride(space: Space) -> int:
+def total_stride(space: SearchSpace) -> int:
     """Stride of the last feature map."""
     return lateral_strides(space)[-1][1]
 
@@ -137,7 +137,7 @@ def coarsest_um(window_um: float, resolution: float) -> float:
 
 
 def macs_of_size(
-    space: Space, architecture: Architecture, size: Tensor | float
+    space: SearchSpace, architecture: Architecture, size: Tensor | float
 ) -> Tensor:
     """Multiply-accumulates at a continuous input size, differentiable; exact where
     ``size`` is an integer.
@@ -145,10 +145,10 @@ def macs_of_size(
     Args:
         size: pixels along the edge of the input, 16 or more, scalar.
     """
-    return interpolated(network(space, architecture).at, size)
+    return interpolate_counts(network_cost(space, architecture).at, size)
 
 
-def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
+def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
     """Counts at integer sizes continued to a continuous size, differentiable.
 
     A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more
@@ -189,7 +189,7 @@ def macs(
     pitch_um: Tensor | float,
     *,
     window_um: float,
-    space: Space | None = None,
+    space: SearchSpace | None = None,
 ) -> Tensor:
     """Multiply-accumulates C_total of one inference as a function of the pixel pitch
     (paper Eq. 9), differentiable.
@@ -205,5 +205,7 @@ def macs(
         window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution
     )
     return macs_of_size(
-        space or Space(), architecture, window_um / pitch_um * architecture.resolution
+        space or SearchSpace(),
+        architecture,
+        window_um / pitch_um * architecture.resolution,
     )

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from codesign.eye import face_axes
 from codesign.network.subnet import Subnet
-from metalens.ground.store import replacing
+from metalens.core.store import replace_atomically
 
 OPSET = 17
 FRAMES = "pixels of the sensor, rows from the top, in any unit: every frame is brought to mean 0 and deviation 1"
@@ -27,7 +27,7 @@ OUTPUTS = {  # name: what it is
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class OutputScale:
     """What turns a network's answers into lengths and angles.
 
     frame_mm: edge of all pixels. slip_mm: unit of the slippage. elevation_rad: of the
@@ -49,12 +49,12 @@ class Scale:
         return tuple(name for name in OUTPUTS if not left_out.get(name, False))
 
 
-class Exported(nn.Module):
+class ExportedNetwork(nn.Module):
     """``forward(frames) -> (outputs...)`` in the order of :attr:`Scale.outputs`; frames
     (batch, 1, size, size).
     """
 
-    def __init__(self, net: Subnet, scale: Scale) -> None:
+    def __init__(self, net: Subnet, scale: OutputScale) -> None:
         super().__init__()
         self.net, self.scale = net, scale
         self.eval()
@@ -86,8 +86,8 @@ class Exported(nn.Module):
         )
 
 
-def write(
-    path: str | Path, net: Subnet, scale: Scale, *, size: int, pitch_um: float
+def write_onnx(
+    path: str | Path, net: Subnet, scale: OutputScale, *, size: int, pitch_um: float
 ) -> None:
     """Write an ONNX file (opset 17) for any number of square frames of ``size`` pixels,
     ``pitch_um`` apart.
@@ -103,11 +103,11 @@ def write(
         OSError: the target cannot be written.
     """
     made, example, names = (
-        Exported(net, scale),
+        ExportedNetwork(net, scale),
         torch.zeros(2, 1, size, size),
         scale.outputs,
     )
-    with replacing(path) as part:
+    with replace_atomically(path) as part:
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore"

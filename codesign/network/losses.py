@@ -16,7 +16,7 @@ POINT_KNEE, AXIS_KNEE = (
 )  # of these units: straight beyond half a per cent of the image, and 2 degrees
 
 
-def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
+def dice_loss(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
     """Mean Dice loss 1 - (2 sum pm + s) / (sum p + sum m + s): 0 for a perfect mask,
     finite for an empty one.
 
@@ -29,7 +29,7 @@ def dice(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
     return (1 - (2 * both + smooth) / (either + smooth)).mean()
 
 
-def segmentation(logits: Tensor, mask: Tensor) -> Tensor:
+def segmentation_loss(logits: Tensor, mask: Tensor) -> Tensor:
     """Dice loss plus cross entropy, which carries the gradient while the mask is still
     far off.
 
@@ -40,11 +40,13 @@ def segmentation(logits: Tensor, mask: Tensor) -> Tensor:
         logits = F.interpolate(
             logits[:, None], size=mask.shape[-2:], mode="bilinear", align_corners=False
         )[:, 0]
-    target = resized(mask, logits)
-    return dice(logits, target) + F.binary_cross_entropy_with_logits(logits, target)
+    target = resize_mask(mask, logits)
+    return dice_loss(logits, target) + F.binary_cross_entropy_with_logits(
+        logits, target
+    )
 
 
-def slip(
+def slip_loss(
     predicted: Tensor, truth: Tensor, scale: Tensor, *, knee: float = 0.3
 ) -> Tensor:
     """Squared error of the slippage in units of ``scale``, linear beyond ``knee`` so
@@ -57,7 +59,7 @@ def slip(
     return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
 
 
-def depth(told: Tensor, vergence: Tensor) -> Tensor:
+def depth_loss(told: Tensor, vergence: Tensor) -> Tensor:
     """Negative log likelihood of the windows' vergences under normal distributions,
     less its constant.
 
@@ -69,7 +71,7 @@ def depth(told: Tensor, vergence: Tensor) -> Tensor:
     return (0.5 * miss**2 * torch.exp(-2 * told[:, 1]) + told[:, 1]).mean()
 
 
-def spread(found: Prediction, truth: Tensor) -> Tensor:
+def uncertainty_loss(found: Prediction, truth: Tensor) -> Tensor:
     """The same of the slippage's errors as they are: trains the uncertainty alone; 0
     for a network that tells none.
 
@@ -84,7 +86,7 @@ def spread(found: Prediction, truth: Tensor) -> Tensor:
     ).mean()
 
 
-def task(
+def task_loss(
     found: Prediction,
     mask: Tensor,
     slip_mm: Tensor,
@@ -96,14 +98,14 @@ def task(
     pupil's centre in its place.
     """
     seen = (
-        segmentation(found.mask_logits, mask)
+        segmentation_loss(found.mask_logits, mask)
         if found.mask_logits.numel()
-        else place(found.centre, mask)
+        else position_loss(found.centre, mask)
     )
-    return seen + slip_weight * slip(found.slip, slip_mm, scale_mm)
+    return seen + slip_weight * slip_loss(found.slip, slip_mm, scale_mm)
 
 
-def reading(
+def depth_reading_loss(
     found: Prediction,
     vergence: Tensor,
     slip_mm: Tensor,
@@ -121,12 +123,12 @@ def reading(
     told = (
         found.slip.new_zeros(())
         if found.depth is None
-        else depth_weight * depth(found.depth, vergence)
+        else depth_weight * depth_loss(found.depth, vergence)
     )
-    return told + SPREAD_WEIGHT * spread(found, slip_mm / scale_mm)
+    return told + SPREAD_WEIGHT * uncertainty_loss(found, slip_mm / scale_mm)
 
 
-def pose(
+def pose_loss(
     found: Prediction,
     axis: Tensor,
     points: Tensor,
@@ -155,7 +157,7 @@ def pose(
     return axis_weight * turned + point_weight * seen
 
 
-def place(
+def position_loss(
     centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3
 ) -> Tensor:
     """Distance of the pupil's centre from the centroid of its mask, in units of 2 % of
@@ -186,14 +188,14 @@ def over_budget(macs: Tensor, budget: float) -> Tensor:
     return F.relu(macs / budget - 1)
 
 
-def resized(mask: Tensor, like: Tensor) -> Tensor:
+def resize_mask(mask: Tensor, like: Tensor) -> Tensor:
     """Mask coverage averaged onto the grid of the logits."""
     if mask.shape[-2:] == like.shape[-2:]:
         return mask
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
 
 
-def framed(mask: Tensor, wide: float) -> Tensor:
+def mask_in_frame(mask: Tensor, wide: float) -> Tensor:
     """Coverage over a frame ``wide`` times as wide as the image that the mask is of,
     about its middle; 0 beyond it.
 
@@ -228,7 +230,7 @@ def at_pixels(logits: Tensor, mask: Tensor, pixels: int) -> tuple[Tensor, Tensor
     ]
 
 
-def overlap(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tensor:
+def mask_iou(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tensor:
     """(batch,) intersection over union of the thresholded masks; 1 where both are
     empty, nan without a mask.
 
@@ -242,7 +244,7 @@ def overlap(logits: Tensor, mask: Tensor, *, pixels: int | None = None) -> Tenso
         return torch.full((len(mask),), float("nan"))
     if pixels is not None:
         logits, mask = at_pixels(logits, mask, pixels)
-    found, truth = logits > 0, resized(mask, logits) > 0.5
+    found, truth = logits > 0, resize_mask(mask, logits) > 0.5
     union = (found | truth).sum((1, 2))
     both = (found & truth).sum((1, 2))
     return torch.where(

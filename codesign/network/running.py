@@ -51,7 +51,7 @@ class RunningNorm(nn.Module):
     def _follow(self, x: Tensor) -> None:
         exact = x.double()
         found = torch.stack([exact.mean((0, 2, 3)), (exact**2).mean((0, 2, 3))])
-        if parallel.ranks() > 1:
+        if parallel.process_count() > 1:
             found = (
                 torch.tensor(parallel.mean_of(found.flatten().tolist()))
                 .to(found)
@@ -64,7 +64,7 @@ class RunningNorm(nn.Module):
             self.square.lerp_(found[1], share)
 
 
-def kept(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
+def keep_running_means(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
     """Every running mean of a network with a copy of it as it is now, for
     :func:`put_back`.
     """

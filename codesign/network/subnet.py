@@ -8,10 +8,15 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from codesign.network.architecture import Architecture, Block, blocks, stem_channels
+from codesign.network.architecture import (
+    Architecture,
+    BlockSpec,
+    active_blocks,
+    stem_channels,
+)
 from codesign.network.cost import MASK_CHANNELS, SLIP_CHANNELS, lateral_strides
 from codesign.network.supernet import ElasticBlock, Supernet, modules_of
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 
 
 class Subnet(nn.Module):
@@ -35,7 +40,7 @@ class Subnet(nn.Module):
         return found.mask_logits, found.centre, found.slip
 
 
-def restore(net: Supernet, state: Mapping[str, Tensor]) -> None:
+def restore_weights(net: Supernet, state: Mapping[str, Tensor]) -> None:
     """Put the weights of a kept :class:`Subnet` back into the supernet it was cut from.
 
     Channels are the leading ones and kernels the central ones, as they were cut; what
@@ -67,7 +72,7 @@ def restore(net: Supernet, state: Mapping[str, Tensor]) -> None:
 
 def _trim(net: Supernet, architecture: Architecture) -> None:
     """Drop the weights that ``architecture`` does not use."""
-    rows = blocks(net.space, architecture)
+    rows = active_blocks(net.space, architecture)
     stem = stem_channels(net.space, architecture)
     _trim_conv(net.stem, 1, stem, 3)
     for stage, row in zip(net.stages, rows, strict=True):
@@ -81,7 +86,7 @@ def _trim(net: Supernet, architecture: Architecture) -> None:
     _trim_conv(net.calibration.reduce, rows[-1][-1].outputs, SLIP_CHANNELS, 1)
 
 
-def _trim_block(module: ElasticBlock, block: Block) -> None:
+def _trim_block(module: ElasticBlock, block: BlockSpec) -> None:
     _trim_conv(module.expand, block.inputs, block.hidden, 1)
     _trim_conv(module.depthwise, 1, block.hidden, block.kernel)
     _trim_conv(module.project, block.hidden, block.outputs, 1)

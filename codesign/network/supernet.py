@@ -5,7 +5,7 @@ Every architecture of the space is a slice of one set of weights.
 A kernel is the centre of a larger one, channels are the first of more, blocks are the
 first of a stage (after
 Cai et al. 2019). Batch statistics belong to one architecture at a time:
-:func:`recalibrate` measures them.
+:func:`recalibrate_batch_norm` measures them.
 """
 
 from collections.abc import Iterable, Iterator
@@ -21,10 +21,10 @@ from codesign.network import blur
 from codesign.network.architecture import (
     Activation,
     Architecture,
-    Block,
-    Space,
-    blocks,
-    largest,
+    BlockSpec,
+    SearchSpace,
+    active_blocks,
+    largest_architecture,
     stem_channels,
 )
 from codesign.network.cost import (
@@ -35,12 +35,12 @@ from codesign.network.cost import (
     SLIP_GRID,
     SLIP_HIDDEN,
     lateral_strides,
-    network,
+    network_cost,
 )
 from codesign.network.running import RunningNorm
-from codesign.network.windows import resampled
-from metalens.ground.arrays import Array
-from metalens.ground.errors import TrainingError
+from codesign.network.windows import resample_image
+from metalens.core.arrays import Array
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,7 +75,7 @@ class Prediction:
     axis: Tensor | None = None
 
 
-def activated(x: Tensor, kind: Activation | None) -> Tensor:
+def apply_activation(x: Tensor, kind: Activation | None) -> Tensor:
     """The activation alone."""
     return x if kind is None else F.relu(x) if kind == "relu" else F.hardswish(x)
 
@@ -102,13 +102,13 @@ class SlicedNorm(nn.Module):
         weight, bias = self.weight[:count], self.bias[:count]
         if self.measuring:
             self._measure(x)
-        if self.training and not self.measuring and parallel.ranks() > 1:
-            return activated(parallel.batch_norm(x, weight, bias), act)
+        if self.training and not self.measuring and parallel.process_count() > 1:
+            return apply_activation(parallel.batch_norm(x, weight, bias), act)
         own = self.training or self.measuring  # statistics of this batch
         mean, variance = (None, None) if own else (self.mean, self.variance)
         if mean is not None and variance is not None:
             mean, variance = mean[:count], variance[:count]
-        return activated(
+        return apply_activation(
             F.batch_norm(x, mean, variance, weight, bias, training=own), act
         )
 
@@ -186,7 +186,7 @@ class SqueezeExcite(nn.Module):
 class ElasticBlock(nn.Module):
     """Inverted residual at its largest; ``forward`` takes the block to act as."""
 
-    def __init__(self, most: Block) -> None:
+    def __init__(self, most: BlockSpec) -> None:
         super().__init__()
         self.expand = SlicedConv(most.inputs, most.hidden)
         self.depthwise = SlicedConv(
@@ -197,7 +197,7 @@ class ElasticBlock(nn.Module):
         )
         self.project = SlicedConv(most.hidden, most.outputs)
 
-    def forward(self, x: Tensor, block: Block) -> Tensor:
+    def forward(self, x: Tensor, block: BlockSpec) -> Tensor:
         act = block.activation
         y = self.expand(x, block.hidden, act=act) if block.hidden != block.inputs else x
         y = self.depthwise(
@@ -262,7 +262,7 @@ class CalibrationHead(nn.Module):
         self, features: Tensor, depths: Tensor, points: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         reduced = self.reduce(features, SLIP_CHANNELS, act="hardswish")
-        grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
+        grid = resample_image(reduced, (SLIP_GRID, SLIP_GRID))
         seen = F.hardswish(
             torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1)
         )
@@ -280,11 +280,11 @@ class Supernet(nn.Module):
     :class:`Prediction`.
     """
 
-    def __init__(self, space: Space | None = None) -> None:
+    def __init__(self, space: SearchSpace | None = None) -> None:
         super().__init__()
-        self.space = space or Space()
-        most = largest(self.space)
-        rows = blocks(self.space, most)
+        self.space = space or SearchSpace()
+        most = largest_architecture(self.space)
+        rows = active_blocks(self.space, most)
         self.stem = SlicedConv(1, stem_channels(self.space, most), 3)
         self.stages = nn.ModuleList(
             nn.ModuleList(ElasticBlock(b) for b in row) for row in rows
@@ -296,14 +296,14 @@ class Supernet(nn.Module):
         self.blur = blur.InformedBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
-        seen = scaled(frames, architecture.resolution)
+        seen = resize_frames(frames, architecture.resolution)
         x = self.stem(
             seen, self._stem(architecture), kernel=3, stride=2, act="hardswish"
         )
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(
-            zip(self.stages, blocks(self.space, architecture), strict=True)
+            zip(self.stages, active_blocks(self.space, architecture), strict=True)
         ):
             for module, block in zip(modules_of(stage), row, strict=False):
                 x = module(x, block)
@@ -311,7 +311,7 @@ class Supernet(nn.Module):
                 features.append(x)
         logits, maps, decoded = self.perception(features)
         depth, told, axial = self.blur(seen, decoded)
-        points, spread_out = places(maps)
+        points, spread_out = soft_argmax_maps(maps)
         slip, spread, axis = self.calibration(
             x, told, torch.cat([points.flatten(1), spread_out], 1)
         )
@@ -324,16 +324,16 @@ class Supernet(nn.Module):
         """Multiply-accumulates of a member for square frames of these sizes after
         scaling (integers), exact.
         """
-        return network(self.space, architecture).at(sizes)
+        return network_cost(self.space, architecture).at(sizes)
 
     def _stem(self, architecture: Architecture) -> int:
         return stem_channels(self.space, architecture)
 
 
-def scaled(frames: Tensor, resolution: float) -> Tensor:
+def resize_frames(frames: Tensor, resolution: float) -> Tensor:
     """Frames resized to ``resolution`` of their size (to the nearest pixel)."""
     height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
-    return resampled(frames, (height, width))
+    return resample_image(frames, (height, width))
 
 
 def soft_argmax(logits: Tensor) -> Tensor:
@@ -355,7 +355,7 @@ def soft_argmax(logits: Tensor) -> Tensor:
     )
 
 
-def places(maps: Tensor) -> tuple[Tensor, Tensor]:
+def soft_argmax_maps(maps: Tensor) -> tuple[Tensor, Tensor]:
     """(batch, points, 2) centre of mass x, y of every map's softmax, fraction of the
     image from its middle, and
     (batch, points) its root mean square width: wide where the point is not seen, or out
@@ -379,7 +379,7 @@ def places(maps: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def recalibrate(
+def recalibrate_batch_norm(
     net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]
 ) -> None:
     """Measure the batch statistics of one architecture from a reset, on fixed batches;

@@ -57,14 +57,14 @@ def step_of(size: int) -> int:
 
 
 def spectra_macs(size: int) -> int:
-    """Multiply-accumulates of :func:`spectra` for a square frame of ``size`` pixels."""
+    """Multiply-accumulates of :func:`window_spectra` for a square frame of ``size`` pixels."""
     step = step_of(size)
     kinds = 2 * WAVES + 1  # cosines and sines
     return ((GRID + 1) * step * GRID + GRID**2 * COLUMNS * 2) * kinds * step
 
 
 @functools.lru_cache(maxsize=64)
-def filters(size: int) -> tuple[Tensor, Tensor]:
+def hann_filters(size: int) -> tuple[Tensor, Tensor]:
     """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) under their Hann weight, on
     the second half of a window.
 
@@ -83,7 +83,7 @@ def filters(size: int) -> tuple[Tensor, Tensor]:
     return (seen * torch.cos(turn)).float(), (seen * torch.sin(turn))[:, 1:].float()
 
 
-def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
+def window_spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID,
     GRID) its mean under the weight.
 
@@ -99,7 +99,7 @@ def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     step = step_of(size)
     first = (size - (GRID + 1) * step) // 2
     inside = slice(first, first + (GRID + 1) * step)
-    cosine, sine = (f.to(frames) for f in filters(size))
+    cosine, sine = (f.to(frames) for f in hann_filters(size))
     even, odd = _folded(frames[:, 0, inside, inside], 2)
     real, imaginary = (
         even @ cosine,
@@ -124,7 +124,7 @@ def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     ]
 
 
-def steps(frames: Tensor) -> Tensor:
+def gradient_statistics(frames: Tensor) -> Tensor:
     """(batch, STEP_FEATURES, GRID, GRID) how squared steps between neighbours are
     spread over every window.
 
@@ -135,7 +135,7 @@ def steps(frames: Tensor) -> Tensor:
     Args:
         frames: (batch, 1, size, size), standardised; brought to SAMPLES along a side.
     """
-    fine = resampled(frames, (SAMPLES, SAMPLES))
+    fine = resample_image(frames, (SAMPLES, SAMPLES))
     coarse = F.avg_pool2d(F.pad(fine, (0, 1, 0, 1), mode="replicate"), 2, 1)
     mean, second, steepest = (window_content(part) for part in _moments([fine, coarse]))
     spread = torch.sqrt((second - mean**2).clamp_min(0) + 1e-4)
@@ -159,7 +159,7 @@ def window_content(maps: Tensor) -> Tensor:
     return F.avg_pool2d(coarse, 2, 1)
 
 
-def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+def resample_image(x: Tensor, size: tuple[int, int]) -> Tensor:
     """(batch, channels, *size): averaged by whole factors, then interpolated where the
     size is no divisor.
     """

@@ -17,9 +17,11 @@ from scipy import ndimage
 from torch import Tensor
 
 from characterize.inference import AsBuilt
-from characterize.model import PLACE, state, vector
-from codesign.optics.stack import OpticsConfig, Stack
+from characterize.model import PLACE, parameter_vector, process_state_of
+from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from codesign.optics.true_lens import PillarCells
+from metalens.core.arrays import Array
+from metalens.core.paths import path_difference, sensor_path, source_path
 from metalens.design import Focus, profiles
 from metalens.fabrication import (
     PERTURBATIONS,
@@ -29,8 +31,6 @@ from metalens.fabrication import (
     transmission,
 )
 from metalens.field import Optics, cell_um
-from metalens.ground.arrays import Array
-from metalens.ground.paths import path_difference, sensor_path, source_path
 from metalens.image import (
     Field,
     Pupil,
@@ -52,10 +52,10 @@ def of_lens(x: Array) -> Array:
 
     x: all parameters, in the order of ``characterize.model.parameters.NAMES``.
     """
-    return vector({name: float(x[PLACE[name]]) for name in OF_LENS})
+    return parameter_vector({name: float(x[PLACE[name]]) for name in OF_LENS})
 
 
-def posterior(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
+def posterior_parameters(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
     """All parameters of ``count`` lenses that the fit holds possible, as far as their
     light goes.
     """
@@ -63,7 +63,7 @@ def posterior(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
         yield built.parameters(row)
 
 
-def psf_error(one: Stack, other: Stack) -> float:
+def psf_error(one: PixelPsfStack, other: PixelPsfStack) -> float:
     """Relative L2 difference of two stacks of PSFs, each PSF of sum 1."""
     a, b = (
         s.intensity.double() / s.intensity.double().sum((-2, -1), keepdim=True)
@@ -111,25 +111,25 @@ class MadeLens:
         for rows in range(0, len(d.y_um), 128):
             part = slice(rows, rows + 128)
             self._carrier[part] = np.exp(
-                -1j * profiles.hyperbolic(d.x_um, d.y_um[part, None], self.focus)
+                -1j * profiles.hyperbolic_phase(d.x_um, d.y_um[part, None], self.focus)
             )
 
-    def stack(self, x: Array | None = None) -> Stack:
+    def stack(self, x: Array | None = None) -> PixelPsfStack:
         """PSFs at the run's field angle of the lens with these parameters; of the
         design without them.
 
         Args:
             x: all parameters; of the bench's own (stage, light, camera) none enters.
         """
-        known = of_lens(vector() if x is None else x)
+        known = of_lens(parameter_vector() if x is None else x)
         distance = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
         pupil, tangents = self._pupil(distance), self._field.tangents
         seen = view(pupil, self._field, self.design.source_distance_um)
         x_um, y_um = seen.x_um.numpy(), seen.y_um.numpy()
-        cells = self._gathered(state(known))
+        cells = self._gathered(process_state_of(known))
         field = torch.from_numpy(self._on_nodes(cells, x_um, y_um))
-        phase = profiles.hyperbolic(x_um, y_um, self.focus)
-        phase = phase + self._aberration(state(known), x_um, y_um)
+        phase = profiles.hyperbolic_phase(x_um, y_um, self.focus)
+        phase = phase + self._aberration(process_state_of(known), x_um, y_um)
         centre = tangents[0] * distance, tangents[1] * distance
         k = 2 * math.pi / pupil.wavelength_um
         inward = torch.from_numpy(phase) + k * sensor_path(
@@ -141,7 +141,7 @@ class MadeLens:
         ]
         angles = (torch.remainder(inward + k * p, 2 * math.pi) for p in paths)
         light = self._psfs(seen.weight * field, angles, pupil)
-        return Stack(
+        return PixelPsfStack(
             light,
             self.settings.depths_um,
             Optics(self._plane(known, cells), self.design.layers, distance),
@@ -154,17 +154,19 @@ class MadeLens:
         A wrong lens-sensor distance counts as the defocus that it is. Zero beyond the
         rim.
         """
-        known = of_lens(vector() if x is None else x)
+        known = of_lens(parameter_vector() if x is None else x)
         pupil = self._pupil(self.design.sensor_distance_um)
         nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
-        field = self._on_nodes(self._gathered(state(known)), nodes_x, nodes_y)
+        field = self._on_nodes(
+            self._gathered(process_state_of(known)), nodes_x, nodes_y
+        )
         r2 = nodes_x**2 + nodes_y**2
         actual = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
         paths = path_difference(r2, actual) - path_difference(
             r2, self.design.sensor_distance_um
         )
         phase = 2 * math.pi / self.design.wavelength_um * paths + self._aberration(
-            state(known), nodes_x, nodes_y
+            process_state_of(known), nodes_x, nodes_y
         )
         return np.asarray(field * np.exp(1j * phase) * amplitude(pupil).numpy())
 
@@ -174,7 +176,7 @@ class MadeLens:
 
     def _plane(self, known: Array, cells: Array) -> PillarCells:
         """The lens plane as rays of any direction see it."""
-        d, filled, made = self.design.diameters, _filled(cells), state(known)
+        d, filled, made = self.design.diameters, _filled(cells), process_state_of(known)
         step = self._block * d.pitch_um
         half = filled.shape[1] * step / 2, filled.shape[0] * step / 2
         centre = tuple(

@@ -13,14 +13,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from metalens.core.errors import ConfigError
 from metalens.design import Focus
-from metalens.ground.errors import ConfigError
 
 Family = Literal["free", "radial"]
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class StartingPhase:
     """A fixed phase on top of a hyperbolic focus.
 
     zones: rings of a double helix. parts: sectors; apart_um: diameter of the circle
@@ -93,7 +93,7 @@ class Start:
         return -k * (path(own) - path(s))
 
 
-def terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
+def phase_terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
     """The first ``count`` terms over the unit disc, where x and y lie.
 
     free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity

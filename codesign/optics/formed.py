@@ -21,7 +21,8 @@ from torch import Tensor
 
 from codesign.optics import stack as lens
 from codesign.optics.lens_errors import LensError, variance_rad2
-from codesign.optics.stack import OpticsConfig, Stack
+from codesign.optics.stack import OpticsConfig, PixelPsfStack
+from metalens.core.errors import PropagationError, SceneError, TrainingError
 from metalens.field import (
     Layers,
     Optics,
@@ -31,7 +32,6 @@ from metalens.field import (
     textured_frames,
     with_psfs,
 )
-from metalens.ground.errors import PropagationError, SceneError, TrainingError
 from metalens.image import Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
 from metalens.psf import Source
@@ -78,14 +78,14 @@ def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
     )
 
 
-def imager(
+def make_imager(
     settings: OpticsConfig,
     coefficients_rad: Tensor,
     frame: int,
     *,
     margin: int,
     error: LensError | None = None,
-    made: Stack | None = None,
+    made: PixelPsfStack | None = None,
     device: torch.device | str = "cpu",
 ) -> UniformImager | Imager:
     """What images frames of ``frame`` samples, margin included.
@@ -100,8 +100,8 @@ def imager(
             and the true image is asked for.
     """
     if settings.image == "uniform":
-        found = made or lens.stack(settings, coefficients_rad, error=error)
-        return lens.prepared(settings, found, frame, margin=margin).to(device)
+        found = made or lens.lens_psf_stack(settings, coefficients_rad, error=error)
+        return lens.prepare_transfers(settings, found, frame, margin=margin).to(device)
     there = frame, margin, torch.device(device)
     if made is not None:
         return _made(settings, made, there)
@@ -112,7 +112,7 @@ def imager(
 
 
 @functools.lru_cache(maxsize=32)
-def _made(settings: OpticsConfig, made: Stack, there: There) -> Imager:
+def _made(settings: OpticsConfig, made: PixelPsfStack, there: There) -> Imager:
     """The true image of a lens that is made: formed once for all who look at it."""
     if made.plane is None:
         raise TrainingError(
@@ -158,10 +158,10 @@ def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
 
 
 def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
-    """See :func:`codesign.optics.stack.hazy`; the shadow's light falls on all samples
+    """See :func:`codesign.optics.stack.scatter_loss`; the shadow's light falls on all samples
     alike.
     """
-    light = lens.hazy(
+    light = lens.scatter_loss(
         settings, whole.stack, variance_rad2(error.state(), settings.phase_rates)
     )
     total = light.sum((-2, -1))
@@ -169,7 +169,7 @@ def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Live:
+class DifferentiableImager:
     """A true image whose lens moves: the imager with the light of its nodes as a leaf.
 
     light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes
@@ -200,9 +200,9 @@ class Live:
         value.backward()  # type: ignore[no-untyped-call]
 
 
-def live(
+def make_differentiable_imager(
     settings: OpticsConfig, whole: Imager, pairs: tuple[Tensor, Tensor] | None = None
-) -> Live:
+) -> DifferentiableImager:
     """An imager with its nodes' light as a leaf, of the nodes that were drawn or of
     all; the relative illumination is
     held, and the image is that of the kernels that there are."""
@@ -216,7 +216,7 @@ def live(
     light.requires_grad_()
     psfs = light / light.sum((-2, -1), keepdim=True)
     asked = None if pairs is None else set(pairs[0].tolist())
-    return Live(light, replace(whole, stack=psfs, asked=asked), pairs)
+    return DifferentiableImager(light, replace(whole, stack=psfs, asked=asked), pairs)
 
 
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
@@ -236,10 +236,10 @@ def apart(
     """Relative L2 difference of the uniform image of a texture in depth from its true
     image: the error of 'uniform'.
     """
-    true = imager(
+    true = make_imager(
         replace(settings, image="true"), coefficients_rad, frame, margin=margin
     )
-    one = imager(
+    one = make_imager(
         replace(settings, image="uniform", layers=None),
         coefficients_rad,
         frame,
@@ -263,14 +263,16 @@ def difference(one: UniformImager, true: Imager) -> float:
     return float((got - want).norm() / (want - want.mean()).norm())
 
 
-def above(settings: OpticsConfig, found: UniformImager | Imager) -> str:
+def image_tolerance_problem(
+    settings: OpticsConfig, found: UniformImager | Imager
+) -> str:
     """Why the error of the true image is above ``optics.image_tolerance``; empty where
     it is not, or the image is
     uniform, whose distance from the true one is told instead."""
     return found.above(settings.image_tolerance) if isinstance(found, Imager) else ""
 
 
-def described(
+def describe_image(
     settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
 ) -> dict[str, Any]:
     """What the images are and how wrong, for a report: kind, error, and the source's
@@ -293,17 +295,17 @@ def described(
             return found | {
                 "error": apart(settings, coefficients_rad, frame, margin=margin)
             }
-        made = imager(settings, coefficients_rad, frame, margin=margin)
+        made = make_imager(settings, coefficients_rad, frame, margin=margin)
         return found | {
             "error": float(getattr(made, "error", math.nan)),
-            "above": above(settings, made),
+            "above": image_tolerance_problem(settings, made),
         }
     except (SceneError, PropagationError) as problem:
         return found | {"error": None, "problem": str(problem)}
 
 
-def words(found: dict[str, Any]) -> str:
-    """A line of :func:`described`."""
+def describe_image_text(found: dict[str, Any]) -> str:
+    """A line of :func:`describe_image`."""
     if found["error"] is None:
         return f"image: {found['kind']}; how far it is from the true image is not known: {found['problem']}"
     if found["kind"] == "uniform":

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from metalens import library
 from metalens.cell import Cell
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 from metalens.fabrication import DRAWN, Draw, ResponseError, State, guide, of_kind
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
 from metalens.pillars import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")

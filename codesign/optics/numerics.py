@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.image import PsfBasis, integrate, scene
 from metalens.lens import Lens
-from metalens.psf import Nodes, Source, psf_stack, spectrum
+from metalens.psf import Source, SpectralNodes, psf_stack, spectrum
 
 ENTRIES = 8192  # of the table of diameters
 SLACK_UM = 0.012  # that the table reaches beyond the pillars, for bias
@@ -25,7 +25,7 @@ TEXTURE_STEP_UM = 0.85  # finest sample of intensity
 
 
 @dataclass(frozen=True, slots=True)
-class Numerics:
+class OpticsNumerics:
     """How finely the optics are computed.
 
     depth_count: PSFs over depth, at equal steps of 1/z. wavelength_count: over the
@@ -47,7 +47,7 @@ class Numerics:
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ImageWindow:
     """What is seen of the PSFs: nearest and farthest depth, pixels of the image, width
     of the kernels.
     """
@@ -62,7 +62,7 @@ class Window:
         return np.asarray(1 / np.linspace(1 / self.near_um, 1 / self.far_um, count))
 
 
-class Aperture:
+class TabulatedLens:
     """A lens as places in a table of diameters.
 
     diameter_um: (entries,) of the table. place: (y, x) into it, -1 where there is no
@@ -139,22 +139,22 @@ class Aperture:
         return np.asarray(np.sin(np.arctan(r / sensor)) + behind)
 
 
-def line(lens: Lens, fwhm_nm: float, count: int) -> Nodes:
+def spectral_line_nodes(lens: Lens, fwhm_nm: float, count: int) -> SpectralNodes:
     """Wavelengths and weights of a diode about the design wavelength; one for a width
     of 0.
     """
     if fwhm_nm == 0 or count == 1:
-        return Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
-    um, share = spectrum.weight(Source(lens.wavelength_um * 1e3, fwhm_nm))
-    waves, weights = spectrum.gauss(um, share, count)
-    return Nodes(waves, weights, math.nan)
+        return SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    um, share = spectrum.spectral_weight(Source(lens.wavelength_um * 1e3, fwhm_nm))
+    waves, weights = spectrum.gauss_rule(um, share, count)
+    return SpectralNodes(waves, weights, math.nan)
 
 
-def kernels(
+def pixel_kernels(
     lens: Lens,
     maps: tuple[torch.Tensor, torch.Tensor],
-    numerics: Numerics,
-    window: Window,
+    numerics: OpticsNumerics,
+    window: ImageWindow,
     *,
     fwhm_nm: float = 0.0,
 ) -> PsfBasis:
@@ -167,7 +167,7 @@ def kernels(
     Raises:
         PropagationError: as :func:`metalens.psf.psf_stack`.
     """
-    nodes = line(lens, fwhm_nm, numerics.wavelength_count)
+    nodes = spectral_line_nodes(lens, fwhm_nm, numerics.wavelength_count)
     depths = window.depths_um(numerics.depth_count)
     fine, size = (
         math.ceil(window.pitch_um / TEXTURE_STEP_UM),
@@ -202,7 +202,7 @@ def kernels(
 
 
 def psf_difference(
-    one: PsfBasis, other: PsfBasis, window: Window, *, depths: int = 25
+    one: PsfBasis, other: PsfBasis, window: ImageWindow, *, depths: int = 25
 ) -> float:
     """Relative L2 difference of two bases' PSFs, root mean square over depths between
     their nodes too.

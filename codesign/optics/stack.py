@@ -18,7 +18,7 @@ from torch import Tensor
 
 from codesign.batches import parallel
 from codesign.optics import families
-from codesign.optics.families import Family, Start
+from codesign.optics.families import Family, StartingPhase
 from codesign.optics.lens_errors import (
     LensError,
     LensErrors,
@@ -29,11 +29,11 @@ from codesign.optics.lens_errors import (
     wave_front_rad,
 )
 from metalens.cell import Cell
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, TrainingError
+from metalens.core.paths import source_path
 from metalens.design import Focus, PhaseOf, profiles
 from metalens.field import Layers, Optics
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, TrainingError
-from metalens.ground.paths import source_path
 from metalens.image import (
     Field,
     PsfBasis,
@@ -136,7 +136,9 @@ class OpticsConfig:
             raise ConfigError(
                 f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees"
             )
-        Start(self.focus, 1.0, self.zones, self.parts, self.apart_um, self.foci_mm)
+        StartingPhase(
+            self.focus, 1.0, self.zones, self.parts, self.apart_um, self.foci_mm
+        )
         if not (
             self.fwhm_nm >= 0 and self.filter_nm >= 0 and 0 < self.image_tolerance < 1
         ):
@@ -177,10 +179,10 @@ class OpticsConfig:
         return need + 1 - need % 2
 
     @property
-    def start(self) -> Start:
+    def start(self) -> StartingPhase:
         """The fixed phase on top of the focus."""
         foci = tuple(f * 1e3 for f in self.foci_mm)
-        return Start(
+        return StartingPhase(
             self.focus,
             self.aperture_mm * 500,
             self.zones,
@@ -240,7 +242,7 @@ class OpticsConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stack:
+class PixelPsfStack:
     """PSFs over depth on the grid of the image.
 
     intensity: (depths, h, w) share of the light. depths_um: (depths,). plane: of a lens
@@ -258,13 +260,13 @@ class Stack:
         return basis(self.intensity / total, self.depths_um, tolerance=tolerance)
 
 
-def stack(
+def lens_psf_stack(
     settings: OpticsConfig,
     coefficients_rad: Tensor,
     *,
     error: LensError | None = None,
     shared: bool = False,
-) -> Stack:
+) -> PixelPsfStack:
     """PSFs of the lens whose polynomial coefficients are these, on samples of the
     image; differentiable.
 
@@ -308,12 +310,12 @@ def stack(
     kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
     light = (to_rows @ (kept @ to_columns)).real
     if shared:
-        light = parallel.gathered(light, rows, count)
+        light = parallel.gather_rows(light, rows, count)
     if error is not None:
-        light = hazy(
+        light = scatter_loss(
             settings, light, variance_rad2(error.state(), settings.phase_rates)
         )
-    return Stack(light, settings.depths_um)
+    return PixelPsfStack(light, settings.depths_um)
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
@@ -344,11 +346,13 @@ def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     def phase(x_um: Array, y_um: Array) -> Array:
         x, y = (torch.from_numpy(np.asarray(a, float)) for a in (x_um, y_um[:, None]))
         focused = torch.from_numpy(
-            profiles.hyperbolic(x_um, y_um[:, None], settings.focus)
+            profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
         )
         total = focused + settings.start.phase_rad(x, y)
         for weight, term in zip(
-            weights, families.terms(x / rim, y / rim, len(weights), family), strict=True
+            weights,
+            families.phase_terms(x / rim, y / rim, len(weights), family),
+            strict=True,
         ):
             total = total + weight * term
         return total.numpy()
@@ -356,8 +360,8 @@ def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     return phase
 
 
-def prepared(
-    settings: OpticsConfig, made: Stack, frame: int, *, margin: int
+def prepare_transfers(
+    settings: OpticsConfig, made: PixelPsfStack, frame: int, *, margin: int
 ) -> UniformImager:
     """Transfer functions for square frames of ``frame`` samples rendered with
     ``margin`` to spare.
@@ -373,7 +377,7 @@ def _polynomials(
     their mix of the plain ones.
     """
     x, y = (c / pupil.radius_um for c in coordinates(pupil))
-    raw = torch.stack(families.terms(x, y, count, family))
+    raw = torch.stack(families.phase_terms(x, y, count, family))
     inside = radius(pupil) <= pupil.radius_um
     samples = raw[:, inside]
     _, upper = torch.linalg.qr(samples.T)
@@ -389,7 +393,9 @@ def _modes(settings: OpticsConfig) -> Tensor:
         return terms
     seen, rim = _seen(settings), settings.pupil.radius_um
     raw = torch.stack(
-        families.terms(seen.x_um / rim, seen.y_um / rim, len(mix), settings.family)
+        families.phase_terms(
+            seen.x_um / rim, seen.y_um / rim, len(mix), settings.family
+        )
     )
     return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
 
@@ -499,7 +505,7 @@ def phase_at(
             @ coefficients_rad.double()
         )
         terms = torch.stack(
-            families.terms(
+            families.phase_terms(
                 x_um / rim, y_um / rim, settings.polynomials, settings.family
             )
         )
@@ -533,7 +539,7 @@ def _wave_front(
     return assembled + wave_front_rad(error.state(), x, y, settings.phase_rates)
 
 
-def hazy(settings: OpticsConfig, light: Tensor, variance: float) -> Tensor:
+def scatter_loss(settings: OpticsConfig, light: Tensor, variance: float) -> Tensor:
     """Light of pillars that the process made wrong: their phases differ by more than a
     smooth wave front.
 

@@ -29,7 +29,7 @@ from metalens.field import (
 from metalens.image import Grid, Imager
 from metalens.image import imager as field_imager
 from metalens.lens import Lens
-from metalens.psf import Nodes, Source, among
+from metalens.psf import Source, SpectralNodes, among
 
 ROWS = 256  # of pillars at a time
 
@@ -103,7 +103,7 @@ class PillarCells:
         return t * torch.polar(torch.ones_like(added), added)
 
 
-def gathered(
+def gather_lens_plane(
     lens: Lens, phase: Tensor, level: Tensor, *, window_um: float
 ) -> PillarCells:
     """The lens plane of pillars of these phases and amplitudes.
@@ -128,7 +128,9 @@ def gathered(
     x = torch.as_tensor(d.x_um, dtype=torch.float64)
     factor = None
     if lens.neighbours is not None:
-        factor = among.mean(torch.polar(level, phase), lens.neighbours, d.pitch_um)
+        factor = among.mean_coupling(
+            torch.polar(level, phase), lens.neighbours, d.pitch_um
+        )
     parts = []
     for rows in range(0, len(d.y_um), ROWS):
         part = slice(rows, rows + ROWS)
@@ -175,7 +177,7 @@ def _averaged(layers: Tensor, block: int) -> Tensor:
 
 
 @dataclass(eq=False)
-class Device:
+class ImagingDevice:
     """A lens plane, its films and its sensor, imaged truly over field, depth and
     spectrum.
     """
@@ -235,7 +237,8 @@ class Device:
     def one_wavelength(self, wavelength_um: float) -> Imager:
         """The image in light of one wavelength."""
         plan = replace(
-            self.whole.plan, waves=Nodes(np.array([wavelength_um]), np.ones(1), 0.0)
+            self.whole.plan,
+            waves=SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0),
         )
         return self._imaged(Optics(self.wave, self.layers, self.distance_um), plan)
 
@@ -270,7 +273,7 @@ class Device:
             return with_psfs(self.whole, *normalised(light, optics, plan))
 
 
-def device(
+def make_device(
     wave: Wave,
     grid: Grid,
     *,
@@ -279,7 +282,7 @@ def device(
     spectrum: Source | None = None,
     field_rad: float = 0.0,
     tolerance: float = 0.03,
-) -> Device:
+) -> ImagingDevice:
     """A device whose image is prepared.
 
     Raises:
@@ -290,7 +293,7 @@ def device(
             wave, grid, spectrum=spectrum, layers=layers, field=(field_rad, 0.0), tolerance=tolerance,
             distance_um=distance_um,
         )  # fmt: skip
-    return Device(wave, layers, distance_um, whole, tolerance)
+    return ImagingDevice(wave, layers, distance_um, whole, tolerance)
 
 
 def _few(axis: Tensor) -> Tensor:

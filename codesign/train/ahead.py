@@ -10,12 +10,12 @@ from typing import Generic, Self, TypeVar
 
 import torch
 
-from metalens.ground.executor import cores
+from metalens.core.executor import usable_cores
 
 Made = TypeVar("Made")
 
 
-class Ahead(Generic[Made]):
+class Prefetcher(Generic[Made]):
     """``work(step)`` of the step that is asked for, while that of the next ones begins,
     each on a thread of its own.
 
@@ -75,7 +75,7 @@ class Ahead(Generic[Made]):
         return self._begun.pop(step).result()
 
 
-def renderers(device: torch.device) -> int:
+def renderer_threads(device: torch.device) -> int:
     """Threads that render for a process that trains on ``device``: beside a GPU half of
     the processor's cores, eight at
     most, shared by the processes of ``torchrun`` on this machine. None beside a
@@ -84,4 +84,6 @@ def renderers(device: torch.device) -> int:
     most of the step."""
     if device.type == "cpu":
         return 0
-    return max(1, min(8, cores() // (2 * int(os.environ.get("LOCAL_WORLD_SIZE", "1")))))
+    return max(
+        1, min(8, usable_cores() // (2 * int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
+    )

@@ -12,9 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign.batches import Batch, EyeScenes, as_batch, decoupled
-from codesign.eye import States, Worn, ambiguity_pairs, drawn, render_dressed
-from metalens.ground.errors import TrainingError
+from codesign.batches import EyeScenes, FrameBatch, as_batch, depth_factors
+from codesign.eye import (
+    DrawnAugmentations,
+    EyeStates,
+    ambiguity_pairs,
+    draw_augmentations,
+    render_dressed,
+)
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,8 +33,8 @@ class AmbiguityScenes:
     """
 
     scenes: EyeScenes
-    states: States
-    worn: Worn
+    states: EyeStates
+    worn: DrawnAugmentations
 
     @property
     def margin(self) -> int:
@@ -55,7 +61,7 @@ class AmbiguityScenes:
             )
         return slice(step * size, (step + 1) * size)
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """Frames of a step."""
         rows = self.rows(step, size)
         made = render_dressed(
@@ -67,7 +73,7 @@ class AmbiguityScenes:
         return as_batch(made, self.margin)
 
 
-def ambiguous(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
+def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
     """``pairs`` pairs with scales of spread ``scenes.settings.scale``, from a seed.
 
     Raises:
@@ -76,18 +82,20 @@ def ambiguous(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes:
     found = ambiguity_pairs(
         pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion
     )
-    joined = States(
+    joined = EyeStates(
         *(
             torch.stack([getattr(found.first, n), getattr(found.second, n)], 1).flatten(
                 0, 1
             )
-            for n in States.__slots__
+            for n in EyeStates.__slots__
         )
     )
     depth = scenes.rig.distance_um + joined.slip_um[:, 2]
-    scale = decoupled(
+    scale = depth_factors(
         depth, scenes.depths_um, scenes.settings.scale, np.random.default_rng((seed, 8))
     )
     generator = np.random.default_rng((seed, scenes.stream, 10))
-    worn = drawn(len(joined), scenes.settings.variety, generator).from_one_view()
+    worn = draw_augmentations(
+        len(joined), scenes.settings.variety, generator
+    ).from_one_view()
     return AmbiguityScenes(scenes, replace(joined, scale=scale), worn)

@@ -6,17 +6,23 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from codesign.batches import depth_um, irradiance, samples
-from codesign.network import Architecture, Supernet, blur, losses, recalibrate
-from codesign.optics import OpticsConfig, Stack, formed
+from codesign.batches import depth_um, frame_samples, sensor_irradiance
+from codesign.network import (
+    Architecture,
+    Supernet,
+    blur,
+    losses,
+    recalibrate_batch_norm,
+)
+from codesign.optics import OpticsConfig, PixelPsfStack, formed
 from codesign.train.formation import frame_wide, read_out
-from codesign.train.inner import InnerConfig, Scenes, Trainer
-from metalens.ground.errors import PropagationError, SceneError
+from codesign.train.inner import InnerConfig, SceneSource, Trainer
+from metalens.core.errors import PropagationError, SceneError
 from metalens.image import Imager, UniformImager
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class SensorFrames:
     """Frames as the sensor gave them, with their truth.
 
     frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm:
@@ -25,7 +31,7 @@ class Seen:
     vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`;
     None where it is not known.
     above: why the error of their images is above ``optics.image_tolerance``
-    (:func:`codesign.optics.formed.above`);
+    (:func:`codesign.optics.formed.image_tolerance_problem`);
         empty where it is not.
     """
 
@@ -39,7 +45,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Assessment:
+class TaskErrors:
     """Mean absolute errors of the slippage in mm, and mean intersection over union of
     the pupil.
     """
@@ -58,7 +64,7 @@ SAME = 1.05  # ratio of errors up to which a result does not depend on the toler
 FINER = 4  # by which the image that checks a result is formed more precisely
 
 
-def finer(settings: OpticsConfig) -> OpticsConfig | None:
+def finer_image(settings: OpticsConfig) -> OpticsConfig | None:
     """The image that checks whether a result depends on the image's tolerance: a
     quarter of the tolerance of training; None of the uniform image, which has none.
     """
@@ -68,29 +74,33 @@ def finer(settings: OpticsConfig) -> OpticsConfig | None:
 
 
 def finer_frames(
-    trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None
-) -> Seen | None:
-    """:func:`frames` of the same scenes and noise on the :func:`finer` image; None
+    trainer: Trainer,
+    scenes: SceneSource,
+    batches: int,
+    *,
+    stack: PixelPsfStack | None = None,
+) -> SensorFrames | None:
+    """:func:`sensor_frames` of the same scenes and noise on the :func:`finer_image` image; None
     where there is none, or this lens cannot be imaged so precisely.
     """
-    optics = finer(trainer.optics)
+    optics = finer_image(trainer.optics)
     if optics is None:
         return None
     try:
-        return frames(trainer, scenes, batches, stack=stack, optics=optics)
+        return sensor_frames(trainer, scenes, batches, stack=stack, optics=optics)
     except (SceneError, PropagationError):
         return None
 
 
 @torch.no_grad()
-def frames(
+def sensor_frames(
     trainer: Trainer,
-    scenes: Scenes,
+    scenes: SceneSource,
     batches: int,
     *,
-    stack: Stack | None = None,
+    stack: PixelPsfStack | None = None,
     optics: OpticsConfig | None = None,
-) -> Seen:
+) -> SensorFrames:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
     with fixed noise.
 
@@ -107,13 +117,13 @@ def frames(
             given = (
                 optics,
                 trainer.model.coefficients_rad,
-                samples(batch.frames),
+                frame_samples(batch.frames),
             )
-            prepared = formed.imager(
+            prepared = formed.make_imager(
                 *given, margin=scenes.margin, made=stack, device=trainer.light.device
             )
-            above = formed.above(optics, prepared)
-        light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
+            above = formed.image_tolerance_problem(optics, prepared)
+        light = sensor_irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
         noise = torch.Generator().manual_seed(
             1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number
         )
@@ -125,17 +135,17 @@ def frames(
                 light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise
             )
         )
-        masks.append(losses.framed(batch.mask, wide))
+        masks.append(losses.mask_in_frame(batch.mask, wide))
         slips.append(batch.slip_mm)
         depths.append(
             blur.window_vergence(depth_um(batch.frames, margin=scenes.margin))
         )
     shown = torch.cat(pixels), torch.cat(masks), torch.cat(slips)
-    return Seen(*shown, trainer.inner.batch, torch.cat(depths), wide, above)
+    return SensorFrames(*shown, trainer.inner.batch, torch.cat(depths), wide, above)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Answers:
+class Predictions:
     """What a network said of frames.
 
     slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle.
@@ -159,11 +169,11 @@ class Answers:
 
 
 @torch.no_grad()
-def predict(
-    net: Supernet, architecture: Architecture, seen: Seen, inner: InnerConfig
-) -> Answers:
+def predict_frames(
+    net: Supernet, architecture: Architecture, seen: SensorFrames, inner: InnerConfig
+) -> Predictions:
     """Answers with the batch statistics that the network holds (see
-    :func:`codesign.network.supernet.recalibrate`).
+    :func:`codesign.network.supernet.recalibrate_batch_norm`).
     """
     training = net.training
     net.eval()
@@ -175,11 +185,11 @@ def predict(
     slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
     mask = torch.cat([f.mask_logits for f in found])
-    shared = losses.overlap(mask, seen.mask, pixels=pixels)
+    shared = losses.mask_iou(mask, seen.mask, pixels=pixels)
     spread = [f.slip_log_sd for f in found if f.slip_log_sd is not None]
     depth = [f.depth for f in found if f.depth is not None]
     axis = [f.axis for f in found if f.axis is not None and inner.axis_weight]
-    return Answers(
+    return Predictions(
         slip,
         torch.cat([f.centre for f in found]) * seen.wide,
         shared,
@@ -190,7 +200,7 @@ def predict(
     )
 
 
-def parts(seen: Seen) -> list[Tensor]:
+def batched_frames(seen: SensorFrames) -> list[Tensor]:
     """Frames a batch at a time."""
     return [
         seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)
@@ -201,28 +211,28 @@ def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
     """Training frames through the lens as it is: batch statistics are measured on them,
     never on frames that are scored.
     """
-    return parts(frames(trainer, trainer.scenes, batches))
+    return batched_frames(sensor_frames(trainer, trainer.scenes, batches))
 
 
 @torch.no_grad()
-def assess(
+def assess_architecture(
     net: Supernet,
     architecture: Architecture,
-    seen: Seen,
+    seen: SensorFrames,
     inner: InnerConfig,
     *,
     measured: Sequence[Tensor],
-) -> Assessment:
+) -> TaskErrors:
     """Errors of one architecture.
 
     Args:
         measured: (batch, 1, y, x) frames each, on which its batch statistics are
             measured; see :func:`training_frames`.
     """
-    recalibrate(net, architecture, measured)
-    answers = predict(net, architecture, seen, inner)
+    recalibrate_batch_norm(net, architecture, measured)
+    answers = predict_frames(net, architecture, seen, inner)
     error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     net.train()
-    return Assessment(
+    return TaskErrors(
         float(error[2]), float(error[:2].mean()), float(answers.iou.mean())
     )

@@ -12,9 +12,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from metalens.ground import config
-from metalens.ground.errors import TrainingError
-from metalens.ground.store import replacing
+from metalens.core import config
+from metalens.core.errors import TrainingError
+from metalens.core.store import replace_atomically
 
 VERSION = 10
 ABOUT = "about"
@@ -86,7 +86,7 @@ def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None
     """Of what is said about the tensors there is one entry: the writer puts several
     into an order drawn by chance.
     """
-    with replacing(path) as part:
+    with replace_atomically(path) as part:
         try:
             save_file(tensors, str(part), metadata={key: value})
         except SafetensorError as error:
@@ -129,7 +129,7 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
     return merged
 
 
-def difference(old: str, settings: object) -> str:
+def settings_difference(old: str, settings: object) -> str:
     """What changed from settings in TOML to these, one ``key: old -> new`` a line; ''
     for none.
 
@@ -177,7 +177,7 @@ def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
             f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}; train again, or go on "
             "with the release that wrote it"
         )
-    changed = difference(metadata["settings"], settings)
+    changed = settings_difference(metadata["settings"], settings)
     if changed:
         raise TrainingError(
             f"{path} belongs to other settings; start a new run or undo the change:\n{changed}"

@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from codesign.batches import Batch, Flat
+from codesign.batches import FrameBatch, SingleSurfaceFrames
 from codesign.network import Architecture, Supernet
 from codesign.train import assess
-from codesign.train.inner import Scenes, Trainer
+from codesign.train.inner import SceneSource, Trainer
 from metalens.image import Frames
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Displaced:
+class DisplacedFrames:
     """Frames that are blurred as if everything stood ``shift_um`` farther away; places
     and sizes stay.
     """
 
-    scenes: Scenes
+    scenes: SceneSource
     shift_um: float
 
     @property
@@ -33,18 +33,20 @@ class Displaced:
         """The noise is that of the frames in their true place."""
         return int(getattr(self.scenes, "stream", 0))
 
-    def batch(self, step: int, size: int) -> Batch:
+    def batch(self, step: int, size: int) -> FrameBatch:
         """Frames of a step; the labels are the old ones."""
         plain = self.scenes.batch(step, size)
-        return replace(plain, frames=displaced(plain.frames, self.shift_um))
+        return replace(plain, frames=displace_frames(plain.frames, self.shift_um))
 
 
-def displaced(frames: Frames | Flat, shift_um: float) -> Frames | Flat:
+def displace_frames(
+    frames: Frames | SingleSurfaceFrames, shift_um: float
+) -> Frames | SingleSurfaceFrames:
     """Frames with all depths larger by ``shift_um``."""
     if isinstance(frames, Frames):
         return Frames(frames.radiance, frames.coverage, frames.depth_um + shift_um)
     far = frames.depth_um * frames.scale[:, None, None] + shift_um
-    return Flat(
+    return SingleSurfaceFrames(
         frames.light,
         (far / frames.scale[:, None, None]).clip(0, 65535).round().astype(np.uint16),
         frames.scale,
@@ -66,7 +68,7 @@ class DepthResponse:
 
 def depth_response(
     trainer: Trainer,
-    scenes: Scenes,
+    scenes: SceneSource,
     net: Supernet,
     architecture: Architecture,
     *,
@@ -79,10 +81,12 @@ def depth_response(
     A network that guesses depth from the size of what it sees answers 0, however well
     it scores on natural frames.
     The batch statistics must be measured
-    (:func:`codesign.network.supernet.recalibrate`).
+    (:func:`codesign.network.supernet.recalibrate_batch_norm`).
     """
     here = _axial(trainer, scenes, net, architecture, batches)
-    there = _axial(trainer, Displaced(scenes, shift_um), net, architecture, batches)
+    there = _axial(
+        trainer, DisplacedFrames(scenes, shift_um), net, architecture, batches
+    )
     change = (there - here) / (shift_um * 1e-3)
     return DepthResponse(
         float(change.mean()), float(change.std() / len(change) ** 0.5), len(change)
@@ -91,10 +95,10 @@ def depth_response(
 
 def _axial(
     trainer: Trainer,
-    scenes: Scenes,
+    scenes: SceneSource,
     net: Supernet,
     architecture: Architecture,
     batches: int,
 ) -> Tensor:
-    seen = assess.frames(trainer, scenes, batches)
-    return assess.predict(net, architecture, seen, trainer.inner).slip_mm[:, 2]
+    seen = assess.sensor_frames(trainer, scenes, batches)
+    return assess.predict_frames(net, architecture, seen, trainer.inner).slip_mm[:, 2]

@@ -13,19 +13,19 @@ import numpy as np
 from codesign.batches import parallel
 from codesign.network import (
     Architecture,
-    Space,
-    active,
-    check,
-    largest,
-    mutate,
-    sample,
-    smallest,
+    SearchSpace,
+    canonical_architecture,
+    check_architecture,
+    largest_architecture,
+    mutate_architecture,
+    sample_architecture,
+    smallest_architecture,
 )
-from metalens.ground.errors import TrainingError, nearest
+from metalens.core.errors import TrainingError, nearest_name_hint
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class EvaluatedCandidate:
     """An evaluated architecture: ``error`` is to be small, ``macs`` within the budget."""
 
     architecture: Architecture
@@ -34,7 +34,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class EvolutionSettings:
     """Settings of the search.
 
     population: members alive; the oldest dies with every birth.
@@ -76,17 +76,17 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class EvolutionState:
     """State of a search: everything that is needed to go on after a stop.
 
     history: every candidate in order of birth; the last ``population`` are alive.
     generator: state of the random generator.
     """
 
-    history: tuple[Candidate, ...] = ()
+    history: tuple[EvaluatedCandidate, ...] = ()
     generator: dict[str, Any] = field(default_factory=dict)
 
-    def alive(self, plan: Plan) -> tuple[Candidate, ...]:
+    def alive(self, plan: EvolutionSettings) -> tuple[EvaluatedCandidate, ...]:
         """The members that may become parents."""
         return self.history[-plan.population :]
 
@@ -95,21 +95,21 @@ Evaluate = Callable[[Architecture], float]
 Count = Callable[[Architecture], float]
 
 
-def evolve(
-    space: Space,
-    plan: Plan,
+def evolve_population(
+    space: SearchSpace,
+    plan: EvolutionSettings,
     evaluate: Evaluate,
     count: Count,
     *,
     budget: float,
     seed: int,
-    start: Search | None = None,
-) -> Iterator[Search]:
+    start: EvolutionState | None = None,
+) -> Iterator[EvolutionState]:
     """Search state after every round of births; give the last one as ``start`` to go on
     exactly where it stopped.
 
-    The first two candidates are those that :func:`sandwich` trains at every step
-    (:func:`ends`).
+    The first two candidates are those that :func:`sample_sandwich` trains at every step
+    (:func:`largest_and_smallest`).
 
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
@@ -119,37 +119,52 @@ def evolve(
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
-    affordable(space, count, budget)
-    state = start or Search(
+    check_budget(space, count, budget)
+    state = start or EvolutionState(
         generator=dict(np.random.default_rng(seed).bit_generator.state)
     )
-    known = {active(space, c.architecture): c.error for c in state.history}
+    known = {
+        canonical_architecture(space, c.architecture): c.error for c in state.history
+    }
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
         here = len(state.history)
         births = min(plan.together, plan.rounds - here)
         born = (
-            list(ends(space, count, budget)[here : here + births]) if here < 2 else []
+            list(largest_and_smallest(space, count, budget)[here : here + births])
+            if here < 2
+            else []
         )
         while len(born) < births:
             born.append(_next(space, plan, state, count, budget, generator))
-        fresh = {active(space, a): a for a in born if active(space, a) not in known}
+        fresh = {
+            canonical_architecture(space, a): a
+            for a in born
+            if canonical_architecture(space, a) not in known
+        }
         known |= dict(
-            zip(fresh, parallel.each(evaluate, list(fresh.values())), strict=True)
+            zip(fresh, parallel.share_work(evaluate, list(fresh.values())), strict=True)
         )
-        judged = (Candidate(a, known[active(space, a)], float(count(a))) for a in born)
-        state = Search((*state.history, *judged), dict(generator.bit_generator.state))
+        judged = (
+            EvaluatedCandidate(
+                a, known[canonical_architecture(space, a)], float(count(a))
+            )
+            for a in born
+        )
+        state = EvolutionState(
+            (*state.history, *judged), dict(generator.bit_generator.state)
+        )
         yield state
 
 
-def affordable(space: Space, count: Count, budget: float) -> None:
+def check_budget(space: SearchSpace, count: Count, budget: float) -> None:
     """Refuse a budget below the smallest network.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
-    least = count(smallest(space))
+    least = count(smallest_architecture(space))
     if least > budget:
         raise TrainingError(
             f"budget of {budget / 1e6:g} MMACs is below the smallest network, {least / 1e6:.1f} MMACs; "
@@ -158,30 +173,32 @@ def affordable(space: Space, count: Count, budget: float) -> None:
 
 
 def search(
-    space: Space,
-    plan: Plan,
+    space: SearchSpace,
+    plan: EvolutionSettings,
     evaluate: Evaluate,
     count: Count,
     *,
     budget: float,
     seed: int,
-) -> tuple[Candidate, ...]:
-    """A whole search: every candidate in order of birth; :func:`best` and
-    :func:`pareto` read it.
+) -> tuple[EvaluatedCandidate, ...]:
+    """A whole search: every candidate in order of birth; :func:`best_candidate` and
+    :func:`pareto_front` read it.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
-    state = Search()
-    for born in evolve(space, plan, evaluate, count, budget=budget, seed=seed):
+    state = EvolutionState()
+    for born in evolve_population(
+        space, plan, evaluate, count, budget=budget, seed=seed
+    ):
         state = born
     return state.history
 
 
 def _next(
-    space: Space,
-    plan: Plan,
-    state: Search,
+    space: SearchSpace,
+    plan: EvolutionSettings,
+    state: EvolutionState,
     count: Count,
     budget: float,
     generator: np.random.Generator,
@@ -190,9 +207,9 @@ def _next(
     tournament.
     """
     if len(state.history) < plan.population:
-        return _within(lambda: sample(space, generator), count, budget) or smallest(
-            space
-        )
+        return _within(
+            lambda: sample_architecture(space, generator), count, budget
+        ) or smallest_architecture(space)
     alive = state.alive(plan)
     rivals = generator.choice(len(alive), plan.tournament, replace=False)
     parent = min(
@@ -200,7 +217,9 @@ def _next(
     ).architecture
     return (
         _within(
-            lambda: mutate(space, parent, generator, rate=plan.mutation), count, budget
+            lambda: mutate_architecture(space, parent, generator, rate=plan.mutation),
+            count,
+            budget,
         )
         or parent
     )
@@ -221,14 +240,16 @@ def _rank(error: float) -> float:
     return error if np.isfinite(error) else np.inf
 
 
-def best(candidates: Sequence[Candidate]) -> Candidate:
+def best_candidate(candidates: Sequence[EvaluatedCandidate]) -> EvaluatedCandidate:
     """The candidate of least error; of equals, the cheapest."""
     return min(candidates, key=lambda c: (_rank(c.error), c.macs))
 
 
-def pareto(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def pareto_front(
+    candidates: Sequence[EvaluatedCandidate],
+) -> tuple[EvaluatedCandidate, ...]:
     """Candidates that no other beats in both error and cost, cheapest first."""
-    front: list[Candidate] = []
+    front: list[EvaluatedCandidate] = []
     for candidate in sorted(candidates, key=lambda c: (c.macs, _rank(c.error))):
         if np.isfinite(candidate.error) and (
             not front or candidate.error < front[-1].error
@@ -237,8 +258,8 @@ def pareto(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     return tuple(front)
 
 
-def sandwich(
-    space: Space,
+def sample_sandwich(
+    space: SearchSpace,
     count: Count,
     budget: float,
     generator: np.random.Generator,
@@ -249,19 +270,21 @@ def sandwich(
     ones.
 
     With a budget above 0 each sees its input at the highest resolution that the budget
-    allows (:func:`ends`): what is
+    allows (:func:`largest_and_smallest`): what is
     never chosen is not trained. Where nothing fits, the smallest at least resolution.
     """
     if not budget:
         return [
-            largest(space),
-            smallest(space),
-            *(sample(space, generator) for _ in range(subnets)),
+            largest_architecture(space),
+            smallest_architecture(space),
+            *(sample_architecture(space, generator) for _ in range(subnets)),
         ]
-    large, small = ends(space, count, budget)
+    large, small = largest_and_smallest(space, count, budget)
     drawn = [
         _within(
-            lambda: fitted(space, sample(space, generator), count, budget),
+            lambda: fit_resolution(
+                space, sample_architecture(space, generator), count, budget
+            ),
             count,
             budget,
             tries=20,
@@ -271,8 +294,8 @@ def sandwich(
     return [large, small, *(one or small for one in drawn)]
 
 
-def ends(
-    space: Space, count: Count, budget: float
+def largest_and_smallest(
+    space: SearchSpace, count: Count, budget: float
 ) -> tuple[Architecture, Architecture]:
     """The largest uniform network that fits at any resolution, and the smallest: most
     weights, most pixels.
@@ -280,13 +303,16 @@ def ends(
     Both at the highest resolution that the budget allows; the smallest at least
     resolution where nothing fits.
     """
-    small = fitted(space, smallest(space), count, budget)
-    made = (fitted(space, candidate, count, budget) for candidate in uniform(space))
+    small = fit_resolution(space, smallest_architecture(space), count, budget)
+    made = (
+        fit_resolution(space, candidate, count, budget)
+        for candidate in uniform_architectures(space)
+    )
     return next((a for a in made if count(a) <= budget), small), small
 
 
-def fitted(
-    space: Space, architecture: Architecture, count: Count, budget: float
+def fit_resolution(
+    space: SearchSpace, architecture: Architecture, count: Count, budget: float
 ) -> Architecture:
     """The architecture at the highest resolution that the budget allows; at the least
     if none does.
@@ -302,11 +328,11 @@ def fitted(
     return dataclasses.replace(architecture, resolution=low)
 
 
-def uniform(space: Space) -> Iterator[Architecture]:
+def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
     """Networks alike in all stages, large to smallest: width, then depth, then kernel
     and expansion are reduced.
     """
-    whole, least = largest(space), smallest(space)
+    whole, least = largest_architecture(space), smallest_architecture(space)
     shallow = dataclasses.replace(whole, depths=least.depths)
     for width in sorted(space.widths, reverse=True):
         yield from (
@@ -314,7 +340,7 @@ def uniform(space: Space) -> Iterator[Architecture]:
         )
 
 
-def dumps(search: Search) -> str:
+def state_to_json(search: EvolutionState) -> str:
     """The state as JSON text."""
     history = [
         {**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs}
@@ -323,7 +349,7 @@ def dumps(search: Search) -> str:
     return json.dumps({"history": history, "generator": search.generator})
 
 
-def loads(text: str, space: Space) -> Search:
+def state_from_json(text: str, space: SearchSpace) -> EvolutionState:
     """State from JSON text.
 
     Raises:
@@ -332,24 +358,26 @@ def loads(text: str, space: Space) -> Search:
     try:
         raw = json.loads(text)
         history = tuple(_candidate(entry, space) for entry in raw["history"])
-        return Search(history, raw["generator"])
+        return EvolutionState(history, raw["generator"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise TrainingError(
             f"not the state of an architecture search: {error!r}"
         ) from error
 
 
-def _candidate(entry: dict[str, Any], space: Space) -> Candidate:
+def _candidate(entry: dict[str, Any], space: SearchSpace) -> EvaluatedCandidate:
     values = dict(entry)
     error, macs = values.pop("error"), values.pop("macs")
     fields = {f.name for f in dataclasses.fields(Architecture)}
     for name in values:
         if name not in fields:
             raise TrainingError(
-                f"unknown entry {name!r} of an architecture{nearest(name, fields)}"
+                f"unknown entry {name!r} of an architecture{nearest_name_hint(name, fields)}"
             )
     fixed: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
     }
     made = Architecture(**fixed)
-    return Candidate(check(space, made), float(error), float(macs))
+    return EvaluatedCandidate(
+        check_architecture(space, made), float(error), float(macs)
+    )

@@ -9,29 +9,29 @@ from typing import Any
 
 from torch import Tensor
 
-from codesign.batches import CALIBRATION, TEST, Scenes
-from codesign.gaze.bench import People
-from codesign.network import blur, recalibrate
+from codesign.batches import CALIBRATION, TEST, SceneSource
+from codesign.gaze.bench import PeopleFrames
+from codesign.network import blur, recalibrate_batch_norm
 from codesign.train import ambiguity, assess, evolution, specialise
-from codesign.train.assess import Answers, Seen
+from codesign.train.assess import Predictions, SensorFrames
 from codesign.train.depth_test import depth_response
-from codesign.train.evolution import Candidate, Search
+from codesign.train.evolution import EvaluatedCandidate, EvolutionState
 from codesign.train.inner import Trainer
-from codesign.train.run import Run
-from metalens.ground.errors import TrainingError
+from codesign.train.run import CodesignRun
+from metalens.core.errors import TrainingError
 
 
-def finish(run: Run) -> list[dict[str, Any]]:
+def finish_budgets(run: CodesignRun) -> list[dict[str, Any]]:
     """The best of every budget on the test frames: one row a budget.
 
     Raises:
         TrainingError: a search has not ended.
     """
-    return [end.row for end in finished(run)]
+    return [end.row for end in finished_budgets(run)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class End:
+class BudgetResult:
     """What a budget ended in.
 
     row: of the result. trainer: with the model that reached it, lens, pitch and weights
@@ -43,13 +43,13 @@ class End:
 
     row: dict[str, Any]
     trainer: Trainer
-    seen: Seen
-    answers: Answers
+    seen: SensorFrames
+    answers: Predictions
     interval_mm: Tensor | None
 
 
-def finished(run: Run) -> list[End]:
-    """The ends of :func:`finish`, a budget each.
+def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
+    """The ends of :func:`finish_budgets`, a budget each.
 
     ``gaze_deg``: mean gaze error on people whom training never saw, by spherical-eye
     solver and residual regressor. ``pitch_um``: of its own lens and sensor.
@@ -72,7 +72,7 @@ def finished(run: Run) -> list[End]:
     shared: _Frames | None = None
     out = []
     for budget, best in _chosen(run):
-        trainer = specialise.specialise(run, best.architecture, budget)
+        trainer = specialise.specialise_candidate(run, best.architecture, budget)
         if shared is None or settings.search.inner_steps:
             shared = _frames(replace(run, trainer=trainer), people)
         out.append(_end(replace(run, trainer=trainer), budget, best, people, shared))
@@ -85,42 +85,48 @@ class _Frames:
     people, to measure batch statistics on, to calibrate intervals with.
     """
 
-    tests: dict[str, Seen]
-    fine: Seen | None
-    people: Seen
+    tests: dict[str, SensorFrames]
+    fine: SensorFrames | None
+    people: SensorFrames
     measured: list[Tensor]
-    apart: Seen
-    response: Scenes
+    apart: SensorFrames
+    response: SceneSource
 
 
-def _frames(run: Run, people: People) -> _Frames:
+def _frames(run: CodesignRun, people: PeopleFrames) -> _Frames:
     settings, trainer = run.settings, run.trainer
-    tests = {"": assess.frames(trainer, run.scenes(TEST), settings.test_batches)}
-    response: Scenes = run.scenes(TEST)
+    tests = {"": assess.sensor_frames(trainer, run.scenes(TEST), settings.test_batches)}
+    response: SceneSource = run.scenes(TEST)
     if settings.ambiguity_pairs:
-        pairs = ambiguity.ambiguous(
+        pairs = ambiguity.ambiguous_pairs(
             run.scenes(TEST), settings.ambiguity_pairs, settings.inner.seed
         )
         batches = max(1, len(pairs) // settings.inner.batch)
-        tests["ambiguous_"] = assess.frames(trainer, pairs, batches)
+        tests["ambiguous_"] = assess.sensor_frames(trainer, pairs, batches)
         response = pairs
     return _Frames(
         tests,
         assess.finer_frames(trainer, run.scenes(TEST), settings.test_batches),
         specialise.frames_of(trainer, people),
         assess.training_frames(trainer),
-        assess.frames(trainer, run.scenes(CALIBRATION), settings.validation_batches),
+        assess.sensor_frames(
+            trainer, run.scenes(CALIBRATION), settings.validation_batches
+        ),
         response,
     )
 
 
 def _end(
-    run: Run, budget: float, best: Candidate, people: People, shown: _Frames
-) -> End:
+    run: CodesignRun,
+    budget: float,
+    best: EvaluatedCandidate,
+    people: PeopleFrames,
+    shown: _Frames,
+) -> BudgetResult:
     """The row of one budget; ``run`` holds the trainer that reached it."""
     settings, trainer, architecture = run.settings, run.trainer, best.architecture
     net, inner = trainer.model.net, settings.inner
-    recalibrate(net, architecture, shown.measured)
+    recalibrate_batch_norm(net, architecture, shown.measured)
     row: dict[str, Any] = {
         "budget_mmacs": budget,
         "mmacs": run.macs(architecture) / 1e6,
@@ -130,13 +136,19 @@ def _end(
     row["gaze_deg"] = specialise.gaze_error_deg(
         trainer, architecture, people, shown.people
     )
-    reach = widths(assess.predict(net, architecture, shown.apart, inner), shown.apart)
-    plain = assess.predict(net, architecture, shown.tests[""], inner)
+    reach = conformal_quantiles(
+        assess.predict_frames(net, architecture, shown.apart, inner), shown.apart
+    )
+    plain = assess.predict_frames(net, architecture, shown.tests[""], inner)
     for name, seen in shown.tests.items():
-        answers = assess.predict(net, architecture, seen, inner) if name else plain
-        row |= _errors(name, answers, seen) | told(name, answers, seen, reach)
+        answers = (
+            assess.predict_frames(net, architecture, seen, inner) if name else plain
+        )
+        row |= _errors(name, answers, seen) | uncertainty_summary(
+            name, answers, seen, reach
+        )
     if shown.fine is not None:
-        on_fine = assess.predict(net, architecture, shown.fine, inner)
+        on_fine = assess.predict_frames(net, architecture, shown.fine, inner)
         row |= _errors("finer_", on_fine, shown.fine)
         row["finer_ratio"] = row["finer_axial_slip_mm"] / row["axial_slip_mm"]
     response = depth_response(
@@ -148,11 +160,13 @@ def _end(
     )
     row["depth_response_mm_per_mm"] = response.mean
     row["depth_response_error"] = response.standard_error
-    row["architecture"] = json.loads(evolution.dumps(Search((best,))))["history"][0]
-    return End(row, trainer, shown.tests[""], plain, _wide(plain, reach))
+    row["architecture"] = json.loads(evolution.state_to_json(EvolutionState((best,))))[
+        "history"
+    ][0]
+    return BudgetResult(row, trainer, shown.tests[""], plain, _wide(plain, reach))
 
 
-def _chosen(run: Run) -> list[tuple[float, Candidate]]:
+def _chosen(run: CodesignRun) -> list[tuple[float, EvaluatedCandidate]]:
     settings = run.settings
     if len(run.searches) < len(settings.run.budgets_mmacs):
         raise TrainingError(
@@ -160,12 +174,14 @@ def _chosen(run: Run) -> list[tuple[float, Candidate]]:
             "done; resume the run"
         )
     return [
-        (b, evolution.best(s.history))
+        (b, evolution.best_candidate(s.history))
         for b, s in zip(settings.run.budgets_mmacs, run.searches, strict=True)
     ]
 
 
-def _errors(name: str, answers: Answers, seen: Seen) -> dict[str, float | None]:
+def _errors(
+    name: str, answers: Predictions, seen: SensorFrames
+) -> dict[str, float | None]:
     error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     shared = float(answers.iou.mean())
     return {
@@ -177,7 +193,9 @@ def _errors(name: str, answers: Answers, seen: Seen) -> dict[str, float | None]:
     }
 
 
-def widths(answers: Answers, seen: Seen, *, share: float = 0.9) -> float | None:
+def conformal_quantiles(
+    answers: Predictions, seen: SensorFrames, *, share: float = 0.9
+) -> float | None:
     """Half width, in its own standard deviations, of the interval that holds this share
     of the axial slippages.
 
@@ -193,7 +211,7 @@ def widths(answers: Answers, seen: Seen, *, share: float = 0.9) -> float | None:
     return float(ratio.sort().values[rank - 1])
 
 
-def _wide(answers: Answers, reach: float | None) -> Tensor | None:
+def _wide(answers: Predictions, reach: float | None) -> Tensor | None:
     """(n,) half width of the 90 % intervals of the axial slippage."""
     return (
         None
@@ -202,8 +220,8 @@ def _wide(answers: Answers, reach: float | None) -> Tensor | None:
     )
 
 
-def told(
-    name: str, answers: Answers, seen: Seen, reach: float | None
+def uncertainty_summary(
+    name: str, answers: Predictions, seen: SensorFrames, reach: float | None
 ) -> dict[str, float]:
     """What the network tells beside the slippage: coverage of its 90 % intervals, their
     width, depth of windows.

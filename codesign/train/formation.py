@@ -9,7 +9,7 @@ from torch import Tensor
 
 from codesign.batches import parallel
 from codesign.network import Architecture, Supernet, cost
-from codesign.optics import OpticsConfig, Stack
+from codesign.optics import OpticsConfig, PixelPsfStack
 from metalens.image import Sensor, encircled_energy, texture_information
 from metalens.image import sensor as camera
 
@@ -84,11 +84,11 @@ def _normal(
     )
     collected = mean.clamp(max=well)
     share, size = (
-        parallel.ranks(),
+        parallel.process_count(),
         len(mean),
     )  # the noise of the whole batch, whoever takes which part of it
     noise = camera.normal((share * size, *mean.shape[1:]), mean, generator)
-    noise = noise[parallel.rank() * size : (parallel.rank() + 1) * size]
+    noise = noise[parallel.process_rank() * size : (parallel.process_rank() + 1) * size]
     return collected + noise * torch.sqrt(
         collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6
     )
@@ -100,7 +100,7 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
 
     The last pixels then reach beyond the image, by half a pixel at most; a network sees
     the frame and tells places in
-    it, so its labels are those of the frame (:func:`codesign.network.losses.framed`).
+    it, so its labels are those of the frame (:func:`codesign.network.losses.mask_in_frame`).
     """
     wide = (
         camera.pixel_count(samples, sample_um, pitch_um)
@@ -118,10 +118,10 @@ def network_macs(
 ) -> Tensor:
     """Multiply-accumulates of one member at this pitch, differentiable."""
     size = window_um / pitch_um * architecture.resolution
-    return cost.interpolated(lambda sizes: net.counts(architecture, sizes), size)
+    return cost.interpolate_counts(lambda sizes: net.counts(architecture, sizes), size)
 
 
-def depth_information(made: Stack) -> Tensor:
+def depth_information(made: PixelPsfStack) -> Tensor:
     """(depths - 1,) information on depth between the depths, in the blur of a window of
     1/f texture, per mm².
 
@@ -142,7 +142,7 @@ def depth_information(made: Stack) -> Tensor:
     return torch.stack(told)
 
 
-def depth_loss(made: Stack, settings: OpticsConfig, *, energy: float) -> Tensor:
+def depth_loss(made: PixelPsfStack, settings: OpticsConfig, *, energy: float) -> Tensor:
     """-log of the information on depth in blurred texture, and a hinge on the encircled
     energy (paper Eq. 6).
 

@@ -23,15 +23,15 @@ from pytorch_optimizer import SOAP
 from torch import Tensor, nn
 
 from codesign.batches import (
-    Batch,
+    EyePose,
     EyeScenes,
-    Flat,
-    Pose,
-    Scenes,
+    FrameBatch,
+    SceneSource,
+    SingleSurfaceFrames,
     depth_um,
-    irradiance,
+    frame_samples,
     parallel,
-    samples,
+    sensor_irradiance,
 )
 from codesign.network import (
     Architecture,
@@ -41,21 +41,21 @@ from codesign.network import (
     losses,
     running,
 )
-from codesign.optics import LensError, OpticsConfig, Stack
+from codesign.optics import LensError, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.train import moving
-from codesign.train.ahead import Ahead, renderers
-from codesign.train.evolution import Count, sandwich
+from codesign.train.ahead import Prefetcher, renderer_threads
+from codesign.train.evolution import Count, sample_sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
-from codesign.train.light import Light
-from codesign.train.moving import Model, Schedule, model
+from codesign.train.light import StepImaging
+from codesign.train.moving import LearningRateSchedule, TrainedModel, make_model
 from codesign.train.separability import (
     SeparabilityConfig,
+    fisher_separability,
     render_triplets,
-    separability,
 )
-from metalens.ground import threads
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.core import threads
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.image import (
     Frames,
     Imager,
@@ -98,9 +98,15 @@ class InnerConfig:
     batch: int = 32
     seed: int = 0
     subnets: int = 1
-    weights: Schedule = field(default_factory=lambda: Schedule(4e-3, clip=2.0))
-    optics: Schedule = field(default_factory=lambda: Schedule(0.02, 0.1, 0.8, clip=1.0))
-    pitch: Schedule = field(default_factory=lambda: Schedule(0.0, 0.1, 0.8, clip=1.0))
+    weights: LearningRateSchedule = field(
+        default_factory=lambda: LearningRateSchedule(4e-3, clip=2.0)
+    )
+    optics: LearningRateSchedule = field(
+        default_factory=lambda: LearningRateSchedule(0.02, 0.1, 0.8, clip=1.0)
+    )
+    pitch: LearningRateSchedule = field(
+        default_factory=lambda: LearningRateSchedule(0.0, 0.1, 0.8, clip=1.0)
+    )
     slip_weight: float = 2.0
     depth_weight: float = 0.5
     axis_weight: float = 0.5
@@ -169,7 +175,7 @@ def _soap(weights: list[nn.Parameter]) -> torch.optim.Optimizer:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Given:
+class StepInputs:
     """What a step trains on.
 
     light: (batch, y, x) on the sensor. vergence: (batch, windows, windows) of
@@ -179,7 +185,7 @@ class Given:
     """
 
     step: int
-    batch: Batch
+    batch: FrameBatch
     light: Tensor
     optics_loss: Tensor
     vergence: Tensor
@@ -187,7 +193,7 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class LogRecord:
     """One line of the log.
 
     skipped: steps so far whose gradient was not finite.
@@ -212,11 +218,11 @@ class Trainer:
         inner: InnerConfig,
         optics: OpticsConfig,
         sensor: Sensor,
-        scenes: Scenes,
-        made: Model,
+        scenes: SceneSource,
+        made: TrainedModel,
         *,
         architecture: Architecture | None = None,
-        stacks: Sequence[Stack] = (),
+        stacks: Sequence[PixelPsfStack] = (),
         budgets_mmacs: Sequence[float] = (),
         largest_only: bool = False,
         triplets: EyeScenes | None = None,
@@ -242,7 +248,7 @@ class Trainer:
             made,
         )
         self.architecture = architecture
-        self.light = Light(
+        self.light = StepImaging(
             optics,
             stacks,
             refresh=inner.refresh,
@@ -252,7 +258,7 @@ class Trainer:
         )
         reading = _reading_layers(made.net)
         others = [p for p in made.net.parameters() if all(p is not q for q in reading)]
-        self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
+        self.groups: dict[str, tuple[LearningRateSchedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, others),
             "reading": (inner.weights, reading),
             "optics": (
@@ -277,7 +283,7 @@ class Trainer:
         self._begins_um = float(made.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
-    def run(self, *, until: int | None = None) -> Iterator[Record]:
+    def run(self, *, until: int | None = None) -> Iterator[LogRecord]:
         """Train to ``until`` (the end of the run without it), yielding a record a step.
 
         Raises:
@@ -286,7 +292,9 @@ class Trainer:
         threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        with Ahead(self._batch, end=end, workers=renderers(self.light.device)) as ahead:
+        with Prefetcher(
+            self._batch, end=end, workers=renderer_threads(self.light.device)
+        ) as ahead:
             while self.step < end:
                 batch = ahead.take(self.step)
                 with ahead.beside():
@@ -318,7 +326,7 @@ class Trainer:
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
-    def _advance(self, batch: Batch) -> Record:
+    def _advance(self, batch: FrameBatch) -> LogRecord:
         progress = self.step / self.inner.steps
         rates = {
             name: schedule.at(progress) for name, (schedule, _) in self.groups.items()
@@ -333,9 +341,9 @@ class Trainer:
             self._given(self.step, batch, live=live, seen=not moves), rates
         )
 
-    def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
+    def _stepped(self, given: StepInputs, rates: dict[str, float]) -> LogRecord:
         """A step of every optimiser on what is given."""
-        means = running.kept(self.model.net)
+        means = running.keep_running_means(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
         total, macs = (
@@ -347,9 +355,9 @@ class Trainer:
             total = total + self.inner.budget_weight * over.to(self.light.device)
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.model.coefficients_rad)
-        parallel.average(p for _, ps in self.groups.values() for p in ps)
+        parallel.average_gradients(p for _, ps in self.groups.values() for p in ps)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
-        finite = finite and moving.finite(
+        finite = finite and moving.has_finite_gradients(
             p for _, ps in self.groups.values() for p in ps
         )
         if not finite:
@@ -360,27 +368,29 @@ class Trainer:
         loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of(
             [float(v.detach()) for v in values]
         )
-        return Record(
+        return LogRecord(
             self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
         )
 
-    def _batch(self, step: int) -> Batch:
+    def _batch(self, step: int) -> FrameBatch:
         """The frames of a step, by its number alone."""
         return parallel.part_of(self.scenes.batch(step, self.inner.batch))
 
-    def _given(self, step: int, batch: Batch, *, live: bool, seen: bool) -> Given:
+    def _given(
+        self, step: int, batch: FrameBatch, *, live: bool, seen: bool
+    ) -> StepInputs:
         """What a step trains on; ``seen``: as the pixels give it, which takes a pitch
         that does not move.
         """
         margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(step, batch.frames, live)
-            light = irradiance(batch.frames, optics, margin=margin)
+            light = sensor_irradiance(batch.frames, optics, margin=margin)
         vergence = blur.window_vergence(
             depth_um(batch.frames, margin=margin, device=self.light.device)
         )
         frames = self._read(step, light, pitch, False) if seen else None
-        return Given(
+        return StepInputs(
             step, batch.to(self.light.device), light, optics_loss, vergence, frames
         )
 
@@ -399,7 +409,7 @@ class Trainer:
             resized=resized,
         )
 
-    def _losses(self, given: Given, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
+    def _losses(self, given: StepInputs, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
         """Mean task loss of the step's members, and the multiply-accumulates of each."""
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
         scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
@@ -416,14 +426,14 @@ class Trainer:
         wide = frame_wide(
             given.light.shape[-1], self.optics.sample_um, float(pitch.detach())
         )
-        mask = losses.framed(batch.mask, wide)
+        mask = losses.mask_in_frame(batch.mask, wide)
         shift = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
             answer = self.model.net(frames[finer[a]], a)
-            loss = losses.task(
+            loss = losses.task_loss(
                 answer, mask, shift, scale, slip_weight=self.inner.slip_weight
             )
-            loss = loss + losses.reading(
+            loss = loss + losses.depth_reading_loss(
                 answer,
                 given.vergence,
                 shift,
@@ -438,32 +448,34 @@ class Trainer:
         )
         return torch.stack(parts).mean(), macs
 
-    def _pose(self, answer: Prediction, pose: Pose, wide: float) -> Tensor:
+    def _pose(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
         weights = {
             "axis_weight": self.inner.axis_weight,
             "point_weight": self.inner.point_weight,
         }
-        return losses.pose(answer, pose.axis, pose.points / wide, **weights)
+        return losses.pose_loss(answer, pose.axis, pose.points / wide, **weights)
 
     def _light(
-        self, step: int, frames: Frames | Flat, live: bool
+        self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
     ) -> tuple[UniformImager | Imager, Tensor]:
         """What images this step's frames, and the optics loss."""
         coefficients = self.model.coefficients_rad
         optics = self.light.at(
-            step, coefficients, samples(frames), self.scenes.margin, live=live
+            step, coefficients, frame_samples(frames), self.scenes.margin, live=live
         )
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
         config, every = self.inner.separability, self.inner.separability.every
         if every and (self.triplets is None or step % every):
             return optics, torch.zeros(())
-        made = lens.stack(self.optics, coefficients, error=self._lens_error(step))
+        made = lens.lens_psf_stack(
+            self.optics, coefficients, error=self._lens_error(step)
+        )
         if not every or self.triplets is None:
             return optics, depth_loss(made, self.optics, energy=self.inner.energy)
-        found = separability(
+        found = fisher_separability(
             render_triplets(self.triplets, config, step),
-            lambda one: irradiance(one, optics, margin=self.scenes.margin),
+            lambda one: sensor_irradiance(one, optics, margin=self.scenes.margin),
             encircled_energy(
                 made.intensity,
                 self.optics.sample_um,
@@ -483,7 +495,7 @@ class Trainer:
             return [self.architecture]
         space = self.model.net.space
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
-        members = sandwich(
+        members = sample_sandwich(
             space, count, self._budget, generator, subnets=self.inner.subnets
         )
         return (
@@ -537,18 +549,18 @@ class Trainer:
         bad = [
             name
             for name, (_, parameters) in self.groups.items()
-            if not moving.finite(parameters)
+            if not moving.has_finite_gradients(parameters)
         ]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
 
 
 __all__ = [
-    "Batch",
+    "FrameBatch",
     "InnerConfig",
-    "Model",
-    "Record",
-    "Scenes",
-    "Schedule",
+    "LearningRateSchedule",
+    "LogRecord",
+    "SceneSource",
+    "TrainedModel",
     "Trainer",
-    "model",
+    "make_model",
 ]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.optics import LensError, OpticsConfig, Stack, formed
+from codesign.optics import LensError, OpticsConfig, PixelPsfStack, formed
 from codesign.optics import stack as lens
 from metalens.field import drawn
 from metalens.image import Imager, UniformImager
@@ -17,7 +17,7 @@ from metalens.image import Imager, UniformImager
 Draw = Callable[[int], LensError | None]
 
 
-class Light:
+class StepImaging:
     """What images the frames of every step.
 
     One PSF a depth is formed at every step in which the lens moves. The true image is
@@ -30,7 +30,7 @@ class Light:
     def __init__(
         self,
         optics: OpticsConfig,
-        stacks: Sequence[Stack],
+        stacks: Sequence[PixelPsfStack],
         *,
         refresh: int,
         draws: int,
@@ -48,7 +48,7 @@ class Light:
         )  # of images and losses: see :mod:`codesign.train.placement`
         self._ready: UniformImager | Imager | None = None
         self._given: dict[int, UniformImager | Imager] = {}
-        self._live: formed.Live | None = None
+        self._live: formed.DifferentiableImager | None = None
 
     def state(self) -> dict[str, Any]:
         """Which lens is imaged: all that the next step needs."""
@@ -79,7 +79,7 @@ class Light:
         made = self._true(step, coefficients_rad.detach(), frame, margin, live=live)
         if not live:
             return made
-        self._live = formed.live(
+        self._live = formed.make_differentiable_imager(
             self.optics, made, drawn(made.plan, self.draws, self._generator(step))
         )
         return self._live.ready
@@ -111,8 +111,10 @@ class Light:
         error = self.draw(step)
         if not live and error is None and self._ready is not None:
             return self._ready
-        made = lens.stack(self.optics, coefficients_rad, error=error, shared=True)
-        prepared = lens.prepared(self.optics, made, frame, margin=margin).to(
+        made = lens.lens_psf_stack(
+            self.optics, coefficients_rad, error=error, shared=True
+        )
+        prepared = lens.prepare_transfers(self.optics, made, frame, margin=margin).to(
             self.device
         )
         self._ready = None if live or error is not None else prepared
@@ -144,7 +146,9 @@ class Light:
                 "error": error,
                 "device": self.device,
             }
-            self._ready = formed.imager(self.optics, self.imaged_rad, frame, **about)
+            self._ready = formed.make_imager(
+                self.optics, self.imaged_rad, frame, **about
+            )
         if not isinstance(self._ready, Imager):
             raise TypeError("the true image needs a field of PSFs")
         return self._ready
@@ -163,7 +167,7 @@ class Light:
                 "made": made,
                 "device": self.device,
             }
-            self._given[number] = formed.imager(
+            self._given[number] = formed.make_imager(
                 self.optics, coefficients_rad, frame, **about
             )
         return self._given[number]

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from codesign.network import Space, Supernet
+from codesign.network import SearchSpace, Supernet
 from codesign.optics import OpticsConfig
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)
-class Schedule:
+class LearningRateSchedule:
     """How one group of parameters moves: Adam with warm-up, cosine decay, and its own
     clip.
 
@@ -48,7 +48,7 @@ class Schedule:
 
 
 @dataclass(eq=False)
-class Model:
+class TrainedModel:
     """What training moves.
 
     coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel
@@ -82,25 +82,25 @@ class Model:
         )
 
 
-def model(
+def make_model(
     settings: OpticsConfig,
     *,
     pitch_um: float,
     seed: int,
-    space: Space | None = None,
-) -> Model:
+    space: SearchSpace | None = None,
+) -> TrainedModel:
     """A fresh model: network weights from the seed, a lens without added phase."""
     torch.manual_seed(seed)
     net = Supernet(space)
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
-    return Model(
+    return TrainedModel(
         net,
         nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
         nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
     )
 
 
-def finite(parameters: Iterable[nn.Parameter]) -> bool:
+def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
     """Whether all gradients that there are have finite numbers alone; a device is asked
     once.
     """

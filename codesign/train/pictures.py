@@ -9,54 +9,54 @@ import torch
 from torch import Tensor
 
 from codesign.batches import VALIDATION
-from codesign.network import blur, losses, recalibrate, smallest
+from codesign.network import blur, losses, recalibrate_batch_norm, smallest_architecture
 from codesign.optics import stack as lens
 from codesign.train import assess
-from codesign.train.finish import End
+from codesign.train.finish import BudgetResult
 from codesign.train.formation import depth_information
-from codesign.train.run import Run
-from metalens.ground import report
-from metalens.ground.arrays import Array
+from codesign.train.run import CodesignRun
+from metalens.core import report
+from metalens.core.arrays import Array
 
 
 @torch.no_grad()
-def all_of(run: Run) -> dict[str, bytes]:
+def all_of(run: CodesignRun) -> dict[str, bytes]:
     """PNG pictures by name: psf, frames, masks.
 
     The run stays as it is: masks come from a copy of the network, whose batch
     statistics are measured in evaluation mode on the frames that are shown.
     """
     trainer = run.trainer
-    made = lens.stack(trainer.optics, trainer.model.coefficients_rad)
+    made = lens.lens_psf_stack(trainer.optics, trainer.model.coefficients_rad)
     chosen = torch.linspace(0, len(made.depths_um) - 1, 6).long().tolist()
     titles = [f"{float(made.depths_um[i]) * 1e-3:.0f} mm" for i in chosen]
     pictures = {
         "psf": _row([made.intensity[i].clamp_min(0).sqrt() for i in chosen], titles)
     }
-    seen = assess.frames(trainer, run.scenes(VALIDATION), 1)
+    seen = assess.sensor_frames(trainer, run.scenes(VALIDATION), 1)
     shown = min(6, len(seen.frames))
     pictures["frames"] = _row(list(seen.frames[:shown, 0]), [""] * shown)
     net = copy.deepcopy(trainer.model.net)  # the run's own statistics must not move
-    recalibrate(net, smallest(net.space), [seen.frames])
-    found = net(seen.frames, smallest(net.space)).mask_logits.cpu()
+    recalibrate_batch_norm(net, smallest_architecture(net.space), [seen.frames])
+    found = net(seen.frames, smallest_architecture(net.space)).mask_logits.cpu()
     if found.numel():
         pictures["masks"] = _row(list(torch.sigmoid(found[:shown])), [""] * shown)
     return pictures
 
 
 def _row(images: list[Tensor], titles: list[str]) -> bytes:
-    figure, _ = report.canvas(size=(1.6 * len(images), 1.8))
+    figure, _ = report.make_figure(size=(1.6 * len(images), 1.8))
     figure.clear()
     for k, (image, title) in enumerate(zip(images, titles, strict=True)):
         axes = figure.add_subplot(1, len(images), k + 1)
         axes.imshow(image.numpy(), cmap="gray")
         axes.set_title(title)
         axes.set_axis_off()
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 @torch.no_grad()
-def bound(run: Run) -> dict[str, list[float]]:
+def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
     """Least standard deviation, in mm, of a reader of the blur of one window, on axis,
     over the depth.
 
@@ -64,7 +64,7 @@ def bound(run: Run) -> dict[str, list[float]]:
     power: see
     :func:`codesign.train.formation.depth_information`.
     """
-    made = lens.stack(run.trainer.optics, run.trainer.model.coefficients_rad)
+    made = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
     told = depth_information(made)
     middle = (made.depths_um[1:] + made.depths_um[:-1]) / 2
     return {
@@ -73,7 +73,7 @@ def bound(run: Run) -> dict[str, list[float]]:
     }
 
 
-def answered(ends: list[End], count: int) -> dict[str, Array]:
+def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Array]:
     """The first test frames and what each network said of them.
 
     Returns:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from codesign.network import Prediction
 from codesign.train.inner import Trainer
 from codesign.train.words import Place
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 
 def device_of(wanted: Place) -> torch.device:
@@ -40,7 +40,7 @@ def device_of(wanted: Place) -> torch.device:
     )
 
 
-def place(trainer: Trainer, device: torch.device) -> None:
+def place_on_device(trainer: Trainer, device: torch.device) -> None:
     """Let a trainer image and train on a device: its network and what its optimiser
     remembers move there.
     """
@@ -54,10 +54,10 @@ def place(trainer: Trainer, device: torch.device) -> None:
         optimiser.load_state_dict(
             optimiser.state_dict()
         )  # casts what it holds to its parameters' devices
-    attend(net, device)
+    follow_device(net, device)
 
 
-def attend(net: nn.Module, device: torch.device) -> None:
+def follow_device(net: nn.Module, device: torch.device) -> None:
     """From now on frames on the processor are taken to ``device``, and what is
     predicted of those is brought back.
     """

@@ -16,21 +16,28 @@ import torch
 
 from codesign.batches import (
     EyeScenes,
-    Pool,
+    FramePool,
     PoolScenes,
     SceneConfig,
-    fill,
     parallel,
+    render_pool,
 )
-from codesign.network import Architecture, Space, cost, smallest
+from codesign.network import Architecture, SearchSpace, cost, smallest_architecture
 from codesign.optics import OpticsConfig
 from codesign.train import checkpoint, evolution
-from codesign.train.evolution import Plan, Search
+from codesign.train.evolution import EvolutionSettings, EvolutionState
 from codesign.train.formation import network_macs
-from codesign.train.inner import InnerConfig, Record, Scenes, Schedule, Trainer, model
+from codesign.train.inner import (
+    InnerConfig,
+    LearningRateSchedule,
+    LogRecord,
+    SceneSource,
+    Trainer,
+    make_model,
+)
 from codesign.train.words import Part
-from metalens.ground import config
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.core import config
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.image import Sensor
 from metalens.image.sensor import pixel_count
 
@@ -38,7 +45,7 @@ Preset = Literal["none", "smoke", "laptop", "paper"]
 
 
 @dataclass(frozen=True, slots=True)
-class Budgets:
+class RunBudgets:
     """Where the run starts, and what it is searched under.
 
     pitch_um: pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
@@ -100,10 +107,10 @@ class RunConfig:
     scenes: SceneConfig = field(default_factory=SceneConfig)
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     sensor: Sensor = field(default_factory=Sensor)
-    space: Space = field(default_factory=Space)
+    space: SearchSpace = field(default_factory=SearchSpace)
     inner: InnerConfig = field(default_factory=InnerConfig)
-    search: Plan = field(default_factory=Plan)
-    run: Budgets = field(default_factory=Budgets)
+    search: EvolutionSettings = field(default_factory=EvolutionSettings)
+    run: RunBudgets = field(default_factory=RunBudgets)
 
     def __post_init__(self) -> None:
         if min(self.checkpoint_every, self.validation_batches, self.test_batches) < 1:
@@ -129,20 +136,22 @@ class RunConfig:
             )
 
 
-def load(path: str | Path) -> RunConfig:
+def load_run_settings(path: str | Path) -> RunConfig:
     """Read RUN.toml over its preset.
 
     Raises:
-        ConfigError: see :func:`metalens.ground.config.load`; an unknown preset.
+        ConfigError: see :func:`metalens.core.config.load`; an unknown preset.
     """
     table = config.read(path, RunConfig, empty=False)
     preset = preset_table(table.get("preset", "laptop"))
-    return config.from_table(config.merged(preset, table), RunConfig, where=str(path))
+    return config.from_table(
+        config.merge_tables(preset, table), RunConfig, where=str(path)
+    )
 
 
 def preset_table(name: str) -> dict[str, Any]:
     """The settings of a preset; empty for "none" and for a name that is no preset,
-    which :func:`load` then refuses.
+    which :func:`load_run_settings` then refuses.
     """
     if name == "none" or name not in get_args(Preset):
         return {}
@@ -153,12 +162,12 @@ def preset_table(name: str) -> dict[str, Any]:
 
 
 @dataclass(eq=False)
-class Run:
+class CodesignRun:
     """A run and where it stands: ``trainer`` first, then a search for every budget."""
 
     settings: RunConfig
     trainer: Trainer
-    searches: list[Search]
+    searches: list[EvolutionState]
 
     @property
     def window_um(self) -> float:
@@ -196,7 +205,7 @@ class Run:
         )
 
 
-def start(settings: RunConfig) -> Run:
+def start_run(settings: RunConfig) -> CodesignRun:
     """A fresh run; its pool of frames, where there is one, is rendered when the first
     batch is asked for.
 
@@ -206,9 +215,15 @@ def start(settings: RunConfig) -> Run:
     """
     seed, frozen = settings.inner.seed, settings.run.frozen
     inner = settings.inner
-    inner = replace(inner, optics=Schedule(0.0)) if "optics" in frozen else inner
-    inner = replace(inner, pitch=Schedule(0.0)) if "pitch" in frozen else inner
-    made = model(
+    inner = (
+        replace(inner, optics=LearningRateSchedule(0.0))
+        if "optics" in frozen
+        else inner
+    )
+    inner = (
+        replace(inner, pitch=LearningRateSchedule(0.0)) if "pitch" in frozen else inner
+    )
+    made = make_model(
         settings.optics,
         pitch_um=settings.run.pitch_um,
         seed=seed,
@@ -220,7 +235,7 @@ def start(settings: RunConfig) -> Run:
         settings.optics.sensor_distance_mm * 1e3,
         seed,
     )
-    scenes: Scenes = fresh
+    scenes: SceneSource = fresh
     if settings.scenes.pool:
         pool = functools.partial(
             _pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed
@@ -236,7 +251,7 @@ def start(settings: RunConfig) -> Run:
         largest_only="architecture" in frozen,
         triplets=fresh,
     )
-    run = Run(settings, trainer, [])
+    run = CodesignRun(settings, trainer, [])
     made.finest_um = _affordable(run, moves=inner.pitch.rate > 0)
     return run
 
@@ -244,15 +259,17 @@ def start(settings: RunConfig) -> Run:
 @functools.lru_cache(maxsize=1)
 def _pool(
     scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int
-) -> Pool:
+) -> FramePool:
     """The rendered frames of a run; kept for whoever goes on with it in this process,
     as its retraining does, until
     another run asks for its own: an experiment over nine runs held nine of a gigabyte
     each."""
-    return fill(EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool)
+    return render_pool(
+        EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool
+    )
 
 
-def _affordable(run: Run, *, moves: bool) -> float:
+def _affordable(run: CodesignRun, *, moves: bool) -> float:
     """The finest pitch that leaves the smallest network within every budget; 0 where
     the samples' own does.
 
@@ -263,7 +280,10 @@ def _affordable(run: Run, *, moves: bool) -> float:
         TrainingError: it is coarser than the pitch that the run begins with.
     """
     settings, net = run.settings, run.trainer.model.net
-    least, budget = smallest(settings.space), min(settings.run.budgets_mmacs) * 1e6
+    least, budget = (
+        smallest_architecture(settings.space),
+        min(settings.run.budgets_mmacs) * 1e6,
+    )
 
     def count(pitch_um: float) -> float:
         smooth = network_macs(
@@ -310,18 +330,18 @@ def finest_within(
     return high_um
 
 
-def save(path: Path, run: Run) -> None:
+def save_run(path: Path, run: CodesignRun) -> None:
     """Checkpoint: training state and the searches so far; written by one process alone."""
-    if parallel.rank():
+    if parallel.process_rank():
         return
     state = {
         "trainer": run.trainer.state(),
-        "searches": [evolution.dumps(s) for s in run.searches],
+        "searches": [evolution.state_to_json(s) for s in run.searches],
     }
     checkpoint.save(path, state, settings=run.settings)
 
 
-def resume(path: Path, settings: RunConfig) -> Run:
+def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
     """Go on from a checkpoint.
 
     Raises:
@@ -329,13 +349,15 @@ def resume(path: Path, settings: RunConfig) -> Run:
             difference is named).
     """
     state = checkpoint.load(path, settings=settings)
-    run = start(settings)
+    run = start_run(settings)
     run.trainer.restore(state["trainer"])
-    run.searches = [evolution.loads(text, settings.space) for text in state["searches"]]
+    run.searches = [
+        evolution.state_from_json(text, settings.space) for text in state["searches"]
+    ]
     return run
 
 
-def train(run: Run, path: Path) -> Iterator[Record]:
+def train_run(run: CodesignRun, path: Path) -> Iterator[LogRecord]:
     """Advance the training to its end, with checkpoints; a record a step."""
     for record in run.trainer.run():
         # first the caller's log, then the checkpoint: a log never lacks a step that is
@@ -345,9 +367,9 @@ def train(run: Run, path: Path) -> Iterator[Record]:
             record.step % run.settings.checkpoint_every == 0
             or record.step == run.settings.inner.steps
         ):
-            save(path, run)
+            save_run(path, run)
 
 
-def coefficients(run: Run) -> torch.Tensor:
+def lens_coefficients(run: CodesignRun) -> torch.Tensor:
     """Polynomial coefficients of the trained lens, rad."""
     return run.trainer.model.coefficients_rad.detach().clone()

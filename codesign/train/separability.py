@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from codesign.batches import EyeScenes
-from codesign.eye import States, render
-from metalens.ground.errors import ConfigError
+from codesign.eye import EyeStates, render
+from metalens.core.errors import ConfigError
 from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
 from metalens.image import sensor as camera
 
@@ -77,7 +77,7 @@ class SeparabilityConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Separability:
+class FisherSeparability:
     """Fisher matrix of gaze and slippage at the sensor, and the loss of Eq. 6.
 
     fisher: (motions, motions), mean over the anchors, per degree and mm.
@@ -95,7 +95,7 @@ class Separability:
         return torch.atan2((gaze * slip - both**2).clamp_min(0).sqrt(), both)
 
 
-def moved_states(states: States, config: SeparabilityConfig) -> list[States]:
+def moved_states(states: EyeStates, config: SeparabilityConfig) -> list[EyeStates]:
     """The anchors, then the same moved along every motion."""
     out = [states]
     for name, axis, step in config.directions:
@@ -118,7 +118,7 @@ def render_triplets(
     ]
 
 
-def separability(
+def fisher_separability(
     frames: list[Frames],
     image: Callable[[Frames], Tensor],
     encircled: Tensor,
@@ -126,7 +126,7 @@ def separability(
     *,
     sensor: Sensor,
     sample_um: float,
-) -> Separability:
+) -> FisherSeparability:
     """Eqs. 4 to 6 of triplets through a lens and its sensor; differentiable in both.
 
     Args:
@@ -151,4 +151,4 @@ def separability(
         orthogonality=config.orthogonality,
         compactness=config.compactness,
     )
-    return Separability(fisher, loss)
+    return FisherSeparability(fisher, loss)

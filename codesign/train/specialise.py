@@ -21,14 +21,16 @@ from codesign.network import Architecture
 from codesign.train import assess
 from codesign.train.formation import network_macs
 from codesign.train.inner import InnerConfig, Trainer
-from codesign.train.moving import Schedule
-from codesign.train.run import Run, finest_within
+from codesign.train.moving import LearningRateSchedule
+from codesign.train.run import CodesignRun, finest_within
 
 PEOPLE_EACH = 20  # frames of a person, of which a fifth calibrates
 SLOWER = 4  # rates of the inner optimisation are those of training over this
 
 
-def specialise(run: Run, architecture: Architecture, budget_mmacs: float) -> Trainer:
+def specialise_candidate(
+    run: CodesignRun, architecture: Architecture, budget_mmacs: float
+) -> Trainer:
     """A trainer whose model is θ*(α): a copy of the supernet's, trained on for this
     architecture alone, then its weights alone (``finetune_steps``).
 
@@ -42,12 +44,12 @@ def specialise(run: Run, architecture: Architecture, budget_mmacs: float) -> Tra
     joint = replace(joint, budget_mmacs=budget_mmacs)
     weights = replace(
         _slower(source.inner, settings.run.finetune_steps, seed + 1),
-        optics=Schedule(0.0),
-        pitch=Schedule(0.0),
+        optics=LearningRateSchedule(0.0),
+        pitch=LearningRateSchedule(0.0),
     )
     if settings.search.inner_steps:
         model.finest_um = _finest_um(run, architecture, budget_mmacs)
-    with parallel.alone():
+    with parallel.single_process():
         for inner, steps in (
             (joint, settings.search.inner_steps),
             (weights, settings.run.finetune_steps),
@@ -81,7 +83,9 @@ def _slower(inner: InnerConfig, steps: int, seed: int) -> InnerConfig:
     return replace(inner, steps=max(steps, 1), seed=seed, **groups)  # type: ignore[arg-type]
 
 
-def _finest_um(run: Run, architecture: Architecture, budget_mmacs: float) -> float:
+def _finest_um(
+    run: CodesignRun, architecture: Architecture, budget_mmacs: float
+) -> float:
     """The finest pitch at which an architecture keeps its budget."""
     begins = float(run.trainer.model.pitch_um.detach())
 
@@ -97,27 +101,29 @@ def _finest_um(run: Run, architecture: Architecture, budget_mmacs: float) -> flo
     return finest_within(count, budget_mmacs * 1e6, finest, begins) or begins
 
 
-def people_of(run: Run, stream: int, batches: int) -> bench.People:
+def people_of(run: CodesignRun, stream: int, batches: int) -> bench.PeopleFrames:
     """People of a stream, as many as fill these batches; two or more."""
     frames = batches * run.settings.inner.batch
     count = max(2, frames // PEOPLE_EACH)
     seed = run.settings.inner.seed + 31 * (stream + 1)
-    return bench.people(run.scenes(stream), count, PEOPLE_EACH, seed=seed)
+    return bench.simulate_people(run.scenes(stream), count, PEOPLE_EACH, seed=seed)
 
 
-def frames_of(trainer: Trainer, people: bench.People) -> assess.Seen:
+def frames_of(trainer: Trainer, people: bench.PeopleFrames) -> assess.SensorFrames:
     """Their frames through a trainer's lens and sensor."""
     size = trainer.inner.batch
-    return assess.frames(trainer, people, math.ceil(len(people.states) / size))
+    return assess.sensor_frames(trainer, people, math.ceil(len(people.states) / size))
 
 
 def gaze_error_deg(
     trainer: Trainer,
     architecture: Architecture,
-    people: bench.People,
-    seen: assess.Seen,
+    people: bench.PeopleFrames,
+    seen: assess.SensorFrames,
 ) -> float:
     """Mean gaze error of a network whose batch statistics are measured."""
-    answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
+    answers = assess.predict_frames(
+        trainer.model.net, architecture, seen, trainer.inner
+    )
     read = bench.read_of(people, answers.centre, answers.slip_mm)
     return bench.calibrated_error_deg(people, read)

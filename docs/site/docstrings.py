@@ -9,7 +9,7 @@ from typing import Any
 
 import griffe
 
-from metalens.ground import config
+from metalens.core import config
 
 _NAMED = re.compile(r"^::: ([\w.]+)$", re.M)
 _ROLE = re.compile(r":(?:func|class|mod|meth|attr):`~?([\w.]+)`")
@@ -39,7 +39,7 @@ class Docstrings(griffe.Extension):
             "dataclass" in str(one.value) for one in cls.decorators
         ):
             return
-        told = config.described(
+        told = config.describe_fields(
             getattr(importlib.import_module(cls.module.path), cls.name)
         )
         texts = cls.docstring.value.split("\n\n")

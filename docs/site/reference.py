@@ -20,7 +20,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from metalens.cli import VERBS
-from metalens.ground import config
+from metalens.core import config
 
 # settings file: (module, record, command that reads it)
 SETTINGS = {
@@ -130,7 +130,7 @@ def keys(record: type[Any], path: str = "") -> list[str]:
     """Markdown of a record's keys, then of the tables below it."""
     hints, told = (
         typing.get_type_hints(record, include_extras=True),
-        config.described(record),
+        config.describe_fields(record),
     )
     lead = (inspect.getdoc(record) or "").split("\n\n")[0].replace("\n", " ")
     lines = [f"### `[{path}]`" if path else "### Top level", "", lead, ""]
@@ -179,12 +179,12 @@ def _options(verb: str, module: str) -> list[str]:
         ]
     record = loaded.Options
     told, hints = (
-        config.described(record),
+        config.describe_fields(record),
         typing.get_type_hints(record, include_extras=True),
     )
     for base in reversed(record.__mro__[1:-1]):
         if dataclasses.is_dataclass(base):
-            told = config.described(base) | told
+            told = config.describe_fields(base) | told
     lines = [
         f"## metalens {verb}",
         "",

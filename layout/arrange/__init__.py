@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.arrange import apart as apart
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     from layout.arrange import parts as parts
     from layout.arrange import seen as seen
     from layout.arrange import wafer as wafer
-    from layout.arrange.record import Arrangement as Arrangement
-    from layout.arrange.record import At as At
     from layout.arrange.record import CellPart as CellPart
-    from layout.arrange.record import Furniture as Furniture
+    from layout.arrange.record import Floorplan as Floorplan
+    from layout.arrange.record import FrameSettings as FrameSettings
     from layout.arrange.record import LensPart as LensPart
-    from layout.arrange.record import Wafer as Wafer
+    from layout.arrange.record import Placement as Placement
+    from layout.arrange.record import WaferSettings as WaferSettings
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Arrangement": "record",
-        "At": "record",
+        "Floorplan": "record",
+        "Placement": "record",
         "CellPart": "record",
-        "Furniture": "record",
+        "FrameSettings": "record",
         "LensPart": "record",
-        "Wafer": "record",
+        "WaferSettings": "record",
         "apart": "",
         "job_file": "",
         "joined": "",

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.arrange.joined import PER_UM, Placing
-from layout.arrange.parts import APERTURE, Part
+from layout.arrange.joined import PER_UM, PartPlacement
+from layout.arrange.parts import APERTURE, DieComponent
 from layout.drc import Violation
-from layout.formats import Copies, Turn
+from layout.formats import CellCopies, Orientation
 from layout.pec import psf
 from layout.process import Process
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 MOST_PLACED = 4000  # parts on a die
 
@@ -24,8 +24,8 @@ MOST_PLACED = 4000  # parts on a die
 class _Standing:
     """One copy of a part: where, and the boxes of its exposures there."""
 
-    part: Part
-    turn: Turn
+    part: DieComponent
+    turn: Orientation
     x: int
     y: int
 
@@ -72,7 +72,9 @@ def reach_um(process: Process) -> float:
     return high
 
 
-def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
+def check_separation(
+    placed: Sequence[PartPlacement], process: Process
+) -> list[Violation]:
     """Pairs of parts that are nearer than the least gap, or than one's backscatter lets
     the other's doses hold.
 
@@ -101,7 +103,9 @@ def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
     return found
 
 
-def extent(placed: Sequence[Placing], *, exposed: bool = False) -> Array:
+def extent_of_copies(
+    placed: Sequence[PartPlacement], *, exposed: bool = False
+) -> Array:
     """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``:
     of what is exposed alone.
     """
@@ -111,13 +115,13 @@ def extent(placed: Sequence[Placing], *, exposed: bool = False) -> Array:
     return _around(np.array(made))
 
 
-def _all(placed: Sequence[Placing]) -> Iterator[_Standing]:
+def _all(placed: Sequence[PartPlacement]) -> Iterator[_Standing]:
     for placing in placed:
         for copies in placing.copies(placing.part.top):
             yield from _each(placing.part, copies)
 
 
-def _each(part: Part, copies: Copies) -> Iterator[_Standing]:
+def _each(part: DieComponent, copies: CellCopies) -> Iterator[_Standing]:
     if copies.count > MOST_PLACED:
         raise ProcessError(
             f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked"

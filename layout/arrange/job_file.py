@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.arrange.joined import PER_UM, Placing
-from layout.formats import Assembly, CellContent, handover
-from layout.mask import FieldPlan, Lattice
+from layout.arrange.joined import PER_UM, PartPlacement
+from layout.formats import CellContent, MaskAssembly, handover
+from layout.mask import FieldPlan, PillarLattice
 from layout.process import LayerNumber
 from layout.shapes import polygon
-from metalens.ground import store
-from metalens.ground.units import nm
+from metalens.core import store
+from metalens.core.units import nm
 
 HEAD = (*handover.FIELD_HEAD, "part")
 
@@ -34,7 +34,7 @@ class PlacedField:
 
 
 def place_fields(
-    placed: Sequence[Placing], splits: Mapping[str, FieldPlan]
+    placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
 ) -> Iterator[PlacedField]:
     """Write fields of all lenses on the die, part by part in their order of writing.
 
@@ -47,7 +47,7 @@ def place_fields(
     for one in placed:
         if one.part.name not in splits:
             continue
-        steps = handover.sequence(splits[one.part.name])
+        steps = handover.field_sequence(splits[one.part.name])
         middle = np.array([(step.x_um, step.y_um) for step in steps])
         for copies in one.copies(one.part.top):
             if not copies.turn.quarter:
@@ -69,7 +69,7 @@ def place_fields(
 
 
 def without_fields(
-    placed: Sequence[Placing], splits: Mapping[str, FieldPlan]
+    placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
 ) -> list[str]:
     """Lenses with copies whose write fields would not lie along x and y, by name."""
     return [
@@ -91,7 +91,7 @@ def write_fields(fields: Sequence[PlacedField], path: str | Path) -> None:
     store.write_text(path, text.getvalue())
 
 
-def areas_um2(made: Assembly) -> dict[LayerNumber, float]:
+def areas_um2(made: MaskAssembly) -> dict[LayerNumber, float]:
     """{layer: area of all that is written on it}, over the whole hierarchy."""
     found: dict[str, dict[LayerNumber, float]] = {}
 
@@ -121,7 +121,7 @@ def _own_areas(cell: CellContent) -> dict[LayerNumber, float]:
     return total
 
 
-def _children(made: Assembly, name: str) -> Iterator[tuple[str, float]]:
+def _children(made: MaskAssembly, name: str) -> Iterator[tuple[str, float]]:
     """(child, copies times their squared scale) of a cell's placements."""
     placed = made.cells[name].kept()
     scales = np.array([turn.scale**2 for turn in placed.turns])
@@ -139,5 +139,5 @@ def _children(made: Assembly, name: str) -> Iterator[tuple[str, float]]:
                 yield child, float(count)
 
 
-def _rows_at_once(lattice: Lattice) -> int:
+def _rows_at_once(lattice: PillarLattice) -> int:
     return max(1, (1 << 20) // max(1, lattice.columns))

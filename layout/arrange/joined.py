@@ -6,11 +6,17 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from layout.arrange.parts import UNIT_NM, Part, compact, relayered
-from layout.arrange.record import At
-from layout.formats import Assembly, CellContent, Copies, Sites, Turn
+from layout.arrange.parts import UNIT_NM, DieComponent, compact_arrays, relayer_cell
+from layout.arrange.record import Placement
+from layout.formats import (
+    CellContent,
+    CellCopies,
+    MaskAssembly,
+    Orientation,
+    PillarSites,
+)
 from layout.process import LayerNumber
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
 MARGIN_UM = 10.0  # around the marks of a wafer
@@ -19,28 +25,30 @@ _MOST_DATATYPE = 32767
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Placing:
+class PartPlacement:
     """A part and where it stands on the die."""
 
-    part: Part
-    at: tuple[At, ...]
+    part: DieComponent
+    at: tuple[Placement, ...]
 
-    def copies(self, top: str) -> tuple[Copies, ...]:
+    def copies(self, top: str) -> tuple[CellCopies, ...]:
         """As arrays of its cell ``top``, in database units."""
         return tuple(_copies(top, at) for at in self.at)
 
 
-def _copies(child: str, at: At) -> Copies:
+def _copies(child: str, at: Placement) -> CellCopies:
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
     step = (
         (0, 0) if at.step_um is None else tuple(round(s * PER_UM) for s in at.step_um)
     )
-    turn = Turn(at.turn_deg % 360, at.mirrored)
-    return Copies(child, x, y, turn, at.columns, at.rows, (step[0], 0), (0, step[1]))
+    turn = Orientation(at.turn_deg % 360, at.mirrored)
+    return CellCopies(
+        child, x, y, turn, at.columns, at.rows, (step[0], 0), (0, step[1])
+    )
 
 
 @dataclass(eq=False, slots=True)
-class Layers:
+class JobLayers:
     """(layer, datatype) of all parts together: one dose each.
 
     doses: of those that are exposed. names: shown by viewers. kept: numbers that mean
@@ -51,7 +59,7 @@ class Layers:
     doses: dict[LayerNumber, float] = field(default_factory=dict)
     names: dict[LayerNumber, str] = field(default_factory=dict)
 
-    def take(self, part: Part) -> dict[LayerNumber, LayerNumber]:
+    def take(self, part: DieComponent) -> dict[LayerNumber, LayerNumber]:
         """New numbers of a part's layers: its own where these are free or mean the same
         dose, else a free datatype.
         """
@@ -78,15 +86,15 @@ class Layers:
         raise ProcessError(f"layer {layer[0]}: all datatypes hold doses")
 
 
-def die(
-    name: str, placed: Sequence[Placing], *, kept: frozenset[LayerNumber]
-) -> Assembly:
+def die_cell(
+    name: str, placed: Sequence[PartPlacement], *, kept: frozenset[LayerNumber]
+) -> MaskAssembly:
     """All parts in one cell ``name``."""
-    layers = Layers(kept)
+    layers = JobLayers(kept)
     cells: dict[str, CellContent] = {}
-    copies: dict[str, tuple[Copies, ...]] = {}
-    sites: dict[str, Sites] = {}
-    here: list[Copies] = []
+    copies: dict[str, tuple[CellCopies, ...]] = {}
+    sites: dict[str, PillarSites] = {}
+    here: list[CellCopies] = []
     for one in placed:
         new = _take(one.part, layers, cells, copies, sites)
         here += one.copies(new[one.part.top])
@@ -96,15 +104,15 @@ def die(
         )
     cells[name] = CellContent(name)
     copies[name] = tuple(here)
-    return Assembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
+    return MaskAssembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
 
 
 def _take(
-    part: Part,
-    layers: Layers,
+    part: DieComponent,
+    layers: JobLayers,
     cells: dict[str, CellContent],
-    copies: dict[str, tuple[Copies, ...]],
-    sites: dict[str, Sites],
+    copies: dict[str, tuple[CellCopies, ...]],
+    sites: dict[str, PillarSites],
 ) -> dict[str, str]:
     """The cells of a part with numbers and names of their own; {old: new name}."""
     numbers = layers.take(part)
@@ -112,7 +120,7 @@ def _take(
     for name in part.cells:
         new[name] = _free(name, cells, new)
     for name, cell in part.cells.items():
-        left, found = compact(relayered(cell, numbers))
+        left, found = compact_arrays(relayer_cell(cell, numbers))
         children = tuple(new[child] for child in left.placed.children)
         cells[new[name]] = dataclasses.replace(
             left,
@@ -136,11 +144,14 @@ def _free(name: str, cells: Mapping[str, CellContent], new: Mapping[str, str]) -
     return made
 
 
-def wafer(
-    name: str, one: Assembly, steps: tuple[Copies, ...], marks: Placing | None
-) -> Assembly:
+def wafer_cell(
+    name: str,
+    one: MaskAssembly,
+    steps: tuple[CellCopies, ...],
+    marks: PartPlacement | None,
+) -> MaskAssembly:
     """Dies, and the wafer's marks beside them, in one cell ``name``."""
-    layers = Layers(frozenset(), dict(one.doses), dict(one.layer_names))
+    layers = JobLayers(frozenset(), dict(one.doses), dict(one.layer_names))
     cells, copies, sites = dict(one.cells), dict(one.copies), dict(one.sites)
     here = list(steps)
     if marks is not None:

@@ -12,18 +12,18 @@ import numpy as np
 from layout.formats import (
     NOTHING,
     CellContent,
-    Copies,
+    CellCopies,
     MaskContent,
-    Sites,
-    arrays,
+    PillarSites,
     doses,
+    find_arrays,
     flatten,
 )
-from layout.mask import UNDRAWN, Lattice, MaskPlan
+from layout.mask import UNDRAWN, MaskPlan, PillarLattice
 from layout.process import LayerNumber, Process
 from layout.shapes import polygon, rectilinear, region
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 UNIT_NM = 1.0
 PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
@@ -32,7 +32,7 @@ _TILES = 64  # squares of a lattice, each way
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Part:
+class DieComponent:
     """A cell with all below it, in nanometres.
 
     name: of the part. top: its cell. cells: by name, as they will be written.
@@ -57,13 +57,13 @@ class Part:
     uncorrected: Mapping[LayerNumber, int] = field(default_factory=dict)
     texts: int = 0
     empty: int = 0
-    sites: Mapping[str, Sites] = field(default_factory=dict)
+    sites: Mapping[str, PillarSites] = field(default_factory=dict)
 
 
-def sketch(name: str, plan: MaskPlan, process: Process) -> Part:
+def plan_extents(name: str, plan: MaskPlan, process: Process) -> DieComponent:
     """Where the shapes of a plan lie, without its cells."""
     boxes, extent = _plan_boxes(plan, process)
-    return Part(name, name, {}, plan.doses, plan.layer_names, boxes, extent)
+    return DieComponent(name, name, {}, plan.doses, plan.layer_names, boxes, extent)
 
 
 def of_plan(
@@ -73,8 +73,8 @@ def of_plan(
     process: Process,
     *,
     corrected: bool,
-    lattices: Mapping[str, Lattice] | None = None,
-) -> Part:
+    lattices: Mapping[str, PillarLattice] | None = None,
+) -> DieComponent:
     """The mask of a plan, as it was read back; its cells are named after the part.
 
     lattices: of cells of which only the sums were kept, which agree with them.
@@ -86,11 +86,11 @@ def of_plan(
     classes = tuple(new.get(made.name, "") for made in plan.classes)
     known = lattices or {}
     sites = {
-        new[c.name]: Sites(known[c.name], classes)
+        new[c.name]: PillarSites(known[c.name], classes)
         for c in content.cells.values()
         if c.sums is not None
     }
-    return Part(
+    return DieComponent(
         name,
         name,
         cells,
@@ -114,7 +114,7 @@ def _plan_boxes(plan: MaskPlan, process: Process) -> tuple[dict[str, Array], Arr
             some = [
                 box
                 for shape in shapes
-                for box in rectilinear.covering(np.asarray(shape, np.int64))
+                for box in rectilinear.covering_rectangles(np.asarray(shape, np.int64))
             ]
             every += some
             if figure.name not in UNDRAWN:
@@ -132,7 +132,7 @@ def of_file(
     *,
     cell: str,
     relative_dose: float,
-) -> Part:
+) -> DieComponent:
     """A cell of a file with all below it; shapes without area are left out.
 
     Args:
@@ -144,7 +144,7 @@ def of_file(
             are no whole nanometres.
     """
     top = _chosen(path, content, cell)
-    whole = scaled(content, UNIT_NM, str(path))
+    whole = scale_part(content, UNIT_NM, str(path))
     wanted = _below(content, top)
     cells = {key: _drawing(each) for key, each in whole.cells.items() if key in wanted}
     empty = sum(
@@ -161,7 +161,7 @@ def of_file(
     layers = process.layers
     undrawn = {layers.outline, layers.fields}
     table = path.with_name("doses.csv")
-    known = doses.read(table) if table.is_file() else {}
+    known = doses.read_dose_table(table) if table.is_file() else {}
     used = {
         layer for each in cells.values() for layer in (*each.polygons, *each.circles)
     }
@@ -174,7 +174,7 @@ def of_file(
     names = {
         layer: text for layer, text in content.layer_names.items() if layer in used
     }
-    return Part(
+    return DieComponent(
         name,
         top,
         cells,
@@ -199,7 +199,7 @@ def _drawing(cell: CellContent) -> CellContent:
         for shape in shapes:
             corners = shape[(shape != np.roll(shape, 1, axis=0)).any(1)]
             if len(corners) > 2 and (
-                polygon.twice_area(corners) or region.union([corners])
+                polygon.twice_area(corners) or region.union_contours([corners])
             ):
                 kept.setdefault(layer, []).append(corners)
     return dataclasses.replace(cell, polygons=kept)
@@ -234,7 +234,7 @@ def _below(content: MaskContent, top: str) -> set[str]:
     return found
 
 
-def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
+def scale_part(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
     """The same mask in another database unit.
 
     Raises:
@@ -296,7 +296,9 @@ def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
     )
 
 
-def relayered(cell: CellContent, new: Mapping[LayerNumber, LayerNumber]) -> CellContent:
+def relayer_cell(
+    cell: CellContent, new: Mapping[LayerNumber, LayerNumber]
+) -> CellContent:
     """A cell with other layer numbers; two that become one are put together."""
     polygons: dict[LayerNumber, list[Array]] = {}
     circles: dict[LayerNumber, list[tuple[int, int, int]]] = {}
@@ -307,13 +309,13 @@ def relayered(cell: CellContent, new: Mapping[LayerNumber, LayerNumber]) -> Cell
     return dataclasses.replace(cell, polygons=polygons, circles=circles)
 
 
-def compact(cell: CellContent) -> tuple[CellContent, tuple[Copies, ...]]:
+def compact_arrays(cell: CellContent) -> tuple[CellContent, tuple[CellCopies, ...]]:
     """The cell with what its arrays hold taken out, and the arrays."""
-    made, left = arrays(cell.kept())
+    made, left = find_arrays(cell.kept())
     return dataclasses.replace(cell, placed=left), made
 
 
-def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
+def _lattice_boxes(plan: MaskPlan, lattice: PillarLattice) -> list[Array]:
     """Boxes around the pillars of squares of sites, at most 64 each way: single pillars
     where there are few.
     """
@@ -356,11 +358,11 @@ def _file_boxes(
     }
     found: dict[str, list[Array]] = {}
     counts: dict[LayerNumber, int] = {}
-    for stack in flatten.stacks(content, top):
+    for stack in flatten.flatten_stacks(content, top):
         number = len(stack.outlines) * len(stack.x)
         counts[stack.layer] = counts.get(stack.layer, 0) + number
         pieces = np.concatenate(
-            [rectilinear.covering(outline) for outline in stack.outlines]
+            [rectilinear.covering_rectangles(outline) for outline in stack.outlines]
         )
         places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
         every = (pieces[None] + places[:, None]).reshape(-1, 4)

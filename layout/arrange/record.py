@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from layout.process import names
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 MOST_DIES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class At:
+class Placement:
     """Where a lens or cell is placed, once or as an array.
 
     x_um, y_um: of its origin (the axis of a lens); of the first one of an array.
@@ -68,7 +68,7 @@ class LensPart:
     file: Path
     name: str
     furnished: bool | None = None
-    at: tuple[At, ...] = (At(),)
+    at: tuple[Placement, ...] = (Placement(),)
 
     def __post_init__(self) -> None:
         _named(self.name)
@@ -91,7 +91,7 @@ class CellPart:
     cell: str = ""
     relative_dose: float = field(default=1.0, metadata={"above": 0})
     checked: bool = True
-    at: tuple[At, ...] = (At(),)
+    at: tuple[Placement, ...] = (Placement(),)
 
     def __post_init__(self) -> None:
         _named(self.name)
@@ -102,7 +102,7 @@ class CellPart:
 
 
 @dataclass(frozen=True, slots=True)
-class Furniture:
+class FrameSettings:
     """Marks, label, dose test and witness cells once for all lenses of the die.
 
     size_um: (x, y) of the die. label: text on it; left out: the name of the
@@ -120,7 +120,7 @@ class Furniture:
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class WaferMark:
     """Middle of an alignment mark of the wafer.
 
     x_mm, y_mm: from the middle of the wafer.
@@ -131,7 +131,7 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Wafer:
+class WaferSettings:
     """Dies side by side on a round wafer, its flat or notch at the lowest y.
 
     diameter_mm: of the wafer. edge_exclusion_mm: from its edge, flat or notch, where no
@@ -154,7 +154,7 @@ class Wafer:
     offset_um: tuple[float, float] = (0.0, 0.0)
     mark_um: float = 400.0
     mark_width_um: float = 20.0
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[WaferMark, ...] = ()
 
     def __post_init__(self) -> None:
         _above("pitch_um", *self.pitch_um)
@@ -180,7 +180,7 @@ class Wafer:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrangement:
+class Floorplan:
     """Lenses and cells on a die, the die alone or on a wafer.
 
     name: of the top cell; ``NAME_DIE`` is the die on a wafer.
@@ -191,8 +191,8 @@ class Arrangement:
     name: str = "ARRANGED"
     lens: tuple[LensPart, ...] = ()
     cell: tuple[CellPart, ...] = ()
-    die: Furniture | None = None
-    wafer: Wafer | None = None
+    die: FrameSettings | None = None
+    wafer: WaferSettings | None = None
 
     def __post_init__(self) -> None:
         _named(self.name)
@@ -209,7 +209,7 @@ class Arrangement:
         ]
         if self.die is not None:
             taken.append("DIE")
-        names.distinct(taken)
+        names.check_distinct_names(taken)
 
     def furnished(self, part: LensPart) -> bool:
         """Whether a lens brings marks, label and test structures of its own."""
@@ -217,7 +217,7 @@ class Arrangement:
 
 
 def _named(name: str) -> None:
-    names.check(name)
+    names.check_cell_name(name)
     if len(name) > 12:
         raise ProcessError(
             f"name {name!r}: need at most 12 characters, cells of its parts begin with it"

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.arrange.joined import Placing
-from layout.arrange.parts import APERTURE, PILLARS, Part
-from layout.formats import MaskContent, Sites, flatten
+from layout.arrange.joined import PartPlacement
+from layout.arrange.parts import APERTURE, PILLARS, DieComponent
+from layout.formats import MaskContent, PillarSites, flatten
 from layout.process import Process
 from layout.shapes import polygon
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _FINER = 3  # samples of a large shape along a point of the picture
 _BLOCK = 1 << 22
@@ -21,7 +21,7 @@ Spots = tuple[Array, Array, Array]  # x, y and area of what stands for shapes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class View:
+class DensityView:
     """Points of a picture: (rows, columns), the first row lowest, squares of ``side``
     units from (left, bottom).
     """
@@ -33,7 +33,7 @@ class View:
     columns: int
 
     @classmethod
-    def over(cls, box: Array, most: int) -> "View":
+    def over(cls, box: Array, most: int) -> "DensityView":
         """Around left, bottom, right, top: ``most`` points along the longer side, and
         one for what is left over.
         """
@@ -67,8 +67,8 @@ class View:
             )
 
 
-def covered(
-    placed: Sequence[Placing], process: Process, view: View
+def coverage_map(
+    placed: Sequence[PartPlacement], process: Process, view: DensityView
 ) -> dict[str, Array]:
     """{exposure: (rows, columns) share of each point that is covered}: pillars,
     aperture, layers of other files.
@@ -85,7 +85,7 @@ def covered(
     return found
 
 
-def _of_part(part: Part, process: Process, side: float) -> dict[str, Spots]:
+def _of_part(part: DieComponent, process: Process, side: float) -> dict[str, Spots]:
     """Spots of all shapes by exposure, those in one third of a point together."""
     layers = process.layers
     undrawn, content = (
@@ -104,7 +104,7 @@ def _of_part(part: Part, process: Process, side: float) -> dict[str, Spots]:
     }
     ours[layers.aperture[0]] = APERTURE
     found: dict[str, list[Spots]] = {}
-    for shape in flatten.shapes(content, part.top):
+    for shape in flatten.flatten_shapes(content, part.top):
         if shape.layer[0] not in undrawn:
             x, y, area = _sampled(np.asarray(shape.outline, float), side / _FINER)
             every = (
@@ -134,7 +134,7 @@ def _together(some: Sequence[Spots]) -> Spots:
     return x, y, area
 
 
-def _of_sites(part: Part, sites: Sites, side: float) -> Iterator[Spots]:
+def _of_sites(part: DieComponent, sites: PillarSites, side: float) -> Iterator[Spots]:
     """The pillars of a lattice, some rows together."""
     l = sites.lattice
     drawn = [

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.arrange.record import MOST_DIES, Wafer
-from layout.formats import Copies
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from layout.arrange.record import MOST_DIES, WaferSettings
+from layout.formats import CellCopies
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 NOTCH_RADIUS_MM = 0.9  # of the bottom of a notch, SEMI M1
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Dies:
+class WaferDies:
     """Dies on a wafer. index: (n, 2) column and row in the raster, row by row from the
     lowest; place_um: (n, 2).
     """
@@ -27,7 +27,9 @@ class Dies:
     place_um: Array
 
 
-def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
+def usable_dies(
+    wafer: WaferSettings, die_um: Box, *, around_marks_um: float = 0.0
+) -> WaferDies:
     """Dies that lie whole within the usable part of the wafer and clear of its marks.
 
     A point is usable where it is at least ``edge_exclusion_mm`` from the edge of the
@@ -74,10 +76,10 @@ def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
             f"no die of {right - left:.0f} x {top - bottom:.0f} um fits on the wafer; change wafer.offset_um, "
             "wafer.edge_exclusion_mm or wafer.diameter_mm"
         )
-    return Dies(index[kept], place[kept])
+    return WaferDies(index[kept], place[kept])
 
 
-def refuse_marks_off(wafer: Wafer) -> None:
+def refuse_marks_off(wafer: WaferSettings) -> None:
     """Raises: ProcessError: a mark that reaches beyond the usable part of the wafer."""
     half = wafer.mark_um / 2
     for mark in wafer.marks:
@@ -88,7 +90,7 @@ def refuse_marks_off(wafer: Wafer) -> None:
             )
 
 
-def chord_um(wafer: Wafer) -> float:
+def chord_um(wafer: WaferSettings) -> float:
     """Distance of the flat from the middle of the wafer; the radius where there is
     none.
     """
@@ -96,7 +98,7 @@ def chord_um(wafer: Wafer) -> float:
     return math.sqrt(radius**2 - half**2)
 
 
-def _usable(wafer: Wafer, boxes: Array) -> Array:
+def _usable(wafer: WaferSettings, boxes: Array) -> Array:
     """(n,) whether boxes (n, 4) lie whole on the usable part."""
     radius, exclusion = 500 * wafer.diameter_mm, 1e3 * wafer.edge_exclusion_mm
     far = np.hypot(np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1))
@@ -108,7 +110,7 @@ def _usable(wafer: Wafer, boxes: Array) -> Array:
     return np.asarray(inside)
 
 
-def notch_distance_um(wafer: Wafer, boxes: Array) -> Array:
+def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
     """(n,) distances of boxes (n, 4) from the notch; 0 or less where they overlap.
 
     SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` deep. That
@@ -133,7 +135,9 @@ def _apart(boxes: Array, box: Box) -> Array:
     return np.asarray(np.hypot(*across.T))
 
 
-def stepped(child: str, found: Dies, *, units_per_um: float) -> tuple[Copies, ...]:
+def step_and_repeat(
+    child: str, found: WaferDies, *, units_per_um: float
+) -> tuple[CellCopies, ...]:
     """The dies as arrays: neighbours of a row together, equal rows above each other
     together.
     """
@@ -166,7 +170,7 @@ def stepped(child: str, found: Dies, *, units_per_um: float) -> tuple[Copies, ..
             round(v * units_per_um) for v in found.place_um[at[first, low]].tolist()
         )
         copies.append(
-            Copies(
+            CellCopies(
                 child,
                 x,
                 y,
@@ -179,7 +183,7 @@ def stepped(child: str, found: Dies, *, units_per_um: float) -> tuple[Copies, ..
     return tuple(copies)
 
 
-def _steps(found: Dies, units_per_um: float) -> tuple[int, int]:
+def _steps(found: WaferDies, units_per_um: float) -> tuple[int, int]:
     """From die to die in units, along x and y; 0 where there is one column or row."""
     steps = []
     for axis in (0, 1):

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import (
-    Arrangement,
-    At,
-    Wafer,
+    Floorplan,
+    Placement,
+    WaferSettings,
     apart,
     job_file,
     joined,
@@ -22,17 +22,24 @@ from layout.arrange import (
 )
 from layout.commands import arranged_page, make
 from layout.commands import placed as standing
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.commands.job import Options
-from layout.commands.placed import Work
-from layout.commands.stages import Stages
+from layout.commands.placed import FloorplanWork
+from layout.commands.stages import StageTimes
 from layout.drc import write_lyp
-from layout.formats import Assembly, compare, doses, gdsii_write, handover, oasis_write
+from layout.formats import (
+    MaskAssembly,
+    compare,
+    doses,
+    gdsii_write,
+    handover,
+    oasis_write,
+)
 from layout.mask import build
-from layout.process import LayerNumber, noticed
+from layout.process import LayerNumber, announce_compilation
 from layout.process import process as processes
-from metalens.ground import config, store
-from metalens.ground.errors import ProcessError
+from metalens.core import config, store
+from metalens.core.errors import ProcessError
 
 _LISTED = 12  # gaps that are told one by one
 
@@ -41,7 +48,7 @@ def run(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does
     not read back as planned.
     """
-    record = config.load(options.lens, Arrangement)
+    record = config.load(options.lens, Floorplan)
     named = [part.file for part in record.lens] + [part.file for part in record.cell]
     process = (
         processes.Process()
@@ -56,9 +63,11 @@ def run(options: Options) -> int:
     with (
         options.claim_folder(options.output, inputs=inputs) as draft,
         options.shared(),
-        noticed(options.console.say),
+        announce_compilation(options.console.say),
     ):
-        work = Work(options, record, process, draft.path, Stages(options.console.say))
+        work = FloorplanWork(
+            options, record, process, draft.path, StageTimes(options.console.say)
+        )
         made = _whole(work)
         _write(work, made)
         with work.stages("report"):
@@ -66,7 +75,7 @@ def run(options: Options) -> int:
     return options.console.judged(_values(work, made), _text(work, made), work.failures)
 
 
-def _refuse_negative(work: Work) -> None:
+def _refuse_negative(work: FloorplanWork) -> None:
     """Raises: ProcessError: gaps are drawn, and something stands on the die that the
     frame of a lens does not know.
     """
@@ -80,7 +89,7 @@ def _refuse_negative(work: Work) -> None:
         )
 
 
-def _whole(work: Work) -> Assembly:
+def _whole(work: FloorplanWork) -> MaskAssembly:
     """The die of the record, or its wafer."""
     record = work.record
     _refuse_negative(work)
@@ -88,7 +97,7 @@ def _whole(work: Work) -> Assembly:
         wafer.refuse_marks_off(record.wafer)
     placed, marks = _parts(work)
     with work.stages("room between parts"):
-        work.placed, work.near = placed, apart.check(placed, work.process)
+        work.placed, work.near = placed, apart.check_separation(placed, work.process)
     told = [
         f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
         for v in work.near
@@ -99,13 +108,15 @@ def _whole(work: Work) -> Assembly:
     layers = work.process.layers
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    one = joined.die(name, placed, kept=kept)
+    one = joined.die_cell(name, placed, kept=kept)
     if record.wafer is None:
         return one
     return _stepped(work, record.wafer, one, marks)
 
 
-def _parts(work: Work) -> tuple[list[joined.Placing], parts.Part | None]:
+def _parts(
+    work: FloorplanWork,
+) -> tuple[list[joined.PartPlacement], parts.DieComponent | None]:
     """What stands on the die, and the alignment mark of the wafer.
 
     Everything that is corrected here is drawn first, so that all of it shares one
@@ -113,13 +124,16 @@ def _parts(work: Work) -> tuple[list[joined.Placing], parts.Part | None]:
     """
     record, process = work.record, work.process
     files = [
-        joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell
+        joined.PartPlacement(standing.cell_part(work, part), part.at)
+        for part in record.cell
     ]
     lenses = [standing.draw_lens(work, part) for part in record.lens]
     made = [drawing.made for drawing in lenses]
     if record.die is not None:
         sketches = [
-            joined.Placing(parts.sketch(part.name, one.plan, process), part.at)
+            joined.PartPlacement(
+                parts.plan_extents(part.name, one.plan, process), part.at
+            )
             for part, one in zip(record.lens, made, strict=True)
         ]
         made.append(standing.draw_surroundings(work, record.die, sketches + files))
@@ -130,24 +144,27 @@ def _parts(work: Work) -> tuple[list[joined.Placing], parts.Part | None]:
         made = build.assign_doses(made, process)
     mark = standing.written_part(work, made.pop()) if has_marks else None
     placed = [
-        joined.Placing(standing.lens_part(work, drawing, one), part.at)
+        joined.PartPlacement(standing.lens_part(work, drawing, one), part.at)
         for part, drawing, one in zip(record.lens, lenses, made, strict=False)
     ]
     placed += files
     if record.die is not None:
         around = standing.written_part(work, made[-1])
-        placed.append(joined.Placing(around, (At(),)))
+        placed.append(joined.PartPlacement(around, (Placement(),)))
     return placed, mark
 
 
 def _stepped(
-    work: Work, size: Wafer, one: Assembly, mark: parts.Part | None
-) -> Assembly:
+    work: FloorplanWork,
+    size: WaferSettings,
+    one: MaskAssembly,
+    mark: parts.DieComponent | None,
+) -> MaskAssembly:
     """The wafer: as many whole dies as it holds, and its marks."""
     placed = work.placed
-    box = apart.extent(placed) / joined.PER_UM
+    box = apart.extent_of_copies(placed) / joined.PER_UM
     scattered = apart.reach_um(work.process)
-    inner = apart.extent(placed, exposed=True) / joined.PER_UM
+    inner = apart.extent_of_copies(placed, exposed=True) / joined.PER_UM
     need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(inner[2 + axis] - inner[axis])
@@ -156,18 +173,18 @@ def _stepped(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, need {need:.4g}"
             )
     left, bottom, right, top = box.tolist()
-    work.dies = wafer.dies(
+    work.dies = wafer.usable_dies(
         size,
         (left, bottom, right, top),
         around_marks_um=max(scattered, joined.MARGIN_UM),
     )
-    steps = wafer.stepped(one.name, work.dies, units_per_um=joined.PER_UM)
-    at = tuple(At(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
-    marks = None if mark is None else joined.Placing(mark, at)
-    return joined.wafer(work.record.name, one, steps, marks)
+    steps = wafer.step_and_repeat(one.name, work.dies, units_per_um=joined.PER_UM)
+    at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
+    marks = None if mark is None else joined.PartPlacement(mark, at)
+    return joined.wafer_cell(work.record.name, one, steps, marks)
 
 
-def _write(work: Work, made: Assembly) -> None:
+def _write(work: FloorplanWork, made: MaskAssembly) -> None:
     """The files that were asked for, each read back."""
     options = work.options
     neither = not (options.oasis or options.gds)
@@ -178,20 +195,23 @@ def _write(work: Work, made: Assembly) -> None:
 
 
 def _one(
-    work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path], None]
+    work: FloorplanWork,
+    made: MaskAssembly,
+    name: str,
+    write: Callable[[MaskAssembly, Path], None],
 ) -> None:
     path = work.folder / name
     with work.stages(f"write {name}"):
         write(made, path)
     with work.stages(f"read back {name}"):
-        content = read(path, make.MOST_READ, keep=make.KEPT)
-        found = compare.differences(made, content)
+        content = read_mask(path, make.MOST_READ, keep=make.KEPT)
+        found = compare.mask_differences(made, content)
     work.failures += [f"{name} does not read back as planned: {text}" for text in found]
     work.unlike |= {name} if found else set()
     work.written[name] = path.stat().st_size
 
 
-def _accompany(work: Work, made: Assembly) -> None:
+def _accompany(work: FloorplanWork, made: MaskAssembly) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
     work.areas_um2 = job_file.areas_um2(made)
     fields = list(job_file.place_fields(work.placed, work.splits))
@@ -202,7 +222,7 @@ def _accompany(work: Work, made: Assembly) -> None:
         for name in turned
     ]
     write_lyp(made, work.folder / "mask.lyp")
-    doses.write(made, work.process, work.folder / "doses.csv")
+    doses.write_dose_table(made, work.process, work.folder / "doses.csv")
     most = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
     held = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
@@ -227,10 +247,10 @@ def _accompany(work: Work, made: Assembly) -> None:
     store.write_text(
         work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n"
     )
-    arranged_page.write(work, made)
+    arranged_page.write_floorplan_page(work, made)
 
 
-def _values(work: Work, made: Assembly) -> dict[str, Any]:
+def _values(work: FloorplanWork, made: MaskAssembly) -> dict[str, Any]:
     return {
         "ok": not work.failures,
         "failures": work.failures,
@@ -246,7 +266,7 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
     }
 
 
-def _sheet(work: Work, made: Assembly, fields: int) -> list[str]:
+def _sheet(work: FloorplanWork, made: MaskAssembly, fields: int) -> list[str]:
     """The job sheet: what stands where, and its doses; what is said of each lens lies
     in its folder.
     """
@@ -301,7 +321,7 @@ def _sheet(work: Work, made: Assembly, fields: int) -> list[str]:
     ]
 
 
-def _text(work: Work, made: Assembly) -> str:
+def _text(work: FloorplanWork, made: MaskAssembly) -> str:
     target = work.options.output
     lines = [*([] if work.failures and not work.unchecked else [work.verdict])]
     lines += work.notes

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 
 from layout.arrange import apart, joined, seen
-from layout.commands.placed import Work
+from layout.commands.placed import FloorplanWork
 from layout.drc import format_size
-from layout.formats import Assembly, handover
+from layout.formats import MaskAssembly, handover
 from layout.shapes import rectilinear
-from metalens.ground import report
-from metalens.ground.arrays import Array
-from metalens.ground.report import Figure, KeyFigure, Section, Table
+from metalens.core import report
+from metalens.core.arrays import Array
+from metalens.core.report import Figure, KeyFigure, Section, Table
 
 _POINTS = 600  # of the picture, each way
 _LISTED = 60
 
 
-def write(work: Work, made: Assembly) -> None:
+def write_floorplan_page(work: FloorplanWork, made: MaskAssembly) -> None:
     """Write report.html and die.png (and wafer.png) beside the masks."""
-    box = apart.extent(work.placed)
+    box = apart.extent_of_copies(work.placed)
     die = _die(work, box)
     (work.folder / "die.png").write_bytes(die)
     items: list[Figure | Table] = [
@@ -47,7 +47,7 @@ def write(work: Work, made: Assembly) -> None:
         KeyFigure("doses", str(len(made.doses))),
         KeyFigure("what fails", str(len(work.failures)), not work.failures),
     ]
-    report.write(
+    report.write_report(
         work.folder / "report.html",
         f"Mask {made.name}",
         sections,
@@ -56,14 +56,14 @@ def write(work: Work, made: Assembly) -> None:
     )
 
 
-def _lead(work: Work) -> str:
+def _lead(work: FloorplanWork) -> str:
     pillars = sum(
         values["pillars"] * _number(work, name) for name, values in work.lenses.items()
     )
     return f"{len(work.lenses)} lenses with {pillars:,} pillars on a die; process “{work.process.name}”."
 
 
-def _number(work: Work, name: str) -> int:
+def _number(work: FloorplanWork, name: str) -> int:
     """Copies of a part on the die."""
     return sum(
         c.count
@@ -73,16 +73,16 @@ def _number(work: Work, name: str) -> int:
     )
 
 
-def _text(work: Work) -> str:
+def _text(work: FloorplanWork) -> str:
     notes = " ".join(f"{note}." for note in work.notes)
     return f"Seen from the pillar side, +y up, as a microscope of the picture's resolution sees it. {notes}".strip()
 
 
-def _die(work: Work, box: Array) -> bytes:
-    view = seen.View.over(box, _POINTS)
-    images = seen.covered(work.placed, work.process, view)
+def _die(work: FloorplanWork, box: Array) -> bytes:
+    view = seen.DensityView.over(box, _POINTS)
+    images = seen.coverage_map(work.placed, work.process, view)
     count = max(1, len(images))
-    figure, axes = report.canvas(1, count, size=(6.4 * count, 5.6), squeeze=False)
+    figure, axes = report.make_figure(1, count, size=(6.4 * count, 5.6), squeeze=False)
     x, y = (
         (low, low + n * view.side)
         for low, n in ((view.left, view.columns), (view.bottom, view.rows))
@@ -100,10 +100,10 @@ def _die(work: Work, box: Array) -> bytes:
         ax.set(xlabel="x / µm", ylabel="y / µm", title=kind)
         figure.colorbar(shown, ax=ax, label="area covered / %", shrink=0.8)
         _named(ax, work)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def _named(ax: Any, work: Work) -> None:
+def _named(ax: Any, work: FloorplanWork) -> None:
     """Names of the parts where they stand, and crosses where they are too near."""
     for one in work.placed:
         for at in one.at[:_LISTED]:
@@ -120,14 +120,14 @@ def _named(ax: Any, work: Work) -> None:
         ax.plot(x, y, "x", color="red", ms=6, mew=1.5)
 
 
-def _wafer(work: Work, box: Array) -> bytes:
+def _wafer(work: FloorplanWork, box: Array) -> bytes:
     from matplotlib.collections import PolyCollection
 
     size, dies = work.record.wafer, work.dies
     if size is None or dies is None:
         return b""
-    figure, ax = report.canvas(size=(6.4, 6.2))
-    corner = rectilinear.corners(box / joined.PER_UM / 1e3)
+    figure, ax = report.make_figure(size=(6.4, 6.2))
+    corner = rectilinear.box_corners(box / joined.PER_UM / 1e3)
     ax.add_collection(
         PolyCollection(
             list(dies.place_um[:, None] / 1e3 + corner),
@@ -142,10 +142,10 @@ def _wafer(work: Work, box: Array) -> bytes:
     for mark in size.marks:
         ax.plot(mark.x_mm, mark.y_mm, "+", color="#d1495b", ms=9)
     ax.set(aspect="equal", xlabel="x / mm", ylabel="y / mm")
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def _places(work: Work) -> Table:
+def _places(work: FloorplanWork) -> Table:
     files = {part.name: str(part.file) for part in work.record.lens}
     files |= {part.name: str(part.file) for part in work.record.cell}
     rows = []
@@ -174,7 +174,7 @@ def _places(work: Work) -> Table:
     return Table(head, rows[:_LISTED], most, digits=8)
 
 
-def _checks(work: Work) -> Section:
+def _checks(work: FloorplanWork) -> Section:
     """Rules, exposure and read-back of each part, and what stands too near what."""
     rows = [_lens_row(name, values) for name, values in work.lenses.items()]
     for name, found in work.rules.items():
@@ -214,7 +214,7 @@ def _checks(work: Work) -> Section:
     return Section("Checks", _verdicts(work), items)
 
 
-def _verdicts(work: Work) -> str:
+def _verdicts(work: FloorplanWork) -> str:
     """What fails and what was not checked, in words."""
     said = list(work.failures)
     said += [
@@ -249,7 +249,7 @@ def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     return [name, *sizes, *found, "passes" if values["ok"] else "FAILS"]
 
 
-def _doses(work: Work, made: Assembly) -> Section:
+def _doses(work: FloorplanWork, made: MaskAssembly) -> Section:
     base = work.process.exposure.base_uC_cm2
     rows = [
         [*layer, f"{dose:.6f}", dose * base, made.layer_names.get(layer, "")]
@@ -270,7 +270,7 @@ def _doses(work: Work, made: Assembly) -> Section:
     )
 
 
-def _files(work: Work) -> Section:
+def _files(work: FloorplanWork) -> Section:
     written = work.written.items()
     rows = [
         [n, f"{s / 1e6:.3f}", "DIFFERENT" if n in work.unlike else "as planned"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from layout.commands.validate import validate
+from layout.commands.validate import validate_mask
 from layout.drc import (
     DrcReport,
     LayerChoice,
@@ -22,15 +22,15 @@ from layout.formats import (
     MaskContent,
     gdsii_read,
     hierarchy,
-    mapped,
+    map_bytes,
     oasis_read,
     placement_limit,
 )
 from layout.formats import oasis_records as oasis_bytes
 from layout.process import process as processes
-from metalens.commands import Common, MaybeOutput
-from metalens.ground import reading
-from metalens.ground.errors import MaskFileError
+from metalens.commands import CommonOptions, MaybeOutput
+from metalens.core import reading
+from metalens.core.errors import MaskFileError
 
 _OTHER_FORMATS = {  # how text formats of other programs begin: their name
     rb"\s*(0|999)\r?\n|AutoCAD Binary DXF": "a DXF drawing (convert it)",
@@ -39,7 +39,7 @@ _OTHER_FORMATS = {  # how text formats of other programs begin: their name
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens check``.
 
     Attributes:
@@ -81,10 +81,10 @@ def run(options: Options) -> int:
         else contextlib.nullcontext()
     )
     with output as draft:
-        content = read(options.mask, options.max_shapes)
+        content = read_mask(options.mask, options.max_shapes)
         if options.top is not None:
             content = content.below(options.top)
-        form = validate(options.mask, content) if options.strict else []
+        form = validate_mask(options.mask, content) if options.strict else []
         report = check_library(
             content,
             process.rules,
@@ -124,10 +124,10 @@ def _negative_layers(content: MaskContent, process: processes.Process) -> set[in
         return set()
     layers = process.layers
     others = {layers.aperture[0], layers.outline[0], layers.fields[0]}
-    return {number for number, _ in hierarchy.shapes(content)} - others
+    return {number for number, _ in hierarchy.count_shapes(content)} - others
 
 
-def read(
+def read_mask(
     path: Path, limit: int | None = None, *, keep: int | None = None
 ) -> MaskContent:
     """A GDSII or OASIS mask.
@@ -143,10 +143,10 @@ def read(
     """
     if not path.is_file():
         raise MaskFileError(
-            f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
+            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
         )
-    start = mapped(path)[:64].tobytes()
-    other = reading.foreign(path) or _text_format(start)
+    start = map_bytes(path)[:64].tobytes()
+    other = reading.foreign_format(path) or _text_format(start)
     if other:
         raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
     is_oasis = start.startswith(oasis_bytes.MAGIC)

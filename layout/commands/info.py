@@ -5,11 +5,11 @@ of every layer.
 from pathlib import Path
 from typing import Any
 
-from layout.commands.check import format_counts, read
+from layout.commands.check import format_counts, read_mask
 from layout.formats import hierarchy
 
 
-def told(path: Path, top: str | None = None) -> dict[str, Any]:
+def mask_summary(path: Path, top: str | None = None) -> dict[str, Any]:
     """Format, unit, cells and the shapes of each layer, the hierarchy not expanded.
 
     Args:
@@ -20,10 +20,10 @@ def told(path: Path, top: str | None = None) -> dict[str, Any]:
         MaskFileError: no such file or cell, a file that cannot be read, or of which one
             cell claims more placements than the size of the file allows.
     """
-    content = read(path)
+    content = read_mask(path)
     if top is not None:
         content = content.below(top)
-    counts = hierarchy.shapes(content)
+    counts = hierarchy.count_shapes(content)
     layers = {
         f"{layer[0]}/{layer[1]}": {
             "name": content.layer_names.get(layer, ""),
@@ -43,7 +43,7 @@ def told(path: Path, top: str | None = None) -> dict[str, Any]:
     }
 
 
-def text(found: dict[str, Any]) -> str:
+def mask_summary_text(found: dict[str, Any]) -> str:
     """Lines for people."""
     lines = [
         f"{found['file']}: {found['kind']}, {found['shapes']:,} shapes in "

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import tyro
 
-from layout.commands.stages import Stages
+from layout.commands.stages import StageTimes
 from layout.drc import DrcReport
-from layout.formats import Window, compare, handover
+from layout.formats import DxfWindow, compare, handover
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import ExposureReport, LensRows
-from metalens.commands import Distributed, Output
-from metalens.ground.errors import ConfigError
+from metalens.commands import DistributedOptions, Output
+from metalens.core.errors import ConfigError
 from metalens.lens import Lens
 
 MOST_ANSWERS_ERROR = (
@@ -23,7 +23,7 @@ MOST_ANSWERS_ERROR = (
 
 
 @dataclass(frozen=True)
-class Options(Distributed):
+class Options(DistributedOptions):
     """Options of ``metalens layout``.
 
     Attributes:
@@ -50,7 +50,7 @@ class Options(Distributed):
     dxf: bool = False
     step: bool = False
     stl: bool = False
-    window: Window = field(default_factory=Window)
+    window: DxfWindow = field(default_factory=DxfWindow)
     name: str = "METALENS"
     dose: bool = True
     study: bool = False
@@ -80,7 +80,7 @@ class Options(Distributed):
 
 
 @dataclass(eq=False, slots=True)
-class Job:
+class LayoutJob:
     """What a run of the command has made so far.
 
     stages: what the time went to. written: {file name: bytes}. compared: {file name:
@@ -99,9 +99,9 @@ class Job:
     fields: FieldPlan
     plan: MaskPlan
     drc: DrcReport
-    stages: Stages
+    stages: StageTimes
     written: dict[str, int] = field(default_factory=dict)
-    compared: dict[str, compare.Comparison] = field(default_factory=dict)
+    compared: dict[str, compare.ReadbackComparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None

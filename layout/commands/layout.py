@@ -5,8 +5,8 @@ wafer.
 from pathlib import Path
 
 from layout.commands import make
-from layout.commands.job import Job, Options
-from layout.process import noticed
+from layout.commands.job import LayoutJob, Options
+from layout.process import announce_compilation
 
 ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 
@@ -22,9 +22,9 @@ def run(options: Options) -> int:
     with (
         options.claim_folder(options.output) as draft,
         options.shared(),
-        noticed(options.console.say),
+        announce_compilation(options.console.say),
     ):
-        job = make.make(make.draw(options), draft.path)
+        job = make.make_mask(make.draw_lens(options), draft.path)
     return options.console.judged(
         make.values_of(job),
         _text(job, options.output),
@@ -32,7 +32,7 @@ def run(options: Options) -> int:
     )
 
 
-def _text(job: Job, target: Path) -> str:
+def _text(job: LayoutJob, target: Path) -> str:
     lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from layout.commands import page
-from layout.commands.job import Job, Options
-from layout.commands.stages import Stages
+from layout.commands.job import LayoutJob, Options
+from layout.commands.stages import StageTimes
 from layout.drc import check_plan, write_lyp, write_lyrdb
 from layout.formats import (
     MaskContent,
@@ -32,9 +32,9 @@ from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import ExposureReport, LensRows, verify_exposure
 from metalens import lens as lenses
-from metalens.ground import config, store, transaction
-from metalens.ground.arrays import Array
-from metalens.ground.units import nm
+from metalens.core import config, store, transaction
+from metalens.core.arrays import Array
+from metalens.core.units import nm
 from metalens.lens import Lens
 
 MOST_MADE = (
@@ -47,28 +47,30 @@ MOST_READ = 2**40
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Drawing:
+class DrawnLens:
     """A lens as it is drawn, with the doses that it wants."""
 
     options: Options
     source: Lens
     process: processes.Process
     made: build.MadePlan
-    stages: Stages
+    stages: StageTimes
 
 
-def draw(options: Options, *, furniture: build.Furniture = "die") -> Drawing:
+def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnLens:
     """The plan of ``options.lens``, before its doses are rounded to those of the job.
 
     furniture: what stands on the die beside the lens.
     """
-    stages = Stages(options.console.say)
+    stages = StageTimes(options.console.say)
     with stages("read"):
-        source = (lenses.load if options.study else lenses.streamed)(options.lens)
+        source = (lenses.load if options.study else lenses.load_out_of_core)(
+            options.lens
+        )
         if options.study:
             from layout import study
 
-            study.check(source)
+            study.check_study_lens(source)
         process = (
             processes.Process()
             if options.process is None
@@ -76,17 +78,19 @@ def draw(options: Options, *, furniture: build.Furniture = "die") -> Drawing:
         )
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
-        made = build.draw(
+        made = build.draw_mask(
             source,
             process,
             name=options.name,
             furniture=furniture,
             with_doses=options.dose,
         )
-    return Drawing(options, source, process, made, stages)
+    return DrawnLens(options, source, process, made, stages)
 
 
-def make(drawing: Drawing, folder: Path, made: build.MadePlan | None = None) -> Job:
+def make_mask(
+    drawing: DrawnLens, folder: Path, made: build.MadePlan | None = None
+) -> LayoutJob:
     """Write the mask of a lens and all that goes with it into a folder.
 
     made: with the doses of a job of several masks; left out: of this mask alone.
@@ -95,9 +99,11 @@ def make(drawing: Drawing, folder: Path, made: build.MadePlan | None = None) -> 
         with drawing.stages("dose classes"):
             (made,) = build.assign_doses([drawing.made], drawing.process)
     job = _checked(drawing, made)
-    doses.write(job.plan, job.process, folder / "doses.csv")
+    doses.write_dose_table(job.plan, job.process, folder / "doses.csv")
     with ThreadPoolExecutor(1, thread_name_prefix="pictures") as pool:
-        shots = pool.submit(page.drawn, job.stages.rows.unwatched(job.plan), job.drc)
+        shots = pool.submit(
+            page.draw_pictures, job.stages.rows.unwatched(job.plan), job.drc
+        )
         _write_masks(job, folder)
         with job.stages("report"):
             _accompany(job, shots.result(), folder)
@@ -107,15 +113,15 @@ def make(drawing: Drawing, folder: Path, made: build.MadePlan | None = None) -> 
     return job
 
 
-def _checked(drawing: Drawing, made: build.MadePlan) -> Job:
+def _checked(drawing: DrawnLens, made: build.MadePlan) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
     source, rules, stages = drawing.source, drawing.process, drawing.stages
     with stages("write fields"):
-        split = fields.split(source.diameters, rules, drawn=made.cells)
+        split = fields.split_write_fields(source.diameters, rules, drawn=made.cells)
         plan = stages.rows.watched(with_fields(made.plan, split, rules))
     with stages("check"):
         found = check_plan(plan, rules.rules, foot_nm=_feet(plan, source, rules))
-    return Job(drawing.options, source, rules, made, split, plan, found, stages)
+    return LayoutJob(drawing.options, source, rules, made, split, plan, found, stages)
 
 
 def _room(options: Options, source: Lens) -> int:
@@ -140,7 +146,7 @@ def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
     return np.maximum(top, foot)
 
 
-def _write_masks(job: Job, target: Path) -> None:
+def _write_masks(job: LayoutJob, target: Path) -> None:
     options, plan = job.options, job.plan
     if options.writes_oasis:
         path = target / "mask.oas"
@@ -157,15 +163,15 @@ def _write_masks(job: Job, target: Path) -> None:
         with job.stages("write DXF"):
             count = dxf.write(plan, path, window=options.window)
         with job.stages("read back dxf"):
-            job.compared[path.name] = compare.Comparison(
-                count, dxf.differences(plan, path, window=options.window)
+            job.compared[path.name] = compare.ReadbackComparison(
+                count, dxf.dxf_differences(plan, path, window=options.window)
             )
         job.written[path.name] = path.stat().st_size
     if options.stl or options.step:
         _write_solids(job, target)
 
 
-def _write_solids(job: Job, target: Path) -> None:
+def _write_solids(job: LayoutJob, target: Path) -> None:
     """STL and STEP of the pillars in the window."""
     from layout import solids
 
@@ -187,26 +193,26 @@ def _write_solids(job: Job, target: Path) -> None:
             job.written[path.name] = path.stat().st_size
 
 
-def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
+def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskContent]) -> None:
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
-        table = doses.read(path.with_name("doses.csv"))
-        job.undosed[path.name] = doses.missing(content, table, job.process)
+        table = doses.read_dose_table(path.with_name("doses.csv"))
+        job.undosed[path.name] = doses.layers_without_dose(content, table, job.process)
     if _is_verifiable(job) and job.compared[path.name].ok:
         with job.stages(f"verify exposure {path.suffix[1:]}"):
             job.verified[path.name] = _verified(job, content, table)
     job.written[path.name] = path.stat().st_size
 
 
-def _is_verifiable(job: Job) -> bool:
+def _is_verifiable(job: LayoutJob) -> bool:
     """Whether the simulator knows the point exposure (Gaussians) and the tone."""
     exposure = job.process.exposure
     return exposure.known and exposure.csv is None and job.process.tone == "positive"
 
 
 def _verified(
-    job: Job, content: MaskContent, table: Mapping[LayerNumber, float]
+    job: LayoutJob, content: MaskContent, table: Mapping[LayerNumber, float]
 ) -> ExposureReport:
     """What a file makes that holds the plan's places; two files of the same polygons
     make the same.
@@ -227,7 +233,7 @@ def _verified(
     )
 
 
-def _accompany(job: Job, shots: dict[str, bytes], target: Path) -> None:
+def _accompany(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
     """Layer properties, markers, report and its pictures."""
     write_lyp(job.plan, target / "mask.lyp")
     write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
@@ -236,10 +242,10 @@ def _accompany(job: Job, shots: dict[str, bytes], target: Path) -> None:
     store.write_text(target / "job.txt", job.sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))
-    page.write(job, shots, target)
+    page.write_mask_page(job, shots, target)
 
 
-def values_of(job: Job) -> dict[str, Any]:
+def values_of(job: LayoutJob) -> dict[str, Any]:
     """What layout.json says."""
     found = job.drc
     return {

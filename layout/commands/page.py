@@ -7,35 +7,35 @@ from pathlib import Path
 import numpy as np
 
 from layout.commands import pictures
-from layout.commands.job import Job
+from layout.commands.job import LayoutJob
 from layout.drc import DrcReport, format_size
-from layout.formats import Window, handover
+from layout.formats import DxfWindow, handover
 from layout.mask import MaskPlan
 from layout.pec.psf import PointExposure
-from layout.process import Exposure
+from layout.process import ExposureSettings
 from layout.shapes import polygon
-from metalens.ground import report
-from metalens.ground.report import Figure, KeyFigure, Section, Table
-from metalens.ground.units import nm
+from metalens.core import report
+from metalens.core.report import Figure, KeyFigure, Section, Table
+from metalens.core.units import nm
 
 _LISTED = 40  # write fields in the report
 _ROWS = 1024  # of the lens that are counted at once
 
 
-def drawn(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
+def draw_pictures(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
     """{file name: picture} of what will be written."""
     return {
         "die.png": pictures.whole_die(plan, found),
-        "pillars.png": pictures.pillars(
-            plan, (Window(0, 0, 8), pictures.edge_window(plan, 8))
+        "pillars.png": pictures.plot_pillars(
+            plan, (DxfWindow(0, 0, 8), pictures.edge_window(plan, 8))
         ),
-        "diameters.png": pictures.diameters(plan),
-        "margins.png": pictures.margins(found),
+        "diameters.png": pictures.plot_diameters(plan),
+        "margins.png": pictures.plot_margins(found),
     }
 
 
-def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
-    """Write report.html and the pictures (:func:`drawn`) beside it."""
+def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
+    """Write report.html and the pictures (:func:`draw_pictures`) beside it."""
     for name, png in shots.items():
         (target / name).write_bytes(png)
     sections = [
@@ -52,10 +52,10 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
 
         answers = study_page.answers_of(job.source)
         job.answers_error = max(one.error for one in answers.values())
-        sections[-1:-1] = study_page.sections(
+        sections[-1:-1] = study_page.study_sections(
             job.source, job.process, job.fields, answers
         )
-    report.write(
+    report.write_report(
         target / "report.html",
         f"Mask {job.plan.name}",
         [section for section in sections if section is not None],
@@ -64,7 +64,7 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
     )
 
 
-def _lead(job: Job) -> str:
+def _lead(job: LayoutJob) -> str:
     source, lattice = job.source, job.plan.lattices[0]
     own = sum(int(np.count_nonzero(block)) for _, block in lattice.blocks(_ROWS))
     die = (
@@ -79,7 +79,7 @@ def _lead(job: Job) -> str:
     )
 
 
-def _key_figures(job: Job) -> list[KeyFigure]:
+def _key_figures(job: LayoutJob) -> list[KeyFigure]:
     found = job.drc
     broken = sum(found.counts.values())
     same = all(outcome.ok for outcome in job.compared.values())
@@ -100,7 +100,7 @@ def _key_figures(job: Job) -> list[KeyFigure]:
     ]
 
 
-def _overview(job: Job, shots: dict[str, bytes]) -> Section:
+def _overview(job: LayoutJob, shots: dict[str, bytes]) -> Section:
     text = (
         "Two lithography steps: the pillar layer (with marks, label, dose-test array and witness cells) and the "
         "aperture layer, which draws the openings of the opaque film. The F stands in the upper left "
@@ -122,7 +122,7 @@ def _overview(job: Job, shots: dict[str, bytes]) -> Section:
     return Section("Die", text, items)
 
 
-def _rules(job: Job, shots: dict[str, bytes]) -> Section:
+def _rules(job: LayoutJob, shots: dict[str, bytes]) -> Section:
     found = job.drc
     rows = [
         [rule, _limit(rule, found.limits[rule]), count]
@@ -172,7 +172,7 @@ def _limit(rule: str, value: float) -> str:
     return f"{100 * value if rule == 'density' else value:g}{units.get(rule, ' nm')}"
 
 
-def _shaped(job: Job) -> Section:
+def _shaped(job: LayoutJob) -> Section:
     """Of pillars that are not round."""
     turned = job.source.diameters.angle_rad is not None
     turns = (
@@ -199,7 +199,7 @@ def _shaped(job: Job) -> Section:
     return Section("Pillars", text, [Table(("what", "value"), rows)])
 
 
-def _classes(job: Job, shots: dict[str, bytes]) -> Section:
+def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
     if not job.plan.classes[0].round:
         return _shaped(job)
     shapes = {made.diameter_units: made for made in job.plan.classes}
@@ -239,7 +239,7 @@ def _classes(job: Job, shots: dict[str, bytes]) -> Section:
     return Section("Pillars", text, items)
 
 
-def _doses(job: Job) -> Section | None:
+def _doses(job: LayoutJob) -> Section | None:
     doses = job.made.dose
     if doses is None:
         return None
@@ -289,7 +289,7 @@ def _doses(job: Job) -> Section | None:
     )
 
 
-def _table_said(exposure: Exposure, point: PointExposure) -> str:
+def _table_said(exposure: ExposureSettings, point: PointExposure) -> str:
     """What the Gaussians leave out of a measured table: energy that the two figures
     before it do not know of.
     """
@@ -301,7 +301,7 @@ def _table_said(exposure: Exposure, point: PointExposure) -> str:
     )
 
 
-def _verified(job: Job) -> Section | None:
+def _verified(job: LayoutJob) -> Section | None:
     """What the written files and their dose table make."""
     if not job.verified:
         return None
@@ -328,7 +328,7 @@ def _verified(job: Job) -> Section | None:
         "thinnest top to widest foot / nm",
         f"within {100 * job.process.exposure.tolerance:g} % and 1 nm",
     )
-    picture = pictures.verified(next(iter(job.verified.values())))
+    picture = pictures.plot_verification(next(iter(job.verified.values())))
     text = (
         "The files and doses.csv, read back and exposed again. Shared with the correction: the Gaussians of the process "
         "file, the threshold (half of what a wide area receives) and the method of the field on nodes. That field is "
@@ -344,7 +344,7 @@ def _verified(job: Job) -> Section | None:
     return Section("Exposure as written", text, items)
 
 
-def _fields(job: Job) -> Section:
+def _fields(job: LayoutJob) -> Section:
     split = job.fields
     text = (
         f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm "
@@ -352,7 +352,7 @@ def _fields(job: Job) -> Section:
         f"would have cut {split.cut_before:,} pillars. fields.csv lists them in the order of writing, row by row and "
         f"back; job.txt is the sheet for the operator, with currents left open."
     )
-    steps = handover.sequence(split)
+    steps = handover.field_sequence(split)
     rows = [
         [
             s.sequence,
@@ -387,7 +387,7 @@ def _fields(job: Job) -> Section:
     return Section("Job sheet", text, [charge, fields, marks])
 
 
-def _files(job: Job) -> Section:
+def _files(job: LayoutJob) -> Section:
     rows = []
     for name, size in job.written.items():
         outcome = job.compared.get(name)

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from layout.drc import DrcReport
-from layout.formats import Window, sites_in
-from layout.mask import Lattice, MaskPlan
+from layout.formats import DxfWindow, sites_in
+from layout.mask import MaskPlan, PillarLattice
 from layout.verify import ExposureReport
-from metalens.ground import report
-from metalens.ground.arrays import Array
+from metalens.core import report
+from metalens.core.arrays import Array
 
 _FILLED = ("marks", "label")
 
@@ -18,7 +18,7 @@ def whole_die(plan: MaskPlan, found: DrcReport) -> bytes:
     """Everything on the die; each lattice as the share of the area that its pillars
     cover; violations as crosses.
     """
-    figure, axes = report.canvas(size=(7.2, 6.6))
+    figure, axes = report.make_figure(size=(7.2, 6.6))
     axes.grid(False)
     images = [_thumbnail(plan, lattice) for lattice in plan.lattices]
     low, high = (
@@ -65,14 +65,14 @@ def whole_die(plan: MaskPlan, found: DrcReport) -> bytes:
     )
     if shown is not None:
         figure.colorbar(shown, ax=axes, label="area that pillars cover / %", shrink=0.8)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def pillars(plan: MaskPlan, windows: tuple[Window, ...]) -> bytes:
+def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
     """The drawn polygons in some windows."""
     from matplotlib.collections import PolyCollection
 
-    figure, axes = report.canvas(
+    figure, axes = report.make_figure(
         1, len(windows), size=(4.0 * len(windows), 4.0), squeeze=False
     )
     scale = plan.unit_nm * 1e-3
@@ -104,10 +104,10 @@ def pillars(plan: MaskPlan, windows: tuple[Window, ...]) -> bytes:
         )
         ax.set(aspect="equal", xlabel="x / µm", ylabel="y / µm")
         ax.set_title(f"{window.size_um:g} µm at ({window.x_um:.6g}, {window.y_um:.6g})")
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def diameters(plan: MaskPlan) -> bytes:
+def plot_diameters(plan: MaskPlan) -> bytes:
     """How many pillars of each drawn diameter the lens has."""
     lattice = plan.lattices[0]
     counts = np.zeros(len(plan.classes) + 1, np.int64)
@@ -116,17 +116,17 @@ def diameters(plan: MaskPlan) -> bytes:
     sizes = np.array([made.diameter_nm for made in plan.classes])
     merged, where = np.unique(sizes[counts[1:] > 0], return_inverse=True)
     total = np.bincount(where, counts[1:][counts[1:] > 0])
-    figure, axes = report.canvas(size=(7.6, 2.9))
+    figure, axes = report.make_figure(size=(7.6, 2.9))
     step = float(np.diff(merged).min()) if len(merged) > 1 else 1.0
     axes.bar(merged, total / 1e3, width=0.9 * step)
     axes.set(xlabel="drawn diameter / nm", ylabel="pillars / 1000")
     axes.set_title(
         f"{int(total.sum()):,} pillars of the lens in {len(merged)} diameters"
     )
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def margins(found: DrcReport) -> bytes:
+def plot_margins(found: DrcReport) -> bytes:
     """Each rule: what was found beside what is allowed."""
     rows = [
         ("space / nm", found.minimum_space_nm, found.limits["space"], True),
@@ -138,7 +138,7 @@ def margins(found: DrcReport) -> bytes:
             False,
         ),
     ]
-    figure, axes = report.canvas(1, 3, size=(8.2, 1.9))
+    figure, axes = report.make_figure(1, 3, size=(8.2, 1.9))
     for ax, (name, value, limit, at_least) in zip(axes, rows, strict=True):
         shown = value if np.isfinite(value) else 0.0
         good = value >= limit if at_least else value <= limit
@@ -153,14 +153,14 @@ def margins(found: DrcReport) -> bytes:
         ax.set_title(
             f"{name}: {label}, {'at least' if at_least else 'at most'} {limit:g}"
         )
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def verified(found: ExposureReport) -> bytes:
+def plot_verification(found: ExposureReport) -> bytes:
     """Where the diameters in the resist differ from the drawn ones, and how often by
     how much.
     """
-    figure, (at_left, at_right) = report.canvas(1, 2, size=(8.2, 3.6))
+    figure, (at_left, at_right) = report.make_figure(1, 2, size=(8.2, 3.6))
     left, bottom, right, top = found.box_um
     shown = at_left.imshow(
         found.map_nm, origin="lower", extent=(left, right, bottom, top), cmap="coolwarm"
@@ -171,19 +171,19 @@ def verified(found: ExposureReport) -> bytes:
     edges, pillars = found.histogram
     at_right.stairs(pillars, edges, fill=True)
     at_right.set(xlabel="resist - drawn diameter / nm", ylabel="pillars", yscale="log")
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def edge_window(plan: MaskPlan, size_um: float) -> Window:
+def edge_window(plan: MaskPlan, size_um: float) -> DxfWindow:
     """A window at the rim of the lens, on the +x axis."""
     lattice = plan.lattices[0]
     middle = lattice.source(lattice.rows // 2, lattice.rows // 2 + 1)[0]
     last = int(np.flatnonzero(middle)[-1]) if middle.any() else lattice.columns // 2
     x = (lattice.x0 + last * lattice.pitch) * plan.unit_nm * 1e-3
-    return Window(x - size_um / 3, 0.0, size_um)
+    return DxfWindow(x - size_um / 3, 0.0, size_um)
 
 
-def _thumbnail(plan: MaskPlan, lattice: Lattice, most: int = 700) -> Array:
+def _thumbnail(plan: MaskPlan, lattice: PillarLattice, most: int = 700) -> Array:
     """Share of the area that pillars cover, averaged over squares of sites: what a
     microscope that coarse would see.
 
@@ -203,7 +203,9 @@ def _thumbnail(plan: MaskPlan, lattice: Lattice, most: int = 700) -> Array:
     return np.where(covered > 0, covered, np.nan)
 
 
-def _extent(plan: MaskPlan, lattice: Lattice) -> tuple[float, float, float, float]:
+def _extent(
+    plan: MaskPlan, lattice: PillarLattice
+) -> tuple[float, float, float, float]:
     scale = plan.unit_nm * 1e-3
     left, top = lattice.x0 - lattice.pitch / 2, lattice.y0 + lattice.down / 2
     right, bottom = (

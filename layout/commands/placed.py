@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from layout.arrange import (
-    Arrangement,
     CellPart,
-    Furniture,
+    Floorplan,
+    FrameSettings,
     LensPart,
-    Wafer,
+    WaferSettings,
     apart,
     joined,
     parts,
     wafer,
 )
 from layout.commands import make
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.commands.job import Options
-from layout.commands.stages import Stages
+from layout.commands.stages import StageTimes
 from layout.drc import DrcReport, Violation, check_library, check_plan
 from layout.formats import (
     MaskContent,
@@ -31,18 +31,18 @@ from layout.formats import (
     oasis_write,
     placement_limit,
 )
-from layout.mask import FieldPlan, Lattice, MaskPlan, build
+from layout.mask import FieldPlan, MaskPlan, PillarLattice, build
 from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import verify_exposure
 from metalens import lens as lenses
-from metalens.ground import reading
-from metalens.ground.errors import MaskFileError
+from metalens.core import reading
+from metalens.core.errors import MaskFileError
 from metalens.lens import Lens
 
 
 @dataclass(eq=False, slots=True)
-class Work:
+class FloorplanWork:
     """What is known so far of an arrangement.
 
     failures: what keeps the mask from the writer. notes: what a person should know.
@@ -54,17 +54,17 @@ class Work:
     """
 
     options: Options
-    record: Arrangement
+    record: Floorplan
     process: processes.Process
     folder: Path
-    stages: Stages
+    stages: StageTimes
     failures: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     unchecked: list[str] = field(default_factory=list)
     lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
     written: dict[str, int] = field(default_factory=dict)
-    dies: wafer.Dies | None = None
-    placed: list[joined.Placing] = field(default_factory=list)
+    dies: wafer.WaferDies | None = None
+    placed: list[joined.PartPlacement] = field(default_factory=list)
     near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
     splits: dict[str, FieldPlan] = field(default_factory=dict)
@@ -97,23 +97,25 @@ class Work:
         return self.options.lens.parent / file
 
 
-def draw_lens(work: Work, part: LensPart) -> make.Drawing:
+def draw_lens(work: FloorplanWork, part: LensPart) -> make.DrawnLens:
     """A lens as it is drawn, before the doses of the job are known."""
     options = dataclasses.replace(
         work.options, lens=work.beside(part.file), name=part.name
     )
     work.options.console.say(f"{part.name}: {part.file}")
     furniture: build.Furniture = "die" if work.record.furnished(part) else "aperture"
-    return make.draw(options, furniture=furniture)
+    return make.draw_lens(options, furniture=furniture)
 
 
-def lens_part(work: Work, drawing: make.Drawing, made: build.MadePlan) -> parts.Part:
+def lens_part(
+    work: FloorplanWork, drawing: make.DrawnLens, made: build.MadePlan
+) -> parts.DieComponent:
     """A lens, with mask, report and job sheet in a folder of its own."""
     name = drawing.options.name
     folder = work.folder / name
     folder.mkdir()
     work.options.console.say(f"{name}: mask and report")
-    job = make.make(drawing, folder, made)
+    job = make.make_mask(drawing, folder, made)
     work.failures += [f"{name}: {text}" for text in job.failures]
     work.lenses[name] = make.values_of(job)
     work.splits[name] = job.fields
@@ -122,7 +124,7 @@ def lens_part(work: Work, drawing: make.Drawing, made: build.MadePlan) -> parts.
     path = next(
         path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file()
     )
-    content = read(path, make.MOST_READ, keep=make.KEPT)
+    content = read_mask(path, make.MOST_READ, keep=make.KEPT)
     return parts.of_plan(
         name,
         job.plan,
@@ -133,14 +135,14 @@ def lens_part(work: Work, drawing: make.Drawing, made: build.MadePlan) -> parts.
     )
 
 
-def _lattices(plan: MaskPlan) -> dict[str, Lattice]:
+def _lattices(plan: MaskPlan) -> dict[str, PillarLattice]:
     """{cell: its lattice} in the files of a plan, stored whole or as an eighth."""
     pieces = library_of(plan, fold=True).sites
     whole = {lattice.name: lattice for lattice in plan.lattices}
     return whole | {name: piece.lattice for name, piece in pieces.items()}
 
 
-def cell_part(work: Work, part: CellPart) -> parts.Part:
+def cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
     """A cell of a file made elsewhere, held to the rules where it is to be."""
     made = _file_part(work, part)
     if part.checked:
@@ -148,7 +150,7 @@ def cell_part(work: Work, part: CellPart) -> parts.Part:
         with work.stages(f"{part.name}: check"):
             content = MaskContent("cell", parts.UNIT_NM, dict(made.cells))
             skip = (layers.outline[0], layers.fields[0])
-            drawn = {number for number, _ in hierarchy.shapes(content)}
+            drawn = {number for number, _ in hierarchy.count_shapes(content)}
             found = check_library(
                 content,
                 work.process.rules,
@@ -162,7 +164,7 @@ def cell_part(work: Work, part: CellPart) -> parts.Part:
     return made
 
 
-def _uncorrected(part: CellPart, made: parts.Part) -> str:
+def _uncorrected(part: CellPart, made: parts.DieComponent) -> str:
     """That shapes of a file get doses that correct nothing, and the cure."""
     shapes = sum(made.uncorrected.values())
     names = ", ".join(f"{a}/{b}" for a, b in list(made.uncorrected)[:8])
@@ -176,15 +178,15 @@ def _uncorrected(part: CellPart, made: parts.Part) -> str:
     )
 
 
-def _file_part(work: Work, record: CellPart) -> parts.Part:
+def _file_part(work: FloorplanWork, record: CellPart) -> parts.DieComponent:
     """A cell of a file."""
     path = work.beside(record.file)
     if not path.is_file():
         raise MaskFileError(
-            f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
+            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
         )
     most = placement_limit(path)
-    content = read(path, most)
+    content = read_mask(path, most)
     hierarchy.refuse_beyond(content, most)
     made = parts.of_file(
         record.name,
@@ -203,11 +205,11 @@ def _file_part(work: Work, record: CellPart) -> parts.Part:
 
 
 def draw_surroundings(
-    work: Work, die: Furniture, placed: list[joined.Placing]
+    work: FloorplanWork, die: FrameSettings, placed: list[joined.PartPlacement]
 ) -> build.MadePlan:
     """Marks, label and test structures around all that is placed."""
-    box = apart.extent(placed, exposed=True) / joined.PER_UM
-    return build.surroundings(
+    box = apart.extent_of_copies(placed, exposed=True) / joined.PER_UM
+    return build.die_surroundings(
         _source(work),
         work.process,
         name="DIE",
@@ -217,7 +219,7 @@ def draw_surroundings(
     )
 
 
-def draw_wafer_mark(work: Work, size: Wafer) -> build.MadePlan:
+def draw_wafer_mark(work: FloorplanWork, size: WaferSettings) -> build.MadePlan:
     """The alignment mark of a wafer."""
     return build.wafer_mark(
         _source(work),
@@ -228,12 +230,12 @@ def draw_wafer_mark(work: Work, size: Wafer) -> build.MadePlan:
     )
 
 
-def _source(work: Work) -> Lens:
+def _source(work: FloorplanWork) -> Lens:
     """Whose pillars the test structures repeat."""
-    return lenses.streamed(work.beside(work.record.lens[0].file))
+    return lenses.load_out_of_core(work.beside(work.record.lens[0].file))
 
 
-def written_part(work: Work, made: build.MadePlan) -> parts.Part:
+def written_part(work: FloorplanWork, made: build.MadePlan) -> parts.DieComponent:
     """What stands beside the lenses: checked, written, read back and verified as they
     are.
     """
@@ -243,7 +245,7 @@ def written_part(work: Work, made: build.MadePlan) -> parts.Part:
         work.broken(name, check_plan(plan, process.rules))
     path = work.folder / f"{name}.oas"
     oasis_write.write(plan, path)
-    content = read(path, make.MOST_READ)
+    content = read_mask(path, make.MOST_READ)
     path.unlink()
     work.failures += [
         f"{name}: {text}" for text in compare.compare(plan, content).differences

@@ -8,18 +8,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from layout.mask import Lattice, MaskPlan
-from metalens.ground.arrays import Array
+from layout.mask import MaskPlan, PillarLattice
+from metalens.core.arrays import Array
 
 _FIRST_S, _NEXT_S = 2.0, 10.0
 
 
-class Rows:
+class RowProgress:
     """How far down the lens the stage is that works on it."""
 
     def __init__(self) -> None:
         self.end, self.total, self.start = 0, 0, 0.0
-        self._lens: Lattice | None = None
+        self._lens: PillarLattice | None = None
 
     def watched(self, plan: MaskPlan) -> MaskPlan:
         """``plan``, whose first lattice tells when blocks of its rows are taken."""
@@ -32,7 +32,7 @@ class Rows:
             self.end = end
             return lens.source(first, end)
 
-        lattice: Lattice = dataclasses.replace(lens, source=source)
+        lattice: PillarLattice = dataclasses.replace(lens, source=source)
         return plan.replace(lattices=(lattice, *plan.lattices[1:]))
 
     def unwatched(self, plan: MaskPlan) -> MaskPlan:
@@ -54,7 +54,7 @@ class Rows:
         return f", {100 * self.end / self.total:.0f} % of the rows, {rate:.3g} rows/s, {left:.0f} s left"
 
 
-class Stages:
+class StageTimes:
     """Times of the stages; ``say`` hears of those that last."""
 
     def __init__(
@@ -65,7 +65,7 @@ class Stages:
         next_s: float = _NEXT_S,
     ) -> None:
         self.seconds: dict[str, float] = {}
-        self.rows = Rows()
+        self.rows = RowProgress()
         self._say, self._waits = say, (first_s, next_s)
 
     @contextmanager

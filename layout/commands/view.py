@@ -7,13 +7,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.formats import MaskContent, doses, flatten, hierarchy, placement_limit
 from layout.process import LayerNumber
 from layout.shapes import polygon
 from metalens.commands import MASKS
-from metalens.ground.errors import MaskFileError
-from metalens.view import Drawing, Numbers, Outline, Panel
+from metalens.core.errors import MaskFileError
+from metalens.view import DrawingPanel, OutlinePanel, Panel, TablePanel
 
 
 def mask_of(folder: Path) -> Path | None:
@@ -21,7 +21,7 @@ def mask_of(folder: Path) -> Path | None:
     return next((p for end in MASKS for p in sorted(folder.glob(f"*{end}"))), None)
 
 
-def panels(path: Path) -> list[Panel]:
+def mask_panels(path: Path) -> list[Panel]:
     """The drawing of a mask file, or of the one in a folder, and its layers with their
     doses.
 
@@ -32,11 +32,11 @@ def panels(path: Path) -> list[Panel]:
     if found is None:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
     most = placement_limit(found)
-    content = read(found, most)
+    content = read_mask(found, most)
     hierarchy.refuse_beyond(content, most)
     table = found.with_name("doses.csv")
-    dose = doses.read(table) if table.is_file() else {}
-    groups = flatten.alike(content, lambda shape: (shape.cell, shape.layer))
+    dose = doses.read_dose_table(table) if table.is_file() else {}
+    groups = flatten.equal_shapes(content, lambda shape: (shape.cell, shape.layer))
     outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:
         raise MaskFileError(f"{found} holds no shape to be shown")
@@ -46,13 +46,15 @@ def panels(path: Path) -> list[Panel]:
         "to zoom: far away a pixel shows how much of it is covered, near by the outlines are drawn. "
         + (f"Boxes: {len(marks)} places where a rule is broken." if marks else "")
     )
-    drawn = Drawing(found.name, outlines, 1e-3 * content.unit_nm, caption, marks)
+    drawn = DrawingPanel(found.name, outlines, 1e-3 * content.unit_nm, caption, marks)
     return [drawn, _layers(content, outlines, dose)]
 
 
 def _outline(
-    content: MaskContent, group: list[flatten.Shapes], dose: dict[LayerNumber, float]
-) -> Outline:
+    content: MaskContent,
+    group: list[flatten.PolygonCopies],
+    dose: dict[LayerNumber, float],
+) -> OutlinePanel:
     """Copies of one polygon."""
     shape = group[0]
     size = np.ptp(shape.outline, axis=0) * content.unit_nm
@@ -68,7 +70,7 @@ def _outline(
     places = np.concatenate(
         [np.column_stack([some.x, some.y]) for some in group]
     ).astype(np.int32)
-    return Outline(_name(content, shape.layer), shape.outline, places, notes)
+    return OutlinePanel(_name(content, shape.layer), shape.outline, places, notes)
 
 
 def _name(content: MaskContent, layer: LayerNumber) -> str:
@@ -78,8 +80,8 @@ def _name(content: MaskContent, layer: LayerNumber) -> str:
 
 
 def _layers(
-    content: MaskContent, outlines: list[Outline], dose: dict[LayerNumber, float]
-) -> Numbers:
+    content: MaskContent, outlines: list[OutlinePanel], dose: dict[LayerNumber, float]
+) -> TablePanel:
     """Shapes, area and dose of each (layer, datatype)."""
     rows = []
     for layer in sorted(
@@ -105,7 +107,7 @@ def _layers(
                 dose.get(layer, "none stated"),
             )
         )
-    return Numbers(
+    return TablePanel(
         "Layers",
         ("layer/datatype", "name", "shapes", "area / µm²", "relative dose"),
         rows,

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import compiled
+from layout.process import compile_loop
 from layout.shapes import convex
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 # degrees; a sharper wedge is narrower than the limit as far from its tip
 SHARPEST_CORNER = 60.0
@@ -16,7 +16,7 @@ MAX_PAIRS = 40_000_000  # of close boxes, 16 bytes each
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
+class ShapeMeasurement:
     """A width, notch or sharp corner of one polygon.
 
     rule: "width", "notch" or "corner".
@@ -91,7 +91,7 @@ def contour_box(contours: Sequence[Array]) -> tuple[int, int, int, int]:
 
 def measure_polygon(
     contours: Sequence[Array], width_limit: float, space_limit: float
-) -> list[Measurement]:
+) -> list[ShapeMeasurement]:
     """Widths, notches and sharp corners of one polygon in the projection metric.
 
     A convex contour is as wide as its two nearest parallel supporting lines (calipers);
@@ -117,11 +117,15 @@ def measure_polygon(
         convex_contour.append(np.full(len(points), number if outer or hole else -1))
         if outer:
             found.append(
-                Measurement("width", convex.width(points), contour_box([points]))
+                ShapeMeasurement(
+                    "width", convex.least_width(points), contour_box([points])
+                )
             )
         elif hole:
             found.append(
-                Measurement("notch", convex.width(points[::-1]), contour_box([points]))
+                ShapeMeasurement(
+                    "notch", convex.least_width(points[::-1]), contour_box([points])
+                )
             )
     if len(contours) == 1 and convex_contour[0][0] == 0:
         return found
@@ -140,11 +144,11 @@ def measure_polygon(
             strict=True,
         ):
             corners = edges[[i, j]].reshape(4, 2).astype(np.int64)
-            found.append(Measurement(rule, float(value), contour_box([corners])))
+            found.append(ShapeMeasurement(rule, float(value), contour_box([corners])))
     return found
 
 
-def find_sharp_corners(contours: Sequence[Array]) -> list[Measurement]:
+def find_sharp_corners(contours: Sequence[Array]) -> list[ShapeMeasurement]:
     """Corners of less than 60 degrees, of the interior or the exterior.
 
     Args:
@@ -164,7 +168,7 @@ def find_sharp_corners(contours: Sequence[Array]) -> list[Measurement]:
             angle = np.degrees(np.arccos(min(scalar[n] / product[n], 1.0)))
             x, y = points[n].tolist()
             box = (x - 1, y - 1, x + 1, y + 1)
-            found.append(Measurement("corner", float(angle), box))
+            found.append(ShapeMeasurement("corner", float(angle), box))
     return found
 
 
@@ -211,7 +215,7 @@ def find_close_boxes(boxes: Array, distance: float) -> Array:
     return order[pairs[:count]]
 
 
-@compiled
+@compile_loop
 def _fill_bands(first: Array, last: Array) -> tuple[Array, Array]:
     """Offsets of the bands, and the boxes of each band in the given order."""
     start = np.zeros(last.max() + 2, np.int64)
@@ -228,7 +232,7 @@ def _fill_bands(first: Array, last: Array) -> tuple[Array, Array]:
     return start, member
 
 
-@compiled
+@compile_loop
 def _sweep_bands(
     boxes: Array,
     first: Array,
@@ -291,7 +295,7 @@ def measure_separation(
     return euclidean, projected
 
 
-@compiled
+@compile_loop
 def _measure_separation(
     edges: Array,
     start: Array,
@@ -314,14 +318,15 @@ def _measure_separation(
                 if square < facing * facing:
                     facing = min(facing, projected_distance(one[i], two[j], -1.0))
         if nearest > 0 and (
-            encloses(one, two[0, 0], two[0, 1]) or encloses(two, one[0, 0], one[0, 1])
+            encloses_point(one, two[0, 0], two[0, 1])
+            or encloses_point(two, one[0, 0], one[0, 1])
         ):
             nearest = 0.0
         euclidean[n] = nearest**0.5
         projected[n] = facing
 
 
-@compiled
+@compile_loop
 def edge_distance_squared(e: Array, f: Array) -> float:
     """Squared distance of two edges, 0 where they cross or touch."""
     if _on_both_sides(e, f) and _on_both_sides(f, e) and _overlap_on_axes(e, f):
@@ -336,7 +341,7 @@ def edge_distance_squared(e: Array, f: Array) -> float:
     )
 
 
-@compiled
+@compile_loop
 def _on_both_sides(e: Array, f: Array) -> bool:
     """Whether the ends of f lie on different sides of the line through e, or on it."""
     dx, dy = e[2] - e[0], e[3] - e[1]
@@ -345,7 +350,7 @@ def _on_both_sides(e: Array, f: Array) -> bool:
     return bool(start <= 0 <= end or end <= 0 <= start)
 
 
-@compiled
+@compile_loop
 def _overlap_on_axes(e: Array, f: Array) -> bool:
     """Whether the bounding boxes of two edges meet."""
     for axis in range(2):
@@ -356,7 +361,7 @@ def _overlap_on_axes(e: Array, f: Array) -> bool:
     return True
 
 
-@compiled
+@compile_loop
 def _point_distance_squared(x: float, y: float, e: Array) -> float:
     """Squared distance of a point from an edge."""
     dx, dy = e[2] - e[0], e[3] - e[1]
@@ -365,8 +370,8 @@ def _point_distance_squared(x: float, y: float, e: Array) -> float:
     return float((x - e[0] - along * dx) ** 2 + (y - e[1] - along * dy) ** 2)
 
 
-@compiled
-def encloses(edges: Array, x: float, y: float) -> bool:
+@compile_loop
+def encloses_point(edges: Array, x: float, y: float) -> bool:
     """Whether the winding number of a polygon about a point off its edges is not 0."""
     winding = 0
     for n in range(len(edges)):
@@ -378,7 +383,7 @@ def encloses(edges: Array, x: float, y: float) -> bool:
     return winding != 0
 
 
-@compiled
+@compile_loop
 def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
     """(n,) :func:`projected_distance` of pairs (n, 2) of edges."""
     out = np.empty(len(pairs))
@@ -387,7 +392,7 @@ def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
     return out
 
 
-@compiled
+@compile_loop
 def projected_distance(e: Array, f: Array, side: float) -> float:
     """Distance of two edges in the projection metric, as KLayout measures it.
 
@@ -411,7 +416,7 @@ def projected_distance(e: Array, f: Array, side: float) -> float:
     return max(_perpendicular_distance(e, f, side), _perpendicular_distance(f, e, side))
 
 
-@compiled
+@compile_loop
 def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
     """Least distance from the line of e of that part of f which projects onto e and
     lies on one side of it.
@@ -433,7 +438,7 @@ def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
     return float(max(min(away_start + low * slope, away_start + high * slope), 0.0))
 
 
-@compiled
+@compile_loop
 def _clip_to_range(
     start: float, end: float, low: float, high: float
 ) -> tuple[float, float]:

@@ -18,11 +18,11 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.report import MAX_LISTED, DrcReport, Violation
-from layout.mask import EXPOSED, UNDRAWN, Lattice, MaskPlan, PillarClass, tone
-from layout.process import Rules, Zone, compiled
+from layout.mask import EXPOSED, UNDRAWN, MaskPlan, PillarClass, PillarLattice, tone
+from layout.process import DesignRules, KeepOutZone, compile_loop
 from layout.shapes import region
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 SITES_PER_BLOCK = 1 << 21  # sites of a lattice held in memory at once
 MAX_OUTLINES = (
@@ -31,7 +31,7 @@ MAX_OUTLINES = (
 
 
 def check_plan(
-    plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None
+    plan: MaskPlan, rules: DesignRules, *, foot_nm: Array | None = None
 ) -> DrcReport:
     """Check width, space, overlap, grid, density, exclusion zones and clearance of a
     mask plan.
@@ -81,8 +81,8 @@ class _LatticeCheck:
     """
 
     plan: MaskPlan
-    lattice: Lattice
-    rules: Rules
+    lattice: PillarLattice
+    rules: DesignRules
     counts: Array
     report: DrcReport
 
@@ -366,7 +366,7 @@ def _distinct_outlines(
     return outlines, kind
 
 
-def lattice_vectors(lattice: Lattice, reach: float) -> Array:
+def lattice_vectors(lattice: PillarLattice, reach: float) -> Array:
     """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one
     of each opposite pair.
 
@@ -386,7 +386,7 @@ def lattice_vectors(lattice: Lattice, reach: float) -> Array:
     return np.array(vectors)
 
 
-@compiled
+@compile_loop
 def count_pairs(
     block: Array, new: int, kind: Array, vectors: Array, table: Array
 ) -> None:
@@ -410,7 +410,7 @@ def count_pairs(
                 ] += 1
 
 
-@compiled
+@compile_loop
 def locate_pairs(
     block: Array, new: int, kind: Array, vectors: Array, marked: Array, found: Array
 ) -> int:
@@ -437,7 +437,7 @@ def locate_pairs(
 
 
 def _check_density(
-    plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport
+    plan: MaskPlan, lattice: PillarLattice, rules: DesignRules, report: DrcReport
 ) -> Array:
     """Sites of each class number; windows denser than the rule are entered into the
     report.
@@ -486,7 +486,7 @@ def _check_density(
     return counts
 
 
-@compiled
+@compile_loop
 def add_coverage(
     block: Array,
     top: int,
@@ -514,14 +514,14 @@ def add_coverage(
             covered[tile_row, column // tile[1]] += area[number]
 
 
-def _rows_per_block(lattice: Lattice) -> int:
+def _rows_per_block(lattice: PillarLattice) -> int:
     return max(1, SITES_PER_BLOCK // lattice.columns)
 
 
 # figures, grid, zones
 
 
-def _check_figures(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
+def _check_figures(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
     """Width and notch of marks, labels and apertures, merged by layer number."""
     polygons: dict[int, list[Array]] = {}
     for figure in plan.figures:
@@ -534,7 +534,9 @@ def _check_figures(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
         _check_merged(merged, rules, {}, number, f"figures of layer {number}", report)
 
 
-def _check_negative_frame(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
+def _check_negative_frame(
+    plan: MaskPlan, rules: DesignRules, report: DrcReport
+) -> None:
     """Frame written around the lattices of a negative tone: its width is a space, its
     notches are widths.
     """
@@ -562,14 +564,14 @@ def _check_negative_frame(plan: MaskPlan, rules: Rules, report: DrcReport) -> No
 
 def _check_merged(
     polygons: list[Array],
-    rules: Rules,
+    rules: DesignRules,
     names: dict[str, str],
     layer: int,
     text: str,
     report: DrcReport,
 ) -> None:
     """Widths and notches of the union of polygons; ``names`` renames the rules."""
-    cleaned = (clean_contour(contour) for contour in region.union(polygons))
+    cleaned = (clean_contour(contour) for contour in region.union_contours(polygons))
     contours = [contour for contour in cleaned if len(contour) > 2]
     if not contours:
         return
@@ -621,7 +623,7 @@ def _report_off_grid(
 
 
 def _check_zone(
-    plan: MaskPlan, lattice: Lattice, zone: Zone, report: DrcReport
+    plan: MaskPlan, lattice: PillarLattice, zone: KeepOutZone, report: DrcReport
 ) -> None:
     """Pillars that share area with an exclusion zone."""
     scale = 1e3 / plan.unit_nm
@@ -652,7 +654,7 @@ def _check_zone(
 
 
 def _sites_near(
-    plan: MaskPlan, lattice: Lattice, box: tuple[float, float, float, float]
+    plan: MaskPlan, lattice: PillarLattice, box: tuple[float, float, float, float]
 ) -> Iterator[tuple[int, Array]]:
     """(class number, (n, 2) places) of the pillars that can reach into a box."""
     reach = max(int(np.abs(shape.outline).max()) for shape in plan.classes)
@@ -703,7 +705,7 @@ def clipped_area(
     return total
 
 
-def _check_clearance(plan: MaskPlan, rules: Rules, report: DrcReport) -> None:
+def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:
     """Lattices, marks, labels and verniers keep the minimum space from each other, box
     to box.
     """

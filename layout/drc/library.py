@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from layout.drc.geometry import (
-    Measurement,
+    ShapeMeasurement,
     clean_contour,
     contour_box,
     contour_edges,
@@ -21,11 +21,11 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
-from layout.formats import QUARTERS, MaskContent, Turn, flatten, hierarchy
-from layout.process import LayerNumber, Rules
+from layout.formats import QUARTERS, MaskContent, Orientation, flatten, hierarchy
+from layout.process import DesignRules, LayerNumber
 from layout.shapes import region
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 # database units: two corners, each rounded by up to half a unit along x and along y
 GRID_TOLERANCE = 2**0.5
@@ -36,7 +36,7 @@ LayerChoice = tuple[int, int | None]  # layer number; datatype, None: all togeth
 
 def check_library(
     content: MaskContent,
-    rules: Rules,
+    rules: DesignRules,
     *,
     layers: Collection[LayerChoice] | None = None,
     negative: Collection[int] = (),
@@ -79,7 +79,7 @@ def check_library(
             "the mask has no top cell: its cells reference each other in a circle"
         )
     report = DrcReport.empty(content.unit_nm, rules)
-    shapes = hierarchy.shapes(content)
+    shapes = hierarchy.count_shapes(content)
     if layers is None:
         layers = [(number, None) for number in sorted({number for number, _ in shapes})]
     groups = [_select_layers(choice, shapes) for choice in layers]
@@ -125,7 +125,7 @@ class _Element:
     """
 
     cell: str
-    turn: Turn | None
+    turn: Orientation | None
     contours: tuple[Array, ...]
     designed: tuple[Array, ...]
     rounded: bool
@@ -157,7 +157,7 @@ class _LayerCheck:
         self,
         content: MaskContent,
         layers: set[LayerNumber],
-        rules: Rules,
+        rules: DesignRules,
         metric: Metric,
         max_elements: int,
         rule_names: dict[str, str] | None = None,
@@ -169,7 +169,7 @@ class _LayerCheck:
         self.width = rules.minimum_feature_nm / content.unit_nm
         self.space = rules.minimum_gap_nm / content.unit_nm
         self.elements: list[_Element] = []
-        self.numbers: dict[tuple[str, object, Turn], int] = {}
+        self.numbers: dict[tuple[str, object, Orientation], int] = {}
         self.polygons = cache(self._polygons)
         self.references = cache(self._references)
         self.bounding_box = cache(self._bounding_box)
@@ -216,7 +216,7 @@ class _LayerCheck:
             if layer in self.layers
             for c in some
         ]
-        drawn += [flatten.circle(*c) for c in circles]
+        drawn += [flatten.circle_polygon(*c) for c in circles]
         by_corners: dict[int, list[Array]] = {}
         for points in drawn:
             by_corners.setdefault(len(points), []).append(points)
@@ -232,7 +232,7 @@ class _LayerCheck:
                 found.append((outline.reshape(-1, 2), places[members]))
         return found
 
-    def _references(self, cell: str) -> list[tuple[str, Turn, Array]]:
+    def _references(self, cell: str) -> list[tuple[str, Orientation, Array]]:
         """(referenced cell, orientation, (n, 2) places) of all references that draw on
         the layer.
         """
@@ -263,7 +263,7 @@ class _LayerCheck:
             corners += [places.min(0) + low, places.max(0) + high]
         return contour_box([np.array(corners)]) if corners else None
 
-    def _contents(self, cell: str, turn: Turn) -> _Placements:
+    def _contents(self, cell: str, turn: Orientation) -> _Placements:
         """Polygons and references directly in a cell of some orientation."""
         parts = []
         for outline, places in self.polygons(cell):
@@ -282,7 +282,7 @@ class _LayerCheck:
             )
         return _concatenate(placed)
 
-    def _polygon(self, cell: str, outline: Array, turn: Turn) -> int:
+    def _polygon(self, cell: str, outline: Array, turn: Orientation) -> int:
         """Number of the element of a polygon; -1 where it has no area."""
         key = (cell, outline.tobytes(), turn)
         if key not in self.numbers:
@@ -296,7 +296,7 @@ class _LayerCheck:
             self.numbers[key] = self._add_element(element) if contours else -1
         return self.numbers[key]
 
-    def _reference(self, cell: str, turn: Turn) -> int:
+    def _reference(self, cell: str, turn: Orientation) -> int:
         """Number of the element of a cell reference."""
         key = (cell, None, turn)
         if key not in self.numbers:
@@ -405,7 +405,7 @@ class _LayerCheck:
         self,
         found: DrcReport,
         report: DrcReport,
-        turn: Turn,
+        turn: Orientation,
         places: Array,
         names: dict[str, str] | None = None,
     ) -> None:
@@ -431,7 +431,7 @@ class _LayerCheck:
                 rule, _instance_violations(rule, violations, turn, places, copies)
             )
 
-    def _measure_element(self, number: int) -> list[Measurement]:
+    def _measure_element(self, number: int) -> list[ShapeMeasurement]:
         return measure_polygon(self.elements[number].designed, self.width, self.space)
 
     def _check_polygon(self, number: int, places: Array, report: DrcReport) -> None:
@@ -552,12 +552,12 @@ class _LayerCheck:
         step = self.rules.grid_nm / self.content.unit_nm
         if step == 1:
             return
-        instances: dict[str, dict[tuple[Turn, float, float], list[int]]] = {
+        instances: dict[str, dict[tuple[Orientation, float, float], list[int]]] = {
             name: {} for name in self.content.cells
         }
         for name in self.content.tops:
             instances[name][UPRIGHT, 0.0, 0.0] = [1, 0, 0]
-        for name in hierarchy.ordered(self.content):
+        for name in hierarchy.topological_order(self.content):
             for (turn, *phase), (times, x, y) in instances[name].items():
                 for child, own, places in self.references(name):
                     xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
@@ -577,7 +577,7 @@ class _LayerCheck:
     def _check_grid_of_cell(
         self,
         cell: str,
-        turn: Turn,
+        turn: Orientation,
         grid: tuple[float, float, float],
         instances: tuple[int, int, int],
         report: DrcReport,
@@ -626,12 +626,12 @@ def _merged_contours(polygons: Sequence[Array]) -> tuple[Array, ...]:
         for one in (points, points[::-1]):
             if len(one) > 2 and is_convex(one):
                 return (one,)
-    cleaned = (clean_contour(contour) for contour in region.union(polygons))
+    cleaned = (clean_contour(contour) for contour in region.union_contours(polygons))
     return tuple(contour for contour in cleaned if len(contour) > 2)
 
 
 def _instance_violations(
-    rule: str, violations: list[Violation], turn: Turn, places: Array, text: str
+    rule: str, violations: list[Violation], turn: Orientation, places: Array, text: str
 ) -> Iterator[Violation]:
     """Violations of a cell where its instances draw them."""
     for (x, y), violation in product(places[:MAX_LISTED].tolist(), violations):
@@ -641,7 +641,7 @@ def _instance_violations(
 
 
 def _turned_box(
-    box: tuple[int, int, int, int] | None, turn: Turn
+    box: tuple[int, int, int, int] | None, turn: Orientation
 ) -> tuple[int, int, int, int]:
     """Box around the box of a cell that draws, in some orientation."""
     if box is None:

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import Any
 
 from layout.drc.geometry import SHARPEST_CORNER
-from layout.process import LayerNumber, Rules
+from layout.process import DesignRules, LayerNumber
 
 MAX_LISTED = 500  # violations of one rule with their places
 RULES = (
@@ -56,7 +56,7 @@ class Violation:
 
 
 @dataclass(slots=True)
-class Tally:
+class ViolationTally:
     """Number of violations, and the worst value in the unit of its rule."""
 
     count: int
@@ -91,7 +91,7 @@ class DrcReport:
     limits: dict[str, float]
     shapes: int = 0
     layers: dict[LayerNumber, LayerCoverage] | None = None
-    tallies: dict[tuple[str, int, str], Tally] = field(default_factory=dict)
+    tallies: dict[tuple[str, int, str], ViolationTally] = field(default_factory=dict)
     violations: list[Violation] = field(default_factory=list)
     minimum_width_nm: float = math.inf
     minimum_space_nm: float = math.inf
@@ -100,7 +100,7 @@ class DrcReport:
     _listed: dict[str, int] = field(default_factory=dict)
 
     @classmethod
-    def empty(cls, unit_nm: float, rules: Rules) -> "DrcReport":
+    def empty(cls, unit_nm: float, rules: DesignRules) -> "DrcReport":
         """A report without findings; ``unit_nm`` is the database unit."""
         limits = dict.fromkeys(RULES, 0.0)
         limits |= dict.fromkeys(("space", "notch", "clearance"), rules.minimum_gap_nm)
@@ -194,7 +194,7 @@ class DrcReport:
         """
         if not count:
             return
-        tally = self.tallies.setdefault((rule, layer, cell), Tally(0, worst))
+        tally = self.tallies.setdefault((rule, layer, cell), ViolationTally(0, worst))
         tally.count += count
         choose = max if rule == "density" else min
         tally.worst = choose(tally.worst, worst)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.formats import compare as compare
@@ -17,44 +17,44 @@ if TYPE_CHECKING:
     from layout.formats import oasis_read as oasis_read
     from layout.formats import oasis_records as oasis_records
     from layout.formats import oasis_write as oasis_write
-    from layout.formats.assembly import Assembly as Assembly
-    from layout.formats.assembly import Copies as Copies
-    from layout.formats.assembly import Sites as Sites
-    from layout.formats.assembly import arrays as arrays
+    from layout.formats.assembly import CellCopies as CellCopies
+    from layout.formats.assembly import MaskAssembly as MaskAssembly
+    from layout.formats.assembly import PillarSites as PillarSites
+    from layout.formats.assembly import find_arrays as find_arrays
     from layout.formats.assembly import library_of as library_of
-    from layout.formats.compare import Comparison as Comparison
+    from layout.formats.compare import ReadbackComparison as ReadbackComparison
     from layout.formats.content import NOTHING as NOTHING
     from layout.formats.content import QUARTERS as QUARTERS
     from layout.formats.content import CellContent as CellContent
+    from layout.formats.content import CellPlacements as CellPlacements
     from layout.formats.content import MaskContent as MaskContent
-    from layout.formats.content import Placed as Placed
-    from layout.formats.content import Turn as Turn
-    from layout.formats.content import mapped as mapped
+    from layout.formats.content import Orientation as Orientation
+    from layout.formats.content import map_bytes as map_bytes
     from layout.formats.content import placement_limit as placement_limit
-    from layout.formats.digest import Digest as Digest
-    from layout.formats.digest import Sums as Sums
-    from layout.formats.dxf import Window as Window
+    from layout.formats.digest import PlacementDigest as PlacementDigest
+    from layout.formats.digest import RunningDigest as RunningDigest
+    from layout.formats.dxf import DxfWindow as DxfWindow
     from layout.formats.dxf import sites_in as sites_in
-    from layout.formats.oasis_cursor import Cursor as Cursor
+    from layout.formats.oasis_cursor import ByteCursor as ByteCursor
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Assembly": "assembly",
+        "MaskAssembly": "assembly",
         "CellContent": "content",
-        "Comparison": "compare",
-        "Copies": "assembly",
-        "Cursor": "oasis_cursor",
-        "Digest": "digest",
+        "ReadbackComparison": "compare",
+        "CellCopies": "assembly",
+        "ByteCursor": "oasis_cursor",
+        "RunningDigest": "digest",
         "MaskContent": "content",
         "NOTHING": "content",
-        "Placed": "content",
+        "CellPlacements": "content",
         "QUARTERS": "content",
-        "Sites": "assembly",
-        "Sums": "digest",
-        "Turn": "content",
-        "Window": "dxf",
-        "arrays": "assembly",
+        "PillarSites": "assembly",
+        "PlacementDigest": "digest",
+        "Orientation": "content",
+        "DxfWindow": "dxf",
+        "find_arrays": "assembly",
         "compare": "",
         "doses": "",
         "dxf": "",
@@ -65,7 +65,7 @@ __getattr__, __dir__, __all__ = attach(
         "handover": "",
         "hierarchy": "",
         "library_of": "assembly",
-        "mapped": "content",
+        "map_bytes": "content",
         "oasis_read": "",
         "oasis_records": "",
         "oasis_write": "",

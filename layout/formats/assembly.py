@@ -9,19 +9,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from layout.formats.content import QUARTERS, CellContent, Placed, Turn
-from layout.formats.digest import Digest
-from layout.mask import Lattice, MaskPlan, PillarClass, symmetry
+from layout.formats.content import QUARTERS, CellContent, CellPlacements, Orientation
+from layout.formats.digest import RunningDigest
+from layout.mask import MaskPlan, PillarClass, PillarLattice, symmetry
 from layout.process import LayerNumber
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 _LEAST = 4  # copies that are worth an array
 _MOST = 1 << 20  # placements of a cell that are looked through for arrays
 
 
 @dataclass(frozen=True, slots=True)
-class Copies:
+class CellCopies:
     """A cell placed once, or as an array: copy (i, j) stands at (x, y) + i across + j
     up, in database units.
     """
@@ -29,7 +29,7 @@ class Copies:
     child: str
     x: int
     y: int
-    turn: Turn = QUARTERS[0]
+    turn: Orientation = QUARTERS[0]
     columns: int = 1
     rows: int = 1
     across: tuple[int, int] = (0, 0)
@@ -51,21 +51,21 @@ class Copies:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sites:
+class PillarSites:
     """What a cell of pillars places, never all in memory: class k of ``lattice`` is the
     cell ``children[k - 1]``.
     """
 
-    lattice: Lattice
+    lattice: PillarLattice
     children: tuple[str, ...]
 
-    def renamed(self, new: Mapping[str, str]) -> "Sites":
+    def renamed(self, new: Mapping[str, str]) -> "PillarSites":
         """With cells of other names; classes that do not occur have none."""
         return dataclasses.replace(
             self, children=tuple(new.get(child, "") for child in self.children)
         )
 
-    def numbered(self, number: Mapping[str, int]) -> Lattice:
+    def numbered(self, number: Mapping[str, int]) -> PillarLattice:
         """The lattice with ``number`` + 1 of each cell in place of its class; 0 for
         those without one.
         """
@@ -73,14 +73,14 @@ class Sites:
             [0, *(number.get(child, -1) + 1 for child in self.children)], np.int32
         )
         source = self.lattice.source
-        made: Lattice = dataclasses.replace(
+        made: PillarLattice = dataclasses.replace(
             self.lattice, source=lambda a, b: lookup[source(a, b)], array=None
         )
         return made
 
     def sums(self) -> dict[str, tuple[int, ...]]:
         """{cell: count, sums of x and y, turned, hash} of those that occur."""
-        l, digest = self.lattice, Digest()
+        l, digest = self.lattice, RunningDigest()
         for first, block in l.blocks(max(1, _MOST // max(1, l.columns))):
             digest.sites(block, l.x0, l.y0 - first * l.down, (l.pitch, l.down))
         found = digest.of(np.arange(1, len(self.children) + 1))
@@ -93,7 +93,7 @@ class Sites:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Assembly:
+class MaskAssembly:
     """A mask file to be written.
 
     name: of the library. cells: by name, all that are placed among them. copies, sites:
@@ -104,11 +104,11 @@ class Assembly:
 
     name: str
     cells: Mapping[str, CellContent]
-    copies: Mapping[str, tuple[Copies, ...]]
+    copies: Mapping[str, tuple[CellCopies, ...]]
     unit_nm: float = 1.0
     layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
     doses: Mapping[LayerNumber, float] = field(default_factory=dict)
-    sites: Mapping[str, Sites] = field(default_factory=dict)
+    sites: Mapping[str, PillarSites] = field(default_factory=dict)
 
     @property
     def layers(self) -> set[LayerNumber]:
@@ -120,7 +120,7 @@ class Assembly:
         }
 
 
-def library_of(plan: MaskPlan, *, fold: bool = False) -> Assembly:
+def library_of(plan: MaskPlan, *, fold: bool = False) -> MaskAssembly:
     """A plan as cells: pillar classes that occur, figures, lattices, and the top cell.
 
     Args:
@@ -141,25 +141,25 @@ def library_of(plan: MaskPlan, *, fold: bool = False) -> Assembly:
         shapes = {layer: list(some) for layer, some in figure.polygons.items()}
         cells[figure.name] = CellContent(figure.name, shapes)
     fold = fold and all(map(_is_square_symmetric, plan.classes))
-    sites: dict[str, Sites] = {}
-    copies: dict[str, tuple[Copies, ...]] = {}
+    sites: dict[str, PillarSites] = {}
+    copies: dict[str, tuple[CellCopies, ...]] = {}
     for lattice in plan.lattices:
         cells[lattice.name] = CellContent(lattice.name)
         if not (fold and symmetry.is_square_symmetric(lattice)):
-            sites[lattice.name] = Sites(lattice, children)
+            sites[lattice.name] = PillarSites(lattice, children)
             continue
-        for piece in symmetry.pieces(lattice):
+        for piece in symmetry.symmetry_pieces(lattice):
             name = piece.lattice.name
             if name in cells:
                 raise ProcessError(f"two cells of the name {name}: rename one")
             cells[name] = CellContent(name)
-            sites[name] = Sites(piece.lattice, children)
+            sites[name] = PillarSites(piece.lattice, children)
             turns = [QUARTERS[k + 4 * flip] for k, flip in piece.placed]
-            placed = tuple(Copies(name, 0, 0, turn) for turn in turns)
+            placed = tuple(CellCopies(name, 0, 0, turn) for turn in turns)
             copies[lattice.name] = copies.get(lattice.name, ()) + placed
     cells[plan.name] = CellContent(plan.name)
-    copies[plan.name] = tuple(Copies(name, 0, 0) for name in plan.placed_names)
-    return Assembly(
+    copies[plan.name] = tuple(CellCopies(name, 0, 0) for name in plan.placed_names)
+    return MaskAssembly(
         plan.name, cells, copies, plan.unit_nm, plan.layer_names, plan.doses, sites
     )
 
@@ -183,7 +183,9 @@ def _is_square_symmetric(made: PillarClass) -> bool:
     )
 
 
-def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
+def find_arrays(
+    placed: CellPlacements,
+) -> tuple[tuple[CellCopies, ...], CellPlacements]:
     """Rows and rectangles of equally spaced copies as arrays, and the placements that
     are in none.
 
@@ -210,7 +212,7 @@ def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
         np.column_stack([kind, x, count, step]), axis=0, return_inverse=True
     )[1].ravel()
     begin, rows, up = _runs(alike[again], np.zeros(len(again), np.int64), y[again])
-    made: list[Copies] = []
+    made: list[CellCopies] = []
     single = np.zeros(len(placed.child), bool)
     for b, height, rise in zip(begin.tolist(), rows.tolist(), up.tolist(), strict=True):
         members = again[b : b + height]
@@ -222,7 +224,7 @@ def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
         child, turn = divmod(int(kind[n]), len(placed.turns))
         place, across = (int(x[n]), int(y[n])), (int(step[n]), 0)
         made.append(
-            Copies(
+            CellCopies(
                 placed.children[child],
                 *place,
                 placed.turns[turn],
@@ -238,7 +240,7 @@ def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
         placed.y[single],
         placed.turn[single],
     )
-    return tuple(made), Placed(placed.children, *left, placed.turns)
+    return tuple(made), CellPlacements(placed.children, *left, placed.turns)
 
 
 def _runs(key: Array, line: Array, at: Array) -> tuple[Array, Array, Array]:

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.formats import flatten
-from layout.formats.assembly import Assembly, library_of
-from layout.formats.content import QUARTERS, CellContent, MaskContent, Turn
-from layout.formats.digest import Digest
-from layout.formats.hierarchy import drawn
+from layout.formats.assembly import MaskAssembly, library_of
+from layout.formats.content import QUARTERS, CellContent, MaskContent, Orientation
+from layout.formats.digest import RunningDigest
+from layout.formats.hierarchy import drawn_counts
 from layout.mask import MaskPlan
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
-Who = tuple[str, Turn | None]  # a child and its orientation, None: all together
+Who = tuple[str, Orientation | None]  # a child and its orientation, None: all together
 Sum = tuple[int, ...]  # count, sums of x and y, number turned, hash of all places
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class ReadbackComparison:
     """Outcome of reading a mask back.
 
     pillars: placements of the pillar classes below the top cell.
@@ -35,7 +35,7 @@ class Comparison:
         return not self.differences
 
 
-def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
+def compare(plan: MaskPlan, content: MaskContent) -> ReadbackComparison:
     """Whether a file holds exactly the plan, stored whole or as an eighth.
 
     Args:
@@ -45,15 +45,17 @@ def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
     library = library_of(plan, fold=True)
     if library.cells.keys() != content.cells.keys():
         library = library_of(plan)
-    found = differences(library, content)
+    found = mask_differences(library, content)
     try:
-        times = drawn(content)
+        times = drawn_counts(content)
     except MaskFileError as error:
-        return Comparison(0, (*found, str(error)))
-    return Comparison(sum(times.get(c.name, 0) for c in plan.classes), tuple(found))
+        return ReadbackComparison(0, (*found, str(error)))
+    return ReadbackComparison(
+        sum(times.get(c.name, 0) for c in plan.classes), tuple(found)
+    )
 
 
-def differences(library: Assembly, content: MaskContent) -> list[str]:
+def mask_differences(library: MaskAssembly, content: MaskContent) -> list[str]:
     """What a file does not hold as it was planned, in words; empty where it holds all.
 
     Circles count as the polygons of 64 corners that GDSII has in their place.
@@ -65,7 +67,7 @@ def differences(library: Assembly, content: MaskContent) -> list[str]:
     return list(_differences(library, content))
 
 
-def _differences(library: Assembly, content: MaskContent) -> Iterator[str]:
+def _differences(library: MaskAssembly, content: MaskContent) -> Iterator[str]:
     if abs(content.unit_nm / library.unit_nm - 1) > 1e-12:
         yield f"database unit {content.unit_nm} nm, planned {library.unit_nm}"
     missing = sorted(library.cells.keys() - content.cells.keys())
@@ -104,7 +106,9 @@ def _shapes(cell: CellContent) -> list[tuple[tuple[int, int], list[tuple[int, ..
     """Polygons by layer in a form that does not depend on their order."""
     every = {layer: list(shapes) for layer, shapes in cell.polygons.items()}
     for layer, circles in cell.circles.items():
-        every.setdefault(layer, []).extend(flatten.circle(*one) for one in circles)
+        every.setdefault(layer, []).extend(
+            flatten.circle_polygon(*one) for one in circles
+        )
     return [
         (layer, sorted(_canonical(points) for points in every[layer]))
         for layer in sorted(every)
@@ -123,7 +127,7 @@ def _canonical(points: Array) -> tuple[int, ...]:
 
 
 def _sums(
-    library: Assembly | None, cell: CellContent, *, merged: bool
+    library: MaskAssembly | None, cell: CellContent, *, merged: bool
 ) -> dict[Who, Sum]:
     """Sums over the copies of each child and orientation.
 
@@ -135,10 +139,10 @@ def _sums(
     if cell.sums is not None:
         every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
         return {(child, None): tuple(sums) for child, *sums in every}
-    digests: dict[Who, Digest] = {}
+    digests: dict[Who, RunningDigest] = {}
     for child, turn, places in _copies(library, cell):
         who = _rounded(turn)
-        digest = digests.setdefault((child, None if merged else who), Digest())
+        digest = digests.setdefault((child, None if merged else who), RunningDigest())
         zeros = np.zeros(len(places[0]), np.int64)
         index = QUARTERS.index(who) if who in QUARTERS else len(QUARTERS)
         turned = np.full(len(zeros), index if merged else 0, np.uint8)
@@ -156,8 +160,8 @@ def _sums(
 
 
 def _copies(
-    library: Assembly | None, cell: CellContent
-) -> Iterator[tuple[str, Turn, tuple[Array, Array]]]:
+    library: MaskAssembly | None, cell: CellContent
+) -> Iterator[tuple[str, Orientation, tuple[Array, Array]]]:
     """(child, orientation, places) of all copies in a cell but its pillar arrays."""
     placed = cell.kept()
     key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
@@ -173,7 +177,7 @@ def _copies(
         yield one.child, one.turn, one.places()
 
 
-def _rounded(turn: Turn) -> Turn:
+def _rounded(turn: Orientation) -> Orientation:
     """As both formats hold it: GDSII has 56 bits of a fraction to the base 16."""
     angle = round(turn.angle_deg % 360, 9) % 360
-    return Turn(angle, turn.mirrored, float(f"{turn.scale:.12g}"))
+    return Orientation(angle, turn.mirrored, float(f"{turn.scale:.12g}"))

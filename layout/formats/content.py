@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.formats.digest import Digest, Sums
+from layout.formats.digest import PlacementDigest, RunningDigest
 from layout.process import LayerNumber
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class Orientation:
     """A mirror at the x axis (or none), then a turn counter-clockwise, then a scale."""
 
     angle_deg: float = 0.0
@@ -51,21 +51,21 @@ class Turn:
             np.int64
         )
 
-    def after(self, inner: "Turn") -> "Turn":
+    def after(self, inner: "Orientation") -> "Orientation":
         """The turn that equals ``inner`` followed by this one."""
         angle = self.angle_deg + (
             -inner.angle_deg if self.mirrored else inner.angle_deg
         )
-        return Turn(
+        return Orientation(
             angle % 360, self.mirrored != inner.mirrored, self.scale * inner.scale
         )
 
 
-QUARTERS = tuple(Turn(90.0 * (k & 3), bool(k & 4)) for k in range(8))
+QUARTERS = tuple(Orientation(90.0 * (k & 3), bool(k & 4)) for k in range(8))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Placed:
+class CellPlacements:
     """Placements in one cell.
 
     children: names. child: (n,) index into them. x, y: (n,) int32 database units.
@@ -79,7 +79,7 @@ class Placed:
     x: Array
     y: Array
     turn: Array
-    turns: tuple[Turn, ...] = QUARTERS
+    turns: tuple[Orientation, ...] = QUARTERS
 
     def counts(self) -> Array:
         """(children, turns) how often each child is placed with each turn."""
@@ -97,7 +97,7 @@ class Placed:
 _DEEPEST = 64
 _AT_ONCE = 1 << 20  # placements that are counted at once
 _LARGE = 1 << 23  # placements of which each column has 32 MB
-NOTHING = Placed(
+NOTHING = CellPlacements(
     (),
     np.empty(0, np.int32),
     np.empty(0, np.int32),
@@ -120,12 +120,12 @@ class CellContent:
     name: str
     polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
     circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
-    placed: Placed = NOTHING
+    placed: CellPlacements = NOTHING
     texts: int = 0
-    sums: Sums | None = None
+    sums: PlacementDigest | None = None
     skipped: Counter[str] = field(default_factory=Counter)
 
-    def kept(self) -> Placed:
+    def kept(self) -> CellPlacements:
         """The placements.
 
         Raises:
@@ -203,7 +203,7 @@ class MaskContent:
         cells = {name: cell for name, cell in self.cells.items() if name in kept}
         return dataclasses.replace(self, cells=cells)
 
-    def leaves(self, top: str) -> Iterator[Placed]:
+    def leaves(self, top: str) -> Iterator[CellPlacements]:
         """All placements below ``top`` of cells that place nothing themselves, at their
         final places.
 
@@ -249,8 +249,8 @@ class MaskContent:
         return found
 
     def _walk(
-        self, name: str, x: int, y: int, turn: Turn, above: tuple[str, ...]
-    ) -> Iterator[Placed]:
+        self, name: str, x: int, y: int, turn: Orientation, above: tuple[str, ...]
+    ) -> Iterator[CellPlacements]:
         if name in above or len(above) > _DEEPEST:
             raise MaskFileError(
                 f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask"
@@ -269,7 +269,9 @@ class MaskContent:
             else tuple(turn.after(inner) for inner in placed.turns)
         )
         if not deep.any():
-            yield Placed(placed.children, placed.child, px, py, placed.turn, turns)
+            yield CellPlacements(
+                placed.children, placed.child, px, py, placed.turn, turns
+            )
             return
         inner = deep[placed.child]
         for i in np.flatnonzero(inner):
@@ -282,7 +284,7 @@ class MaskContent:
                 (*above, name),
             )
         if not inner.all():
-            yield Placed(
+            yield CellPlacements(
                 placed.children,
                 placed.child[~inner],
                 px[~inner],
@@ -299,7 +301,9 @@ class MaskContent:
         return self.cells[name]
 
 
-def _moved(placed: Placed, turn: Turn, x: int, y: int) -> tuple[Array, Array]:
+def _moved(
+    placed: CellPlacements, turn: Orientation, x: int, y: int
+) -> tuple[Array, Array]:
     """Places turned about (0, 0), then moved."""
     px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
     return px + x, py + y
@@ -315,7 +319,7 @@ def _within(places: Array, name: str) -> Array:
     return np.asarray(places, np.int32)
 
 
-def mapped(path: str | Path) -> Array:
+def map_bytes(path: str | Path) -> Array:
     """The bytes of a file as uint8, read when they are looked at.
 
     Raises:
@@ -359,7 +363,7 @@ def placement_limit(path: Path) -> int:
     return 4_000_000 + 20 * path.stat().st_size
 
 
-def forget(data: Array, end: int) -> None:
+def release_bytes(data: Array, end: int) -> None:
     """Give back the memory of the bytes before ``end`` of a mapped file; they are read
     again if they are looked at.
     """
@@ -373,7 +377,7 @@ def forget(data: Array, end: int) -> None:
 
 
 @dataclass(eq=False, slots=True)
-class Gathered:
+class PlacementSums:
     """Placements of a cell while it is read: kept up to a number (None: all), beyond it
     only their sums.
 
@@ -385,7 +389,7 @@ class Gathered:
     keep: int | None = None
     parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
     count: int = 0
-    digest: Digest | None = None
+    digest: RunningDigest | None = None
     merged: int = 0
     small: int = 0
 
@@ -397,7 +401,7 @@ class Gathered:
             if self.keep is None or self.count <= self.keep:
                 self._merge(len(child))
                 return
-            self.digest = Digest()
+            self.digest = RunningDigest()
             for part in self.parts:
                 self.digest.take(*part)
             self.parts = []

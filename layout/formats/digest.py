@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import compiled
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from layout.process import compile_loop
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 _FIRST, _SECOND, _THIRD = (
     np.uint64(0x9E3779B97F4A7C15),
@@ -28,7 +28,7 @@ _OTHER = 8  # turns from here on are no quarter turns: alike in the hash
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sums:
+class PlacementDigest:
     """Of the placements of each child. count, x, y, turned: (children,) int64; hashed:
     (children,) uint64.
 
@@ -46,7 +46,7 @@ class Sums:
         return iter((self.count, self.x, self.y, self.turned, self.hashed))
 
 
-class Digest:
+class RunningDigest:
     """Running sums over placements; children are numbered from any integer."""
 
     def __init__(self) -> None:
@@ -82,12 +82,12 @@ class Digest:
         slot = np.flatnonzero(self._sums[:, 0])
         return np.where(slot % 2 == 0, slot // 2, -(slot + 1) // 2)
 
-    def of(self, children: Array) -> Sums:
+    def of(self, children: Array) -> PlacementDigest:
         """Sums of some children, by number."""
         slot = np.where(children >= 0, 2 * children, -2 * children - 1)
         self._grow(int(slot.max(initial=0)) + 1)
         count, x, y, turned = self._sums[slot].T
-        return Sums(count, x, y, turned, self._hashes[slot])
+        return PlacementDigest(count, x, y, turned, self._hashes[slot])
 
     def _grow(self, size: int) -> None:
         if size > _MOST:
@@ -100,7 +100,7 @@ class Digest:
             self._hashes = np.concatenate([self._hashes, np.zeros(more, np.uint64)])
 
 
-@compiled
+@compile_loop
 def _mixed(x: int, y: int) -> np.uint64:
     """splitmix64 of x and y side by side."""
     z = (np.uint64(x & 0xFFFFFFFF) << np.uint64(32)) | np.uint64(y & 0xFFFFFFFF)
@@ -110,7 +110,7 @@ def _mixed(x: int, y: int) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@compiled
+@compile_loop
 def _take(
     slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Array
 ) -> None:
@@ -123,7 +123,7 @@ def _take(
         hashes[k] += _mixed(x[n], y[n]) * np.uint64(2 * min(turn[n], _OTHER) + 1)
 
 
-@compiled
+@compile_loop
 def _sites(
     block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array
 ) -> None:

@@ -15,13 +15,13 @@ from typing import Protocol
 
 from layout.formats.content import MaskContent
 from layout.process import LayerNumber, Process
-from metalens.ground import reading, store
-from metalens.ground.errors import MaskFileError
+from metalens.core import reading, store
+from metalens.core.errors import MaskFileError
 
 HEAD = ("layer", "datatype", "relative_dose", "dose_uC_cm2", "step", "name")
 
 
-class Dosed(Protocol):
+class DosedMask(Protocol):
     """A mask that knows the doses and names of its layers."""
 
     @property
@@ -35,7 +35,7 @@ class Dosed(Protocol):
         ...
 
 
-def write(plan: Dosed, process: Process, path: str | Path) -> None:
+def write_dose_table(plan: DosedMask, process: Process, path: str | Path) -> None:
     """Write the table, one line for each (layer, datatype) that is exposed, rising."""
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
@@ -55,7 +55,7 @@ def write(plan: Dosed, process: Process, path: str | Path) -> None:
     store.write_text(path, text.getvalue())
 
 
-def read(path: str | Path) -> dict[LayerNumber, float]:
+def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
     """{(layer, datatype): relative dose} of a table.
 
     Raises:
@@ -88,7 +88,7 @@ def read(path: str | Path) -> dict[LayerNumber, float]:
     return found
 
 
-def missing(
+def layers_without_dose(
     content: MaskContent, doses: Mapping[LayerNumber, float], process: Process
 ) -> tuple[LayerNumber, ...]:
     """Layers of a file that hold shapes to be exposed and have no dose; outline and

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask import Lattice, MaskPlan
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError, ProcessError
+from layout.mask import MaskPlan, PillarLattice
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError, ProcessError
 
 MOST_PILLARS = 200_000
 _UM = 13  # of $INSUNITS
@@ -30,7 +30,7 @@ _COLOURS = 7
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class DxfWindow:
     """A square window of the mask, +y up."""
 
     x_um: float = 0.0
@@ -44,7 +44,7 @@ class Window:
             raise ProcessError(f"window {self}: need a finite place and a size above 0")
 
 
-def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
+def write(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
     """Write the pillars whose site lies in the window, and all figures; the number of
     pillars.
 
@@ -78,7 +78,9 @@ def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
     return len(sites)
 
 
-def differences(plan: MaskPlan, path: str | Path, *, window: Window) -> tuple[str, ...]:
+def dxf_differences(
+    plan: MaskPlan, path: str | Path, *, window: DxfWindow
+) -> tuple[str, ...]:
     """What a DXF file, read by ezdxf, holds that the window of the plan does not, and
     the other way, in words.
 
@@ -134,14 +136,14 @@ def _fixed_stamps() -> Iterator[None]:
             options.write_fixed_meta_data_for_testing = before
 
 
-def _sites(plan: MaskPlan, window: Window) -> list[tuple[int, int, int]]:
+def _sites(plan: MaskPlan, window: DxfWindow) -> list[tuple[int, int, int]]:
     return [
         site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
     ]
 
 
 def sites_in(
-    plan: MaskPlan, lattice: Lattice, window: Window
+    plan: MaskPlan, lattice: PillarLattice, window: DxfWindow
 ) -> Iterator[tuple[int, int, int]]:
     """(class, x, y) of the pillars whose site lies in the window, database units."""
     scale = 1e3 / plan.unit_nm

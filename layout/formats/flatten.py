@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.formats.content import QUARTERS, MaskContent, Placed, Turn
+from layout.formats.content import QUARTERS, CellPlacements, MaskContent, Orientation
 from layout.process import LayerNumber
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 _DEEPEST = 64
 _CIRCLE = 64  # corners of a true circle
@@ -18,7 +18,7 @@ _AT_ONCE = 1 << 22  # placements that are sorted by cell at once
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Shapes:
+class PolygonCopies:
     """Copies of one polygon.
 
     cell: that holds it. outline: (n, 2), counter-clockwise, turned as placed. x, y:
@@ -33,7 +33,7 @@ class Shapes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stack:
+class PolygonStack:
     """Polygons of one cell and layer with equally many corners, at the same places.
 
     outlines: (k, n, 2), counter-clockwise, turned as placed. x, y: (m,) places of the
@@ -47,51 +47,51 @@ class Stack:
     y: Array
 
 
-def shapes(content: MaskContent, top: str) -> Iterator[Shapes]:
+def flatten_shapes(content: MaskContent, top: str) -> Iterator[PolygonCopies]:
     """Every polygon below ``top``; true circles as polygons of 64 corners of their
     area.
 
     Raises:
         MaskFileError: a cell that places itself or is missing, a place beyond 32 bits.
     """
-    for stack in stacks(content, top):
+    for stack in flatten_stacks(content, top):
         for outline in stack.outlines:
-            yield Shapes(stack.cell, stack.layer, outline, stack.x, stack.y)
+            yield PolygonCopies(stack.cell, stack.layer, outline, stack.x, stack.y)
 
 
-def stacks(content: MaskContent, top: str) -> Iterator[Stack]:
-    """As :func:`shapes`, polygons of a cell that have equally many corners together."""
+def flatten_stacks(content: MaskContent, top: str) -> Iterator[PolygonStack]:
+    """As :func:`flatten_shapes`, polygons of a cell that have equally many corners together."""
     for name, x, y, turn in _cells(content, top, (0, 0), QUARTERS[0], ()):
         cell = content.cells[name]
         drawn = {layer: list(polygons) for layer, polygons in cell.polygons.items()}
         for layer, circles in cell.circles.items():
-            drawn.setdefault(layer, []).extend(circle(*one) for one in circles)
+            drawn.setdefault(layer, []).extend(circle_polygon(*one) for one in circles)
         for layer, polygons in drawn.items():
             by_corners: dict[int, list[Array]] = {}
             for points in polygons:
                 by_corners.setdefault(len(points), []).append(points)
             for group in by_corners.values():
                 outlines = _turned(np.stack(group).astype(np.int64), turn)
-                yield Stack(name, layer, outlines, x, y)
+                yield PolygonStack(name, layer, outlines, x, y)
 
 
-def alike(
-    content: MaskContent, key: Callable[[Shapes], Hashable]
-) -> dict[Hashable, list[Shapes]]:
+def equal_shapes(
+    content: MaskContent, key: Callable[[PolygonCopies], Hashable]
+) -> dict[Hashable, list[PolygonCopies]]:
     """Shapes below all top cells by ``key`` and outline, wherever they are placed.
 
     Raises:
-        MaskFileError: as :func:`shapes`.
+        MaskFileError: as :func:`flatten_shapes`.
     """
-    found: dict[Hashable, list[Shapes]] = {}
+    found: dict[Hashable, list[PolygonCopies]] = {}
     for top in content.tops:
-        for shape in shapes(content, top):
+        for shape in flatten_shapes(content, top):
             outline = np.ascontiguousarray(shape.outline).tobytes()
             found.setdefault((key(shape), outline), []).append(shape)
     return found
 
 
-def circle(x: int, y: int, radius: int) -> Array:
+def circle_polygon(x: int, y: int, radius: int) -> Array:
     """(64, 2) corners of a polygon of the area of a circle, on whole units."""
     angle = 2 * np.pi * (np.arange(_CIRCLE) + 0.5) / _CIRCLE
     reach = radius * np.sqrt(2 * np.pi / _CIRCLE / np.sin(2 * np.pi / _CIRCLE))
@@ -103,7 +103,7 @@ def circle(x: int, y: int, radius: int) -> Array:
     )
 
 
-def _turned(outlines: Array, turn: Turn) -> Array:
+def _turned(outlines: Array, turn: Orientation) -> Array:
     """(k, n, 2) corners turned, counter-clockwise again."""
     made = np.stack(turn.apply(outlines[..., 0], outlines[..., 1]), -1)
     after = np.roll(made, -1, axis=1)
@@ -116,9 +116,9 @@ def _cells(
     content: MaskContent,
     name: str,
     at: tuple[int, int],
-    turn: Turn,
+    turn: Orientation,
     above: tuple[str, ...],
-) -> Iterator[tuple[str, Array, Array, Turn]]:
+) -> Iterator[tuple[str, Array, Array, Orientation]]:
     """(cell, x, y, turn) of every cell below ``name`` and of itself.
 
     Equal leaves come together, four million placements of a cell at once.
@@ -153,7 +153,11 @@ def _cells(
 
 
 def _moved(
-    placed: Placed, some: slice, turn: Turn, at: tuple[int, int], name: str
+    placed: CellPlacements,
+    some: slice,
+    turn: Orientation,
+    at: tuple[int, int],
+    name: str,
 ) -> tuple[Array, Array]:
     """(n,) int32 places of some copies below a cell that is turned and stands ``at``."""
     px, py = turn.apply(

@@ -15,19 +15,19 @@ from layout.formats.content import (
     NOTHING,
     QUARTERS,
     CellContent,
-    Gathered,
+    CellPlacements,
     MaskContent,
-    Placed,
-    Turn,
+    Orientation,
+    PlacementSums,
     decode_name,
-    forget,
     has_area,
-    mapped,
+    map_bytes,
+    release_bytes,
 )
-from layout.formats.digest import Sums
+from layout.formats.digest import PlacementDigest
 from layout.formats.read_loops import FARTHEST, sref_run
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 # records that libraries may have before UNITS
 _HEADS = {0x00, 0x05, 0x1F, 0x20, 0x22, 0x23, 0x36, 0x37, 0x38, 0x39, 0x3A, 0x3B}
@@ -41,13 +41,13 @@ _AT_ONCE = 1 << 20  # copies of an array
 class _Batch:
     """Placements of the structure that is being read."""
 
-    held: Gathered
+    held: PlacementSums
     names: dict[str, int] = field(default_factory=dict)
-    turns: dict[Turn, int] = field(
+    turns: dict[Orientation, int] = field(
         default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
     )
 
-    def add(self, child: Array, x: Array, y: Array, turn: Turn) -> None:
+    def add(self, child: Array, x: Array, y: Array, turn: Orientation) -> None:
         number = self.turns.setdefault(turn, len(self.turns))
         turned = np.full(len(child), number, np.uint8 if number < 256 else np.int32)
         self.held.add(
@@ -57,20 +57,20 @@ class _Batch:
     def number(self, name: str) -> int:
         return self.names.setdefault(name, len(self.names))
 
-    def sums(self) -> Sums | None:
+    def sums(self) -> PlacementDigest | None:
         return (
             None
             if self.held.digest is None
             else self.held.digest.of(np.arange(len(self.names)))
         )
 
-    def placed(self) -> Placed:
+    def placed(self) -> CellPlacements:
         if not self.held.count:
             return NOTHING
         names = tuple(self.names)
         if self.held.digest is not None:
             return dataclasses.replace(NOTHING, children=names)
-        return Placed(names, *self.held.columns(), tuple(self.turns))
+        return CellPlacements(names, *self.held.columns(), tuple(self.turns))
 
 
 def read(
@@ -89,10 +89,10 @@ def read(
             offset.
         OSError: the file cannot be opened.
     """
-    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
+    return parse_gdsii(map_bytes(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(
+def parse_gdsii(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskContent:
     """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
@@ -180,7 +180,7 @@ class _Reader:
 
     def structure(self) -> CellContent:
         name = self.name(self.next(gds.STRNAME)[1])
-        batch, skipped = _Batch(Gathered(self.keep)), Counter[str]()
+        batch, skipped = _Batch(PlacementSums(self.keep)), Counter[str]()
         polygons: dict[tuple[int, int], list[Array]] = {}
         while True:
             self.references(batch)
@@ -217,7 +217,7 @@ class _Reader:
             numbers = np.array([batch.number(self.name(n)) for n in names], np.int32)
             batch.add(numbers[child], x, y, QUARTERS[0])
             self.at = end
-            forget(self.data, end)
+            release_bytes(self.data, end)
             self.count(len(child))
 
     def count(self, more: int) -> None:
@@ -322,7 +322,7 @@ class _Reader:
             )
             yield x, y
 
-    def turn(self, found: dict[int, bytes], start: int) -> Turn:
+    def turn(self, found: dict[int, bytes], start: int) -> Orientation:
         flags = found.get(gds.STRANS, b"\0\0")
         angle, size = (
             gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d
@@ -334,7 +334,7 @@ class _Reader:
                 start,
             )
         # absolute angle and size (bits 13, 14) are ignored, as other readers do
-        return Turn(angle % 360, bool(flags[0] & 128), size)
+        return Orientation(angle % 360, bool(flags[0] & 128), size)
 
     def line(self) -> tuple[tuple[int, int], Array]:
         """Layer and outline of a path; a negative width does not scale with references,
@@ -356,7 +356,9 @@ class _Reader:
             return (layer & 0xFFFF, datatype & 0xFFFF), points[:1]
         extensions = {1: (half, half), 2: (half, half), 4: (float(begin), float(end))}
         first, last = extensions.get(ends, (0.0, 0.0))
-        outline = paths.outline(points, half, begin=first, end=last, rounded=ends == 1)
+        outline = paths.path_outline(
+            points, half, begin=first, end=last, rounded=ends == 1
+        )
         return (layer & 0xFFFF, datatype & 0xFFFF), outline
 
     def whole(self, found: dict[int, bytes], kind: int) -> int:

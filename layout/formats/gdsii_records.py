@@ -2,7 +2,7 @@
 
 import struct
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 HEADER, BGNLIB, LIBNAME, UNITS, ENDLIB, BGNSTR, STRNAME, ENDSTR = range(8)
 BOUNDARY, PATH, SREF, AREF, TEXT, LAYER, DATATYPE, WIDTH, XY, ENDEL, SNAME = range(
@@ -98,7 +98,7 @@ TIMES = (
 MOST_POINTS = 8190  # of one boundary, closing point included
 
 
-def real(value: float) -> bytes:
+def gdsii_real(value: float) -> bytes:
     """Excess-64 base-16 floating point: 1 sign bit, 7 bits of exponent, 56 bits of
     fraction.
     """
@@ -113,33 +113,39 @@ def real(value: float) -> bytes:
 
 
 def to_float(data: bytes) -> float:
-    """Inverse of :func:`real`."""
+    """Inverse of :func:`gdsii_real`."""
     fraction = int.from_bytes(data[1:8], "big") / 2**56
     return (-1.0 if data[0] & 128 else 1.0) * fraction * 16.0 ** ((data[0] & 127) - 64)
 
 
-def record(kind: int, data: bytes = b"") -> bytes:
+def gdsii_record(kind: int, data: bytes = b"") -> bytes:
     """One record: length, kind, data type, data."""
     return struct.pack(">HBB", 4 + len(data), kind, DATA[kind]) + data
 
 
-def text(kind: int, value: str) -> bytes:
+def text_record(kind: int, value: str) -> bytes:
     """A record of text, filled to an even length with a zero."""
     data = value.encode()
-    return record(kind, data + bytes(len(data) % 2))
+    return gdsii_record(kind, data + bytes(len(data) % 2))
 
 
-def shorts(kind: int, *values: int) -> bytes:
+def integer_record(kind: int, *values: int) -> bytes:
     """A record of 16-bit integers."""
-    return record(kind, struct.pack(f">{len(values)}h", *values))
+    return gdsii_record(kind, struct.pack(f">{len(values)}h", *values))
 
 
-def points(xy: Array) -> bytes:
+def xy_record(xy: Array) -> bytes:
     """XY record of (n, 2) points."""
-    return record(XY, xy.astype(">i4").tobytes())
+    return gdsii_record(XY, xy.astype(">i4").tobytes())
 
 
-def library(name: str, unit_nm: float) -> bytes:
+def library_head(name: str, unit_nm: float) -> bytes:
     """Everything before the first structure; user unit micrometre."""
-    head = shorts(HEADER, 600) + shorts(BGNLIB, *TIMES) + text(LIBNAME, name)
-    return head + record(UNITS, real(unit_nm * 1e-3) + real(unit_nm * 1e-9))
+    head = (
+        integer_record(HEADER, 600)
+        + integer_record(BGNLIB, *TIMES)
+        + text_record(LIBNAME, name)
+    )
+    return head + gdsii_record(
+        UNITS, gdsii_real(unit_nm * 1e-3) + gdsii_real(unit_nm * 1e-9)
+    )

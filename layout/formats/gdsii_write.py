@@ -15,13 +15,13 @@ import numpy as np
 
 from layout.formats import flatten
 from layout.formats import gdsii_records as gds
-from layout.formats.assembly import Assembly, Copies, Sites, library_of
-from layout.formats.content import QUARTERS, CellContent, Placed, Turn
-from layout.mask import Lattice, MaskPlan
-from layout.process import LayerNumber, compiled
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from layout.formats.assembly import CellCopies, MaskAssembly, PillarSites, library_of
+from layout.formats.content import QUARTERS, CellContent, CellPlacements, Orientation
+from layout.mask import MaskPlan, PillarLattice
+from layout.process import LayerNumber, compile_loop
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 # bytes of references filled before they are written: within the processor's cache
 _BLOCK = 1 << 19
@@ -31,7 +31,7 @@ REFERENCE_BYTES = 28  # of each pillar: a reference to a cell of a four-letter n
 MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
 
 
-def write(mask: MaskPlan | Assembly, path: str | Path) -> None:
+def write(mask: MaskPlan | MaskAssembly, path: str | Path) -> None:
     """Write a mask as GDSII; the file appears whole or not at all.
 
     Args:
@@ -44,7 +44,7 @@ def write(mask: MaskPlan | Assembly, path: str | Path) -> None:
         OSError: the target cannot be written; what was there before stays.
     """
     library = library_of(mask) if isinstance(mask, MaskPlan) else mask
-    with store.replacing(path) as part, open(part, "wb", buffering=0) as file:
+    with store.replace_atomically(path) as part, open(part, "wb", buffering=0) as file:
         _write_concurrently(file, _pieces(library))
 
 
@@ -79,28 +79,32 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
         view = view[file.write(view) :]
 
 
-def _pieces(library: Assembly) -> Iterator[bytes | memoryview]:
-    yield gds.library(library.name, library.unit_nm)
+def _pieces(library: MaskAssembly) -> Iterator[bytes | memoryview]:
+    yield gds.library_head(library.name, library.unit_nm)
     for name, cell in library.cells.items():
-        head = gds.shorts(gds.BGNSTR, *gds.TIMES) + gds.text(gds.STRNAME, name)
-        shapes = [boundary(layer, polygon) for layer, polygon in _polygons(cell)]
+        head = gds.integer_record(gds.BGNSTR, *gds.TIMES) + gds.text_record(
+            gds.STRNAME, name
+        )
+        shapes = [
+            boundary_element(layer, polygon) for layer, polygon in _polygons(cell)
+        ]
         copies = [_copies(one) for one in library.copies.get(name, ())]
         yield b"".join([head, *shapes, *copies])
         yield from _placements(cell.kept())
         if name in library.sites:
             yield from _pillars(library.sites[name])
-        yield gds.record(gds.ENDSTR)
-    yield gds.record(gds.ENDLIB)
+        yield gds.gdsii_record(gds.ENDSTR)
+    yield gds.gdsii_record(gds.ENDLIB)
 
 
 def _polygons(cell: CellContent) -> Iterator[tuple[LayerNumber, Array]]:
     for layer, polygons in cell.polygons.items():
         yield from ((layer, points) for points in polygons)
     for layer, circles in cell.circles.items():
-        yield from ((layer, flatten.circle(*circle)) for circle in circles)
+        yield from ((layer, flatten.circle_polygon(*circle)) for circle in circles)
 
 
-def boundary(layer: LayerNumber, polygon: Array) -> bytes:
+def boundary_element(layer: LayerNumber, polygon: Array) -> bytes:
     """A polygon.
 
     Raises:
@@ -116,34 +120,36 @@ def boundary(layer: LayerNumber, polygon: Array) -> bytes:
             f"layer {layer[0]}/{layer[1]}: GDSII holds numbers to {MAX_NUMBER}; change "
             "the layer map"
         )
-    head = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, layer[0])
+    head = gds.gdsii_record(gds.BOUNDARY) + gds.integer_record(gds.LAYER, layer[0])
     closed = np.concatenate([polygon, polygon[:1]])
     return (
         head
-        + gds.shorts(gds.DATATYPE, layer[1])
-        + gds.points(closed)
-        + gds.record(gds.ENDEL)
+        + gds.integer_record(gds.DATATYPE, layer[1])
+        + gds.xy_record(closed)
+        + gds.gdsii_record(gds.ENDEL)
     )
 
 
-def _head(name: str, turn: Turn = QUARTERS[0], *, array: bool = False) -> bytes:
+def _head(name: str, turn: Orientation = QUARTERS[0], *, array: bool = False) -> bytes:
     """A reference up to its places."""
-    head = gds.record(gds.AREF if array else gds.SREF) + gds.text(gds.SNAME, name)
+    head = gds.gdsii_record(gds.AREF if array else gds.SREF) + gds.text_record(
+        gds.SNAME, name
+    )
     if turn == QUARTERS[0]:
         return head
-    head += gds.record(gds.STRANS, bytes([128 if turn.mirrored else 0, 0]))
+    head += gds.gdsii_record(gds.STRANS, bytes([128 if turn.mirrored else 0, 0]))
     if turn.scale != 1:
-        head += gds.record(gds.MAG, gds.real(turn.scale))
+        head += gds.gdsii_record(gds.MAG, gds.gdsii_real(turn.scale))
     if turn.angle_deg:
-        head += gds.record(gds.ANGLE, gds.real(turn.angle_deg))
+        head += gds.gdsii_record(gds.ANGLE, gds.gdsii_real(turn.angle_deg))
     return head
 
 
-def _copies(one: Copies) -> bytes:
+def _copies(one: CellCopies) -> bytes:
     """A reference, or an array of them."""
     if one.count == 1:
-        place = gds.points(np.array([[one.x, one.y]]))
-        return _head(one.child, one.turn) + place + gds.record(gds.ENDEL)
+        place = gds.xy_record(np.array([[one.x, one.y]]))
+        return _head(one.child, one.turn) + place + gds.gdsii_record(gds.ENDEL)
     if max(one.columns, one.rows) > MAX_NUMBER:
         raise ProcessError(
             f"an array of {one.columns} x {one.rows} copies of {one.child}: GDSII holds "
@@ -158,23 +164,23 @@ def _copies(one: Copies) -> bytes:
         )
     return (
         _head(one.child, one.turn, array=True)
-        + gds.shorts(gds.COLROW, one.columns, one.rows)
-        + gds.points(corners)
-        + gds.record(gds.ENDEL)
+        + gds.integer_record(gds.COLROW, one.columns, one.rows)
+        + gds.xy_record(corners)
+        + gds.gdsii_record(gds.ENDEL)
     )
 
 
-def _placements(placed: Placed) -> Iterator[bytes]:
+def _placements(placed: CellPlacements) -> Iterator[bytes]:
     """All placements, those of one cell and orientation together."""
     key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
     order = np.argsort(key, kind="stable")
     kinds, starts = np.unique(key[order], return_index=True)
     groups = np.split(order, starts[1:]) if len(kinds) else []
-    tail = np.frombuffer(gds.record(gds.ENDEL), np.uint8)
+    tail = np.frombuffer(gds.gdsii_record(gds.ENDEL), np.uint8)
     for kind, members in zip(kinds.tolist(), groups, strict=True):
         child, turn = divmod(kind, len(placed.turns))
         start = _head(placed.children[child], placed.turns[turn])
-        head = np.frombuffer(start + gds.points(np.zeros((1, 2))), np.uint8)
+        head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
         for some in np.array_split(members, math.ceil(len(members) / _AT_ONCE)):
             block = np.empty((len(some), len(head) + len(tail)), np.uint8)
             block[:, : len(head)], block[:, len(head) :] = head, tail
@@ -183,7 +189,7 @@ def _placements(placed: Placed) -> Iterator[bytes]:
             yield block.tobytes()
 
 
-def _pillars(some: Sites) -> Iterator[memoryview]:
+def _pillars(some: PillarSites) -> Iterator[memoryview]:
     """References of a lattice, cells with equally long names together."""
     for length in sorted({len(child.encode()) for child in some.children if child}):
         children = [child for child in some.children if len(child.encode()) == length]
@@ -191,10 +197,12 @@ def _pillars(some: Sites) -> Iterator[memoryview]:
         yield from _references(children, some.numbered(numbers))
 
 
-def _references(children: Sequence[str], lattice: Lattice) -> Iterator[memoryview]:
+def _references(
+    children: Sequence[str], lattice: PillarLattice
+) -> Iterator[memoryview]:
     """References of a lattice to cells, in two buffers filled in turn."""
     made = [
-        _head(name) + gds.points(np.zeros((1, 2))) + gds.record(gds.ENDEL)
+        _head(name) + gds.xy_record(np.zeros((1, 2))) + gds.gdsii_record(gds.ENDEL)
         for name in children
     ]
     dtype = np.dtype(np.uint16 if len(made[0]) % 4 else np.uint32)
@@ -223,7 +231,7 @@ def _words(values: Array, dtype: np.dtype[Any]) -> Array:
     )
 
 
-@compiled
+@compile_loop
 def _fill(
     buffer: Array,
     block: Array,

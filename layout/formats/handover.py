@@ -18,8 +18,8 @@ import numpy as np
 from layout.mask import FieldPlan, MaskPlan
 from layout.process import LayerNumber, Process
 from layout.shapes import polygon, region
-from metalens.ground import store
-from metalens.ground.units import nm
+from metalens.core import store
+from metalens.core.units import nm
 
 FIELD_HEAD = ("sequence", "x_um", "y_um", "width_um", "height_um", "pillars")
 _OPEN = "________"
@@ -39,7 +39,7 @@ class WriteStep:
     pillars: int
 
 
-def sequence(split: FieldPlan) -> list[WriteStep]:
+def field_sequence(split: FieldPlan) -> list[WriteStep]:
     """All fields that hold pillars."""
     x, y = split.x_um.tolist(), split.y_um.tolist()
     made: list[WriteStep] = []
@@ -59,7 +59,7 @@ def write_fields(split: FieldPlan, path: str | Path) -> None:
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(FIELD_HEAD)
-    for step in sequence(split):
+    for step in field_sequence(split):
         sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
         out.writerow([step.sequence, *(f"{v:.4f}" for v in sizes), step.pillars])
     store.write_text(path, text.getvalue())
@@ -137,7 +137,7 @@ def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
     boxes = (
         [
             (c.min(0), c.max(0))
-            for c in region.union(shapes)
+            for c in region.union_contours(shapes)
             if polygon.twice_area(c) > 0
         ]
         if shapes
@@ -184,7 +184,7 @@ def _lines(
     yield ""
     yield from dose_lines(areas, plan.doses, plan.layer_names, process)
     yield ""
-    steps = sequence(split)
+    steps = field_sequence(split)
     yield f"Write fields: {len(steps)} ({split.mode}), in the order of fields.csv"
     yield f"  at most {split.size_um[0]:.3f} x {split.size_um[1]:.3f} um"
     yield f"  no border cuts a pillar; least distance {split.clearance_um / nm:.1f} nm"

@@ -7,10 +7,10 @@ from collections import Counter
 
 from layout.formats.content import MaskContent
 from layout.process import LayerNumber
-from metalens.ground.errors import MaskFileError
+from metalens.core.errors import MaskFileError
 
 
-def ordered(content: MaskContent) -> list[str]:
+def topological_order(content: MaskContent) -> list[str]:
     """All cells, each after those that place it.
 
     Raises:
@@ -33,14 +33,14 @@ def ordered(content: MaskContent) -> list[str]:
         ) from None
 
 
-def drawn(content: MaskContent) -> dict[str, int]:
+def drawn_counts(content: MaskContent) -> dict[str, int]:
     """{cell: how often it is drawn below the top cells}, each after those that place
     it; 1 for a top cell.
 
     Raises:
-        MaskFileError: as :func:`ordered`.
+        MaskFileError: as :func:`topological_order`.
     """
-    times = dict.fromkeys(ordered(content), 0)
+    times = dict.fromkeys(topological_order(content), 0)
     times |= dict.fromkeys(content.tops, 1)
     for name in times:
         cell = content.cells[name]
@@ -51,14 +51,14 @@ def drawn(content: MaskContent) -> dict[str, int]:
     return times
 
 
-def shapes(content: MaskContent) -> Counter[LayerNumber]:
+def count_shapes(content: MaskContent) -> Counter[LayerNumber]:
     """Shapes that the top cells draw on each layer.
 
     Raises:
-        MaskFileError: as :func:`ordered`.
+        MaskFileError: as :func:`topological_order`.
     """
     found: Counter[LayerNumber] = Counter()
-    for name, times in drawn(content).items():
+    for name, times in drawn_counts(content).items():
         cell = content.cells[name]
         for some in (cell.polygons, cell.circles):
             found.update({layer: times * len(held) for layer, held in some.items()})
@@ -71,10 +71,11 @@ def refuse_beyond(content: MaskContent, most: int) -> None:
     Raises:
         MaskFileError: more than ``most`` shapes (copies of a cell that holds nothing
             count as one), with the number; as
-            :func:`ordered`.
+            :func:`topological_order`.
     """
     total = sum(
-        times * content.cells[name].taken for name, times in drawn(content).items()
+        times * content.cells[name].taken
+        for name, times in drawn_counts(content).items()
     )
     if total > most:
         raise MaskFileError(

@@ -16,14 +16,14 @@ from layout.formats.content import (
     NOTHING,
     QUARTERS,
     CellContent,
-    Gathered,
-    Placed,
-    Turn,
+    CellPlacements,
+    Orientation,
+    PlacementSums,
     has_area,
 )
-from layout.formats.oasis_cursor import Cursor, Repetition
-from layout.formats.read_loops import placements
-from metalens.ground.arrays import Array
+from layout.formats.oasis_cursor import ByteCursor, RepetitionOffsets
+from layout.formats.read_loops import scan_placements
+from metalens.core.arrays import Array
 
 Child = int | str  # reference number, or name
 Value = TypeVar("Value")
@@ -32,7 +32,7 @@ _DRAWN = 8  # placements that take as much memory as a polygon without its corne
 
 
 @dataclass(slots=True)
-class Budget:
+class ReadBudget:
     """Placements and copies of a whole file: at most ``limit``, ``used`` so far."""
 
     limit: int
@@ -45,7 +45,7 @@ class Budget:
 
 
 @dataclass(eq=False, slots=True)
-class Modal:
+class ModalState:
     """Values that a record may leave out because an earlier one gave them; forgotten at
     each cell.
     """
@@ -69,7 +69,7 @@ class Modal:
     path_begin: int | None = None
     path_end: int | None = None
     kind: int | None = None
-    repetition: Repetition | None = None
+    repetition: RepetitionOffsets | None = None
 
 
 @dataclass(eq=False, slots=True)
@@ -83,9 +83,9 @@ class OpenCell:
     circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(
         default_factory=dict
     )
-    held: Gathered = field(default_factory=Gathered)
+    held: PlacementSums = field(default_factory=PlacementSums)
     names: dict[str, int] = field(default_factory=dict)
-    turns: dict[Turn, int] = field(
+    turns: dict[Orientation, int] = field(
         default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
     )
     texts: int = 0
@@ -105,7 +105,7 @@ class OpenCell:
             self.skipped,
         )
 
-    def _placed(self, table: dict[int, str]) -> Placed:
+    def _placed(self, table: dict[int, str]) -> CellPlacements:
         if not self.held.count:
             return NOTHING
         own = {number: name for name, number in self.names.items()}
@@ -117,7 +117,7 @@ class OpenCell:
         child, x, y, turn = self.held.columns()
         used, index = _numbered(child)
         names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
-        return Placed(names, index, x, y, turn, tuple(self.turns))
+        return CellPlacements(names, index, x, y, turn, tuple(self.turns))
 
 
 def _numbered(child: Array) -> tuple[Array, Array]:
@@ -144,10 +144,10 @@ def _numbered(child: Array) -> tuple[Array, Array]:
 class CellReader:
     """Reads the records of one cell."""
 
-    def __init__(self, cell: OpenCell, budget: Budget) -> None:
-        self.cell, self.budget, self.modal = cell, budget, Modal()
+    def __init__(self, cell: OpenCell, budget: ReadBudget) -> None:
+        self.cell, self.budget, self.modal = cell, budget, ModalState()
 
-    def record(self, c: Cursor, kind: int) -> bool:
+    def record(self, c: ByteCursor, kind: int) -> bool:
         """Read the record of this kind that stands at the cursor; False where cells
         hold no such record.
         """
@@ -179,7 +179,7 @@ class CellReader:
             return False
         return True
 
-    def plain_placements(self, c: Cursor) -> None:
+    def plain_placements(self, c: ByteCursor) -> None:
         """Placements in a row, by the compiled loop; stops before anything that it does
         not know.
         """
@@ -195,7 +195,7 @@ class CellReader:
         while True:
             size = min(_BATCH, c.left // 2 + 1)
             out = np.empty((4, size), np.int32)
-            at, count = placements(c.data, c.at, c.end, state, out)
+            at, count = scan_placements(c.data, c.at, c.end, state, out)
             moved, c.at = at > c.at, int(at)
             if count:
                 child, x, y, turn = (row.copy() for row in out[:, :count])
@@ -209,11 +209,13 @@ class CellReader:
             if not moved:
                 return
 
-    def _add(self, c: Cursor, child: Array, x: Array, y: Array, turn: Array) -> None:
+    def _add(
+        self, c: ByteCursor, child: Array, x: Array, y: Array, turn: Array
+    ) -> None:
         self._count(c, len(child))
         self.cell.held.add(child, x, y, turn)
 
-    def _count(self, c: Cursor, more: int) -> None:
+    def _count(self, c: ByteCursor, more: int) -> None:
         self.budget.used += more
         if self.budget.used > self.budget.limit:
             raise c.fail(
@@ -221,13 +223,13 @@ class CellReader:
                 f"corners), at most {self.budget.limit:,} are read (metalens check --max-shapes sets another limit)"
             )
 
-    def _need(self, c: Cursor, value: Value | None, what: str) -> Value:
+    def _need(self, c: ByteCursor, value: Value | None, what: str) -> Value:
         if value is None:
             raise c.fail(f"record without {what}, and none before it in this cell")
         return value
 
     def _position(
-        self, c: Cursor, info: int, bits: tuple[int, int], now: tuple[int, int]
+        self, c: ByteCursor, info: int, bits: tuple[int, int], now: tuple[int, int]
     ) -> tuple[int, int]:
         place = []
         for bit, old in zip(bits, now, strict=True):
@@ -239,7 +241,7 @@ class CellReader:
         return place[0], place[1]
 
     def _repeated(
-        self, c: Cursor, info: int, bit: int, x: int, y: int
+        self, c: ByteCursor, info: int, bit: int, x: int, y: int
     ) -> tuple[Array, Array]:
         if not info & bit:
             return np.array([x]), np.array([y])
@@ -250,7 +252,7 @@ class CellReader:
             c.within(int(offsets.min()) + start)
         return moved.x + moved.x.dtype.type(x), moved.y + moved.y.dtype.type(y)
 
-    def _placement(self, c: Cursor, kind: int) -> None:
+    def _placement(self, c: ByteCursor, kind: int) -> None:
         info, m = c.byte(), self.modal
         if info & 0x80:
             m.child = c.within(c.unsigned()) if info & 0x40 else c.string(name=True)
@@ -266,7 +268,7 @@ class CellReader:
                     f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0"
                 )
             turn = self.cell.turns.setdefault(
-                Turn(angle % 360, bool(info & 1), size), len(self.cell.turns)
+                Orientation(angle % 360, bool(info & 1), size), len(self.cell.turns)
             )
         m.placement_x, m.placement_y = self._position(
             c, info, (0x20, 0x10), (m.placement_x, m.placement_y)
@@ -286,14 +288,14 @@ class CellReader:
             c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32)
         )
 
-    def _layer(self, c: Cursor, info: int) -> None:
+    def _layer(self, c: ByteCursor, info: int) -> None:
         if info & 1:
             self.modal.layer = c.unsigned()
         if info & 2:
             self.modal.datatype = c.unsigned()
 
     def _place(
-        self, c: Cursor, info: int, corners: int
+        self, c: ByteCursor, info: int, corners: int
     ) -> tuple[tuple[int, int], Array, Array]:
         """Layer and positions of a shape, from the end of its record."""
         m = self.modal
@@ -306,7 +308,7 @@ class CellReader:
             y,
         )
 
-    def _polygons(self, c: Cursor, info: int, points: Array, what: str) -> None:
+    def _polygons(self, c: ByteCursor, info: int, points: Array, what: str) -> None:
         """Copies of a polygon; ``what`` names its kind where it draws nothing."""
         layer, x, y = self._place(c, info, len(points))
         if not has_area(points):
@@ -319,7 +321,7 @@ class CellReader:
             for place in zip(x.tolist(), y.tolist(), strict=True)
         )
 
-    def _rectangle(self, c: Cursor) -> None:
+    def _rectangle(self, c: ByteCursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x40:
@@ -331,14 +333,14 @@ class CellReader:
         w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
         self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
 
-    def _polygon(self, c: Cursor) -> None:
+    def _polygon(self, c: ByteCursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x20:
             m.points = c.points()
         self._polygons(c, info, self._need(c, m.points, "point list"), "POLYGON")
 
-    def _path(self, c: Cursor) -> None:
+    def _path(self, c: ByteCursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x40:
@@ -355,10 +357,10 @@ class CellReader:
         )
         begin = self._need(c, m.path_begin, "extension at its start")
         end = self._need(c, m.path_end, "extension at its end")
-        outline = paths.outline(points, half, begin=begin, end=end)
+        outline = paths.path_outline(points, half, begin=begin, end=end)
         self._polygons(c, info, outline if half else points[:1], "PATH")
 
-    def _extent(self, c: Cursor, form: int, last: int | None) -> int | None:
+    def _extent(self, c: ByteCursor, form: int, last: int | None) -> int | None:
         """Extension of a path: as before (0), none, its half width, or stated (3)."""
         if form < 2:
             return 0 if form else last
@@ -366,7 +368,7 @@ class CellReader:
             return self._need(c, self.modal.half_width, "width")
         return c.coordinate()
 
-    def _trapezoid(self, c: Cursor, kind: int) -> None:
+    def _trapezoid(self, c: ByteCursor, kind: int) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         self._size(c, info)
@@ -380,17 +382,17 @@ class CellReader:
         self._polygons(
             c,
             info,
-            trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80)),
+            trapezoids.slanted_trapezoid(w, h, a, b, upright=bool(info & 0x80)),
             "TRAPEZOID",
         )
 
-    def _size(self, c: Cursor, info: int) -> None:
+    def _size(self, c: ByteCursor, info: int) -> None:
         if info & 0x40:
             self.modal.width = c.within(c.unsigned())
         if info & 0x20:
             self.modal.height = c.within(c.unsigned())
 
-    def _compact(self, c: Cursor) -> None:
+    def _compact(self, c: ByteCursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x80:
@@ -401,14 +403,14 @@ class CellReader:
             raise c.fail(
                 f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}"
             )
-        wide, high = trapezoids.needs(kind)
+        wide, high = trapezoids.required_sides(kind)
         w = self._need(c, m.width, "width") if wide else 0
         h = self._need(c, m.height, "height") if high else 0
         size = trapezoids.dependent_size(kind, w, h)
         m.width, m.height = size
-        self._polygons(c, info, trapezoids.compact(kind, w, h), "CTRAPEZOID")
+        self._polygons(c, info, trapezoids.compact_trapezoid(kind, w, h), "CTRAPEZOID")
 
-    def _circle(self, c: Cursor) -> None:
+    def _circle(self, c: ByteCursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x20:
@@ -423,7 +425,7 @@ class CellReader:
             (px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True)
         )
 
-    def _extension(self, c: Cursor) -> None:
+    def _extension(self, c: ByteCursor) -> None:
         """XGEOMETRY, geometry of an extension of the format, is counted, no more."""
         info = c.byte()
         c.unsigned()
@@ -432,7 +434,7 @@ class CellReader:
         _, x, _ = self._place(c, info, 1)
         self.cell.skipped["XGEOMETRY"] += len(x)
 
-    def _text(self, c: Cursor) -> None:
+    def _text(self, c: ByteCursor) -> None:
         """Texts are counted, no more."""
         info, m = c.byte(), self.modal
         if info & 0x40:

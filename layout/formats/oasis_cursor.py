@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.formats.content import decode_name
-from layout.formats.read_loops import FARTHEST, deltas
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaskFileError
+from layout.formats.read_loops import FARTHEST, sum_deltas
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
 
 MOST_BYTES = 9  # of one integer
 MOST_COPIES = 1 << 24  # of one regular repetition, which take memory at once
@@ -18,7 +18,7 @@ DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Repetition:
+class RepetitionOffsets:
     """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32
     bits.
     """
@@ -27,7 +27,7 @@ class Repetition:
     y: Array
 
 
-class Cursor:
+class ByteCursor:
     """A position in the bytes of a file, or in those of one decompressed block of it."""
 
     def __init__(
@@ -175,7 +175,9 @@ class Cursor:
             return dx * (word >> bits), dy * (word >> bits)
         return self.delta()
 
-    def repetition(self, last: Repetition | None, limit: int) -> Repetition:
+    def repetition(
+        self, last: RepetitionOffsets | None, limit: int
+    ) -> RepetitionOffsets:
         """A repetition of any type; at most ``limit`` copies."""
         form = self.unsigned()
         if form == 0:
@@ -191,20 +193,22 @@ class Cursor:
             steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
             line = self._sums(steps)
             return (
-                Repetition(line, 0 * line) if form < 6 else Repetition(0 * line, line)
+                RepetitionOffsets(line, 0 * line)
+                if form < 6
+                else RepetitionOffsets(0 * line, line)
             )
         if form in (8, 9):
             return self._vectors(form, limit)
         if form in (10, 11):
             count, grid = self._count(limit), self.unsigned() if form == 11 else 1
             x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
-            at = deltas(self.data, self.at, self.end, self.within(grid), x, y)
+            at = sum_deltas(self.data, self.at, self.end, self.within(grid), x, y)
             if at < 0:
                 raise self.fail(
                     f"list of {count - 1} steps that is cut or leaves 32 bits"
                 )
             self.at = at
-            return Repetition(x, y)
+            return RepetitionOffsets(x, y)
         raise self.fail(f"repetition of type {form}, need 0 to 11")
 
     def _count(self, limit: int) -> int:
@@ -219,14 +223,14 @@ class Cursor:
             raise self.fail("repetition that leaves 32 bits")
         return np.cumsum(np.array(steps, np.int64))
 
-    def _matrix(self, form: int, limit: int) -> Repetition:
+    def _matrix(self, form: int, limit: int) -> RepetitionOffsets:
         columns = self.unsigned() + 2 if form != 3 else 1
         rows = self.unsigned() + 2 if form != 2 else 1
         step_x = self.unsigned() if form != 3 else 0
         step_y = self.unsigned() if form != 2 else 0
         return self._grid(columns, rows, (step_x, 0), (0, step_y), limit)
 
-    def _vectors(self, form: int, limit: int) -> Repetition:
+    def _vectors(self, form: int, limit: int) -> RepetitionOffsets:
         first = self.unsigned() + 2
         second = self.unsigned() + 2 if form == 8 else 1
         along = self.delta()
@@ -236,7 +240,7 @@ class Cursor:
 
     def _grid(
         self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int
-    ) -> Repetition:
+    ) -> RepetitionOffsets:
         if n * m > min(limit, MOST_COPIES):
             most = min(limit, MOST_COPIES)
             raise self.fail(
@@ -249,4 +253,4 @@ class Cursor:
             (along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32)
             for k in (0, 1)
         )
-        return Repetition(x.ravel(), y.ravel())
+        return RepetitionOffsets(x.ravel(), y.ravel())

@@ -12,13 +12,13 @@ from layout.formats import oasis_records as oasis
 from layout.formats.content import (
     CONTEXT_CELL,
     CellContent,
-    Gathered,
     MaskContent,
-    mapped,
+    PlacementSums,
+    map_bytes,
 )
-from layout.formats.oasis_cells import Budget, CellReader, Child, OpenCell
-from layout.formats.oasis_cursor import Cursor
-from metalens.ground.arrays import Array
+from layout.formats.oasis_cells import CellReader, Child, OpenCell, ReadBudget
+from layout.formats.oasis_cursor import ByteCursor
+from metalens.core.arrays import Array
 
 LIMIT = 2**29
 _NUMBERED_NAMES = (
@@ -48,23 +48,23 @@ def read(
             pillars holds; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
-    return parse(mapped(path), limit=limit, keep=keep, where=str(path))
+    return parse_oasis(map_bytes(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(
+def parse_oasis(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskContent:
     """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
     in errors.
     """
-    return _Reader(Cursor(where, data), limit, keep).whole_file()
+    return _Reader(ByteCursor(where, data), limit, keep).whole_file()
 
 
 class _Reader:
     """The file level; ``cell`` reads what stands in the open cell."""
 
-    def __init__(self, cursor: Cursor, limit: int, keep: int | None) -> None:
-        self.file, self.budget, self.keep = cursor, Budget(limit), keep
+    def __init__(self, cursor: ByteCursor, limit: int, keep: int | None) -> None:
+        self.file, self.budget, self.keep = cursor, ReadBudget(limit), keep
         self.cell: CellReader | None = None
         self.cells: list[OpenCell] = []
         self.names: dict[int, str] = {}
@@ -100,13 +100,13 @@ class _Reader:
             self._offsets(c)
         return 1e3 / steps, offsets_here
 
-    def _offsets(self, c: Cursor) -> None:
+    def _offsets(self, c: ByteCursor) -> None:
         for _ in range(6):
             if c.unsigned() > 1:
                 raise c.fail("table offset with a flag beyond 1")
             c.unsigned()
 
-    def _records(self, c: Cursor) -> None:
+    def _records(self, c: ByteCursor) -> None:
         """All records at the cursor, up to its end or END."""
         while c.left and self.end_at is None:
             if self.cell is not None:
@@ -116,7 +116,7 @@ class _Reader:
             c.begin = c.at
             self._record(c, c.byte())
 
-    def _record(self, c: Cursor, kind: int) -> None:
+    def _record(self, c: ByteCursor, kind: int) -> None:
         if kind in (oasis.CELL_REF, oasis.CELL):
             self._begin_cell(
                 c.within(c.unsigned())
@@ -147,10 +147,10 @@ class _Reader:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
 
     def _begin_cell(self, key: Child) -> None:
-        self.cells.append(OpenCell(key, held=Gathered(self.keep)))
+        self.cells.append(OpenCell(key, held=PlacementSums(self.keep)))
         self.cell = CellReader(self.cells[-1], self.budget)
 
-    def _block(self, c: Cursor) -> None:
+    def _block(self, c: ByteCursor) -> None:
         if c is not self.file:
             raise c.fail("a compressed block within another")
         if c.unsigned() != 0:
@@ -176,9 +176,9 @@ class _Reader:
             raise c.fail(
                 f"compressed block of {len(raw)} bytes where {size} are announced"
             )
-        self._records(Cursor(c.path, np.frombuffer(raw, np.uint8), block=c.begin))
+        self._records(ByteCursor(c.path, np.frombuffer(raw, np.uint8), block=c.begin))
 
-    def _cell_name(self, c: Cursor, explicit: bool) -> None:
+    def _cell_name(self, c: ByteCursor, explicit: bool) -> None:
         name = c.string(name=True)
         self.explicit.add(explicit)
         number = c.within(c.unsigned()) if explicit else len(self.names)
@@ -189,14 +189,14 @@ class _Reader:
         self.names[number] = name
         self.cell = None
 
-    def _layer_name(self, c: Cursor, kind: int) -> None:
+    def _layer_name(self, c: ByteCursor, kind: int) -> None:
         name = c.string(name=True)
         first = [self._interval(c) for _ in range(2)]
         if kind == oasis.LAYERNAME and None not in first:
             self.layer_names[first[0] or 0, first[1] or 0] = name
         self.cell = None
 
-    def _interval(self, c: Cursor) -> int | None:
+    def _interval(self, c: ByteCursor) -> int | None:
         """The single number of an interval; None for any other interval."""
         form = c.unsigned()
         if form > 4:
@@ -204,13 +204,13 @@ class _Reader:
         numbers = [c.unsigned() for _ in range((0, 1, 1, 1, 2)[form])]
         return numbers[0] if form == 3 else None
 
-    def _other_name(self, c: Cursor, kind: int) -> None:
+    def _other_name(self, c: ByteCursor, kind: int) -> None:
         c.string()
         if kind in _NUMBERED_NAMES:
             c.unsigned()
         self.cell = None
 
-    def _property(self, c: Cursor, kind: int) -> None:
+    def _property(self, c: ByteCursor, kind: int) -> None:
         """Properties are passed over."""
         if kind == oasis.PROPERTY_REPEAT:
             return
@@ -223,7 +223,7 @@ class _Reader:
         for _ in range(count):
             self._property_value(c)
 
-    def _property_value(self, c: Cursor) -> None:
+    def _property_value(self, c: ByteCursor) -> None:
         form = c.byte()
         if form <= 7:
             c.at -= 1

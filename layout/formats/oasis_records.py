@@ -53,7 +53,7 @@ MAGIC = b"%SEMI-OASIS\r\n"
 END_SIZE = 256
 
 
-def unsigned(value: int) -> bytes:
+def unsigned_integer(value: int) -> bytes:
     """7 bits a byte, least significant first; the top bit says that more follow."""
     out = bytearray()
     while value > 127:
@@ -63,42 +63,53 @@ def unsigned(value: int) -> bytes:
     return bytes(out)
 
 
-def signed(value: int) -> bytes:
+def signed_integer(value: int) -> bytes:
     """Magnitude shifted left by the sign bit."""
-    return unsigned(abs(value) << 1 | (value < 0))
+    return unsigned_integer(abs(value) << 1 | (value < 0))
 
 
-def string(text: str) -> bytes:
+def oasis_string(text: str) -> bytes:
     """Length and characters."""
     data = text.encode()
-    return unsigned(len(data)) + data
+    return unsigned_integer(len(data)) + data
 
 
-def real(value: float) -> bytes:
+def oasis_real(value: float) -> bytes:
     """Whole numbers as such, their reciprocals as such, all others as IEEE double."""
     if value > 0 and value == round(value):
-        return b"\0" + unsigned(round(value))
+        return b"\0" + unsigned_integer(round(value))
     if 0 < value < 1 and 1 / round(1 / value) == value:
-        return b"\x02" + unsigned(round(1 / value))
+        return b"\x02" + unsigned_integer(round(1 / value))
     return b"\x07" + struct.pack("<d", value)
 
 
-def compressed(raw: bytes | memoryview, level: int) -> bytes:
+def compressed_block(raw: bytes | memoryview, level: int) -> bytes:
     """A CBLOCK record, or the bytes themselves where compression gains nothing."""
     packer = zlib.compressobj(level, zlib.DEFLATED, -15)
     packed = packer.compress(raw) + packer.flush()
-    block = bytes([CBLOCK, 0]) + unsigned(len(raw)) + unsigned(len(packed)) + packed
+    block = (
+        bytes([CBLOCK, 0])
+        + unsigned_integer(len(raw))
+        + unsigned_integer(len(packed))
+        + packed
+    )
     return block if len(block) < len(raw) else bytes(raw)
 
 
-def start(unit_nm: float) -> bytes:
+def start_record(unit_nm: float) -> bytes:
     """Magic and START: version 1.0, grid steps in a micrometre, table offsets in the
     END record.
     """
-    return MAGIC + bytes([START]) + string("1.0") + real(1e3 / unit_nm) + unsigned(1)
+    return (
+        MAGIC
+        + bytes([START])
+        + oasis_string("1.0")
+        + oasis_real(1e3 / unit_nm)
+        + unsigned_integer(1)
+    )
 
 
-def end(offsets: tuple[int, int, int, int, int, int], checksum: int) -> bytes:
+def end_record(offsets: tuple[int, int, int, int, int, int], checksum: int) -> bytes:
     """The 256 bytes of END: strict name tables (0 where there is none), padding, CRC-32
     of all before the CRC.
 
@@ -106,8 +117,12 @@ def end(offsets: tuple[int, int, int, int, int, int], checksum: int) -> bytes:
     strings, layer names, XNAMEs.
     checksum: CRC-32 of the file so far.
     """
-    head = bytes([END]) + b"".join(unsigned(1) + unsigned(offset) for offset in offsets)
+    head = bytes([END]) + b"".join(
+        unsigned_integer(1) + unsigned_integer(offset) for offset in offsets
+    )
     fill = END_SIZE - len(head) - 5
-    length = unsigned(fill - 2) if fill - 2 > 127 else b"\x80" + bytes([fill - 1])
+    length = (
+        unsigned_integer(fill - 2) if fill - 2 > 127 else b"\x80" + bytes([fill - 1])
+    )
     body = head + length + bytes(fill - len(length)) + b"\x01"
     return body + struct.pack("<I", zlib.crc32(body, checksum))

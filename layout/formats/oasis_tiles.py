@@ -5,14 +5,14 @@ looks back on, and a lens
 repeats itself from row to row. That halves the file against whole rows.
 """
 
-from layout.process import compiled
-from metalens.ground.arrays import Array
+from layout.process import compile_loop
+from metalens.core.arrays import Array
 
 TILE_COLUMNS, TILE_ROWS = 96, 512
 LARGEST_RECORD = 18  # bytes of one placement
 
 
-@compiled
+@compile_loop
 def put_unsigned(out: Array, at: int, value: int) -> int:
     """Write a variable-length integer; the position after it."""
     while value > 127:
@@ -23,12 +23,12 @@ def put_unsigned(out: Array, at: int, value: int) -> int:
     return at + 1
 
 
-@compiled
+@compile_loop
 def _put_signed(out: Array, at: int, value: int) -> int:
     return put_unsigned(out, at, (-value << 1) | 1 if value < 0 else value << 1)
 
 
-@compiled
+@compile_loop
 def encode_tile(
     tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array
 ) -> int:
@@ -68,7 +68,7 @@ def encode_tile(
     return at
 
 
-@compiled
+@compile_loop
 def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
     """Placements in their order: the first at its place, each other relative to the one
     before; bytes used.

@@ -4,7 +4,7 @@ P39, figures of CTRAPEZOID).
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 # corners of the compact trapezoids as (x, y), each a sum of w and h: "w-h" or "2h"
 _CORNERS = (
@@ -19,7 +19,7 @@ _CORNERS = (
 KINDS = len(_CORNERS)
 
 
-def compact(kind: int, w: int, h: int) -> Array:
+def compact_trapezoid(kind: int, w: int, h: int) -> Array:
     """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25."""
     value = {
         "0": 0,
@@ -36,7 +36,7 @@ def compact(kind: int, w: int, h: int) -> Array:
     )
 
 
-def needs(kind: int) -> tuple[bool, bool]:
+def required_sides(kind: int) -> tuple[bool, bool]:
     """Whether kind needs a width and a height of its own."""
     text = _CORNERS[kind]
     return "w" in text, "h" in text
@@ -57,7 +57,7 @@ def dependent_size(kind: int, w: int, h: int) -> tuple[int, int]:
     return w, h
 
 
-def sloped(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
+def slanted_trapezoid(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
     """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans."""
     if upright:
         corners = [

@@ -17,12 +17,12 @@ import numpy as np
 
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_tiles as tiles
-from layout.formats.assembly import Assembly, Copies, library_of
-from layout.formats.content import QUARTERS, CellContent, Placed, Turn
-from layout.mask import Lattice, MaskPlan
+from layout.formats.assembly import CellCopies, MaskAssembly, library_of
+from layout.formats.content import QUARTERS, CellContent, CellPlacements, Orientation
+from layout.mask import MaskPlan, PillarLattice
 from layout.process import LayerNumber
-from metalens.ground import store
-from metalens.ground.arrays import Array
+from metalens.core import store
+from metalens.core.arrays import Array
 
 _LEVEL, _FAST_LEVEL = 6, 2  # of deflate
 _LARGE = 10**8  # sites from which a lattice takes the fast level: half the time
@@ -31,7 +31,9 @@ _REPEATED = 8  # bit of a placement that says that a repetition follows
 _THREADS = 2
 
 
-def write(mask: MaskPlan | Assembly, path: str | Path, *, fold: bool = True) -> None:
+def write(
+    mask: MaskPlan | MaskAssembly, path: str | Path, *, fold: bool = True
+) -> None:
     """Write a mask as OASIS; the file appears whole or not at all.
 
     Args:
@@ -44,39 +46,46 @@ def write(mask: MaskPlan | Assembly, path: str | Path, *, fold: bool = True) -> 
     """
     library = library_of(mask, fold=fold) if isinstance(mask, MaskPlan) else mask
     number = {name: k for k, name in enumerate(library.cells)}
-    head = oasis.start(library.unit_nm)
+    head = oasis.start_record(library.unit_nm)
     layers = b"".join(
         layer_name(layer, name) for layer, name in sorted(library.layer_names.items())
     )
     checksum, written = 0, 0
-    with store.replacing(path) as part, open(part, "wb", buffering=1 << 16) as file:
+    with (
+        store.replace_atomically(path) as part,
+        open(part, "wb", buffering=1 << 16) as file,
+    ):
         for piece in itertools.chain((head, layers), _cells(library, number)):
             file.write(piece)
             checksum, written = zlib.crc32(piece, checksum), written + len(piece)
         table = b"".join(cell_name(k, name) for name, k in number.items())
         file.write(table)
         offsets = (written, 0, 0, 0, len(head) if layers else 0, 0)
-        file.write(oasis.end(offsets, zlib.crc32(table, checksum)))
+        file.write(oasis.end_record(offsets, zlib.crc32(table, checksum)))
 
 
 def cell_name(number: int, name: str) -> bytes:
     """Record of a cell's name."""
-    return bytes([oasis.CELLNAME_REF]) + oasis.string(name) + oasis.unsigned(number)
+    return (
+        bytes([oasis.CELLNAME_REF])
+        + oasis.oasis_string(name)
+        + oasis.unsigned_integer(number)
+    )
 
 
 def layer_name(layer: LayerNumber, name: str) -> bytes:
     """Record of the name of a layer and datatype."""
     exactly = b"\x03"
-    numbers = b"".join(exactly + oasis.unsigned(n) for n in layer)
-    return bytes([oasis.LAYERNAME]) + oasis.string(name) + numbers
+    numbers = b"".join(exactly + oasis.unsigned_integer(n) for n in layer)
+    return bytes([oasis.LAYERNAME]) + oasis.oasis_string(name) + numbers
 
 
-def _cells(library: Assembly, number: dict[str, int]) -> Iterator[bytes]:
+def _cells(library: MaskAssembly, number: dict[str, int]) -> Iterator[bytes]:
     for name, cell in library.cells.items():
-        yield bytes([oasis.CELL_REF]) + oasis.unsigned(number[name])
+        yield bytes([oasis.CELL_REF]) + oasis.unsigned_integer(number[name])
         for layer, polygons in cell.polygons.items():
-            shapes = b"".join(polygon(layer, points) for points in polygons)
-            yield oasis.compressed(shapes, _LEVEL)
+            shapes = b"".join(polygon_element(layer, points) for points in polygons)
+            yield oasis.compressed_block(shapes, _LEVEL)
         for layer, circles in cell.circles.items():
             yield b"".join(_circle(layer, *one) for one in circles)
         copies = library.copies.get(name, ())
@@ -86,62 +95,71 @@ def _cells(library: Assembly, number: dict[str, int]) -> Iterator[bytes]:
             yield from _pillars(library.sites[name].numbered(number))
 
 
-def polygon(layer: LayerNumber, points: Array) -> bytes:
+def polygon_element(layer: LayerNumber, points: Array) -> bytes:
     """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last
     one implied.
     """
     steps = np.diff(points.astype(np.int64), axis=0).tolist()
-    x, y = (oasis.signed(int(v)) for v in points[0])
+    x, y = (oasis.signed_integer(int(v)) for v in points[0])
     return b"".join(
         [
             bytes([oasis.POLYGON, 0b00111011]),
-            oasis.unsigned(layer[0]) + oasis.unsigned(layer[1]),
-            b"\x04" + oasis.unsigned(len(steps)),
-            *(vector(dx, dy) for dx, dy in steps),
+            oasis.unsigned_integer(layer[0]) + oasis.unsigned_integer(layer[1]),
+            b"\x04" + oasis.unsigned_integer(len(steps)),
+            *(g_delta(dx, dy) for dx, dy in steps),
             x + y,
         ]
     )
 
 
-def vector(dx: int, dy: int) -> bytes:
+def g_delta(dx: int, dy: int) -> bytes:
     """A g-delta of any direction."""
-    return oasis.unsigned(abs(dx) << 2 | (dx < 0) << 1 | 1) + oasis.signed(dy)
+    return oasis.unsigned_integer(
+        abs(dx) << 2 | (dx < 0) << 1 | 1
+    ) + oasis.signed_integer(dy)
 
 
 def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
-    numbers = b"".join(oasis.unsigned(n) for n in (*layer, radius))
-    place = oasis.signed(x) + oasis.signed(y)
+    numbers = b"".join(oasis.unsigned_integer(n) for n in (*layer, radius))
+    place = oasis.signed_integer(x) + oasis.signed_integer(y)
     return bytes([oasis.CIRCLE, 0b00111011]) + numbers + place
 
 
-def _copies(one: Copies, number: int) -> bytes:
+def _copies(one: CellCopies, number: int) -> bytes:
     """A placement, repeated where it stands for an array."""
     repeated = one.count > 1
     placed = _placement(number, one.turn, one.x, one.y, repeated=repeated)
     if not repeated:
         return placed
     if min(one.columns, one.rows) > 1:
-        sizes = oasis.unsigned(one.columns - 2) + oasis.unsigned(one.rows - 2)
-        steps = vector(*one.across) + vector(*one.up)
-        return placed + oasis.unsigned(8) + sizes + steps
+        sizes = oasis.unsigned_integer(one.columns - 2) + oasis.unsigned_integer(
+            one.rows - 2
+        )
+        steps = g_delta(*one.across) + g_delta(*one.up)
+        return placed + oasis.unsigned_integer(8) + sizes + steps
     along = one.across if one.rows == 1 else one.up
-    return placed + oasis.unsigned(9) + oasis.unsigned(one.count - 2) + vector(*along)
+    return (
+        placed
+        + oasis.unsigned_integer(9)
+        + oasis.unsigned_integer(one.count - 2)
+        + g_delta(*along)
+    )
 
 
 def _placement(
-    number: int, turn: Turn, x: int, y: int, *, repeated: bool = False
+    number: int, turn: Orientation, x: int, y: int, *, repeated: bool = False
 ) -> bytes:
     """A placement at an absolute place, in any orientation."""
     info = 0xF0 | (_REPEATED if repeated else 0)
-    place = oasis.signed(x) + oasis.signed(y)
+    place = oasis.signed_integer(x) + oasis.signed_integer(y)
     if turn in QUARTERS:
         k = QUARTERS.index(turn)
         head = bytes([oasis.PLACEMENT, info | (k & 3) << 1 | k >> 2])
-        return head + oasis.unsigned(number) + place
+        return head + oasis.unsigned_integer(number) + place
     head = bytes([oasis.PLACEMENT_ANY, info | 6 | turn.mirrored])
     double = struct.Struct("<Bd")
     size = double.pack(7, turn.scale) + double.pack(7, turn.angle_deg)
-    return head + oasis.unsigned(number) + size + place
+    return head + oasis.unsigned_integer(number) + size + place
 
 
 def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
@@ -162,7 +180,9 @@ def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
     yield from _listed(own, placed, where)
 
 
-def _listed(own: Array, placed: Placed, where: slice | Array) -> Iterator[bytes]:
+def _listed(
+    own: Array, placed: CellPlacements, where: slice | Array
+) -> Iterator[bytes]:
     columns = placed.child, placed.x, placed.y, placed.turn
     child, x, y, turn = (column[where] for column in columns)
     out = np.empty(min(len(x), _AT_ONCE) * tiles.LARGEST_RECORD + 2, np.uint8)
@@ -170,10 +190,10 @@ def _listed(own: Array, placed: Placed, where: slice | Array) -> Iterator[bytes]
         some = slice(first, first + _AT_ONCE)
         px, py, way = (column[some].astype(np.int64) for column in (x, y, turn))
         used = tiles.encode_list(own[child[some]], px, py, way, out)
-        yield oasis.compressed(out[:used].tobytes(), _LEVEL)
+        yield oasis.compressed_block(out[:used].tobytes(), _LEVEL)
 
 
-def _pillars(lattice: Lattice) -> Iterator[bytes]:
+def _pillars(lattice: PillarLattice) -> Iterator[bytes]:
     """Placements, tile by tile, of the cells that a lattice numbers from 1 on."""
 
     def jobs() -> Iterator[Callable[[], bytes]]:
@@ -193,7 +213,7 @@ def _pillars(lattice: Lattice) -> Iterator[bytes]:
 def _tile(tile: Array, steps: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
     out = np.empty(tile.size * tiles.LARGEST_RECORD, np.uint8)
     used = tiles.encode_tile(tile, *steps, x0, y0, out)
-    return oasis.compressed(out[:used].data, level) if used else b""
+    return oasis.compressed_block(out[:used].data, level) if used else b""
 
 
 def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[bytes]:

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _ROUND = 32  # corners of a full circle at a round end
 _RIGHT = 1e-9  # of the cosine of a right angle, or of a turn back
 
 
-def outline(
+def path_outline(
     points: Array,
     half_width: float,
     *,

@@ -4,8 +4,8 @@ bytes they are given.
 
 import numpy as np
 
-from layout.process import compiled
-from metalens.ground.arrays import Array
+from layout.process import compile_loop
+from metalens.core.arrays import Array
 
 FARTHEST = 2**31 - 1
 _RUN = 1 << 20
@@ -33,7 +33,7 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
     return found, child, x, y, at + count * size
 
 
-@compiled
+@compile_loop
 def _srefs(
     data: Array, at: int, size: int, out: Array, slots: Array, first: Array
 ) -> tuple[int, int]:
@@ -98,7 +98,7 @@ def _srefs(
     return out.shape[1], names
 
 
-@compiled
+@compile_loop
 def _big_endian(data: Array, at: int) -> int:
     value = 0
     for i in range(4):
@@ -106,7 +106,7 @@ def _big_endian(data: Array, at: int) -> int:
     return value - (1 << 32) if value >= 1 << 31 else value
 
 
-@compiled
+@compile_loop
 def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
     """A variable-length integer of at most 6 bytes and the position after it; -1 where
     it is cut or longer.
@@ -122,8 +122,8 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
     return 0, -1
 
 
-@compiled
-def placements(
+@compile_loop
+def scan_placements(
     data: Array, at: int, end: int, state: Array, out: Array
 ) -> tuple[int, int]:
     """OASIS placements by reference number without repetition, and switches of the
@@ -175,8 +175,8 @@ def placements(
     return at, count
 
 
-@compiled
-def deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
+@compile_loop
+def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
     """Running sums of the g-deltas of a repetition; x[0], y[0] are given.
 
     Returns:

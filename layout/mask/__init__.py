@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.mask import build as build
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from layout.mask.fields import FieldPlan as FieldPlan
     from layout.mask.plan import EXPOSED as EXPOSED
     from layout.mask.plan import UNDRAWN as UNDRAWN
-    from layout.mask.plan import Figure as Figure
-    from layout.mask.plan import Lattice as Lattice
+    from layout.mask.plan import FigureCell as FigureCell
     from layout.mask.plan import MaskPlan as MaskPlan
     from layout.mask.plan import PillarClass as PillarClass
+    from layout.mask.plan import PillarLattice as PillarLattice
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "EXPOSED": "plan",
         "FieldPlan": "fields",
-        "Figure": "plan",
-        "Lattice": "plan",
+        "FigureCell": "plan",
+        "PillarLattice": "plan",
         "MaskPlan": "plan",
         "PillarClass": "plan",
         "UNDRAWN": "plan",

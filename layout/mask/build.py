@@ -8,12 +8,12 @@ from typing import Literal
 
 from layout.mask import cells, die, dosed, shaped, tone
 from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
-from layout.pec import Solution, dose_ladder
+from layout.pec import DoseSolution, dose_ladder
 from layout.process import LayerNumber, Process, names
 from metalens.cell.shapes import Circle
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 from metalens.lens import DiameterMap, Lens
 
 UNIT_NM = 1.0
@@ -31,10 +31,10 @@ class MadePlan:
     """
 
     plan: MaskPlan
-    cells: cells.Cells
+    cells: cells.DrawnClasses
     radius_um: float
-    wanted: dosed.Wanted | None = None
-    dose: Solution | None = None
+    wanted: dosed.WantedPlan | None = None
+    dose: DoseSolution | None = None
 
 
 def plan(
@@ -58,7 +58,7 @@ def plan(
             name.
         LensError: invalid diameters.
     """
-    return prepare(
+    return prepare_mask(
         source,
         process,
         name=name,
@@ -67,7 +67,7 @@ def plan(
     ).plan
 
 
-def prepare(
+def prepare_mask(
     source: Lens | DiameterMap,
     process: Process,
     *,
@@ -78,7 +78,9 @@ def prepare(
     """As :func:`plan`, with everything that a report needs; ``with_doses``: with the
     correction of the process.
     """
-    made = draw(source, process, name=name, furniture=furniture, with_doses=with_doses)
+    made = draw_mask(
+        source, process, name=name, furniture=furniture, with_doses=with_doses
+    )
     return assign_doses([made], process)[0]
 
 
@@ -94,14 +96,14 @@ def assign_doses(made: Sequence[MadePlan], process: Process) -> list[MadePlan]:
     steps = dose_ladder(ranges, process.exposure) if ranges else None
     for one in made:
         if one.wanted is not None and steps is not None:
-            plan, dose = dosed.corrected(one.wanted, process, *steps)
+            plan, dose = dosed.apply_dose_classes(one.wanted, process, *steps)
             one = dataclasses.replace(one, plan=plan, dose=dose)
         _check_layers(one.plan, process)
         found.append(one)
     return found
 
 
-def draw(
+def draw_mask(
     source: Lens | DiameterMap,
     process: Process,
     *,
@@ -109,8 +111,8 @@ def draw(
     furniture: Furniture = "die",
     with_doses: bool = True,
 ) -> MadePlan:
-    """As :func:`prepare`, before the doses are rounded to classes."""
-    names.check(name)
+    """As :func:`prepare_mask`, before the doses are rounded to classes."""
+    names.check_cell_name(name)
     diameters = source.diameters if isinstance(source, Lens) else source
     steps = (
         pitch_units(diameters.steps_um[0], process),
@@ -136,16 +138,16 @@ def draw(
     )
     radius_um = diameters.radius_um + diameters.pitch_um / 2
     if furniture == "die":
-        bare = die.furnish(
+        bare = die.add_die_frame(
             bare, process, radius_um=radius_um, label=_label(source, radius_um)
         )
     elif furniture == "aperture":
-        bare = die.opened(bare, process, radius_um=radius_um)
+        bare = die.open_aperture(bare, process, radius_um=radius_um)
     if process.tone == "negative":
-        bare = tone.inverted(bare, process)
+        bare = tone.reverse_tone(bare, process)
     wanted = None
     if with_doses and process.exposure.corrected:
-        wanted = dosed.want(bare, process)
+        wanted = dosed.solve_wanted_doses(bare, process)
     return MadePlan(bare, found, radius_um, wanted)
 
 
@@ -156,7 +158,7 @@ def _word(source: Lens | DiameterMap) -> str:
     )
 
 
-def surroundings(
+def die_surroundings(
     source: Lens | DiameterMap,
     process: Process,
     *,
@@ -176,8 +178,10 @@ def surroundings(
     own = dataclasses.replace(
         process, die=dataclasses.replace(process.die, size_um=size_um, label=label)
     )
-    made = draw(source, own, name=name, furniture="none", with_doses=False)
-    whole = die.furnish(made.plan, own, radius_um=clear_um, label=label, around=True)
+    made = draw_mask(source, own, name=name, furniture="none", with_doses=False)
+    whole = die.add_die_frame(
+        made.plan, own, radius_um=clear_um, label=label, around=True
+    )
     figures = [f for f in whole.figures if f.name != "APERTURE"]
     aperture = next(f for f in whole.figures if f.name == "APERTURE")
     openings = {
@@ -203,26 +207,28 @@ def wafer_mark(
     Raises:
         ProcessError: as :func:`plan`.
     """
-    made = draw(source, process, name=name, furniture="none", with_doses=False)
+    made = draw_mask(source, process, name=name, furniture="none", with_doses=False)
     bare = die.wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
     return _wanting(bare, made, process)
 
 
 def _wanting(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
     """A plan without its lens, with the doses that it wants where the process asks."""
-    wanted = dosed.want(bare, process) if process.exposure.corrected else None
+    wanted = (
+        dosed.solve_wanted_doses(bare, process) if process.exposure.corrected else None
+    )
     return MadePlan(bare, made.cells, made.radius_um, wanted)
 
 
 def _drawn(
     source: Lens | DiameterMap, process: Process
-) -> tuple[cells.Cells, tuple[PillarClass, ...]]:
+) -> tuple[cells.DrawnClasses, tuple[PillarClass, ...]]:
     """The pillars as classes, and what is drawn for each."""
     if isinstance(source, Lens):
         disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
         if source.diameters.angle_rad is not None or not disc:
-            return shaped.classes(source, process, unit_nm=UNIT_NM)
-    found = cells.quantise(
+            return shaped.shape_classes(source, process, unit_nm=UNIT_NM)
+    found = cells.quantise_diameters(
         source.diameters if isinstance(source, Lens) else source, process
     )
     return found, _plain_classes(found.diameters_nm, process)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.held import Held, hold
+from layout.mask.held import ScratchArray, hold_on_disk
 from layout.mask.plan import MOST_CLASSES
 from layout.process import Process, isolation
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError, ProcessError
-from metalens.ground.units import nm
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError, ProcessError
+from metalens.core.units import nm
 from metalens.lens import DiameterMap
 
 _FINE = 16  # table entries for one nanometre of designed diameter
@@ -20,7 +20,7 @@ _BLOCK_SITES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cells:
+class DrawnClasses:
     """Quantised drawn pillars.
 
     sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
@@ -29,7 +29,7 @@ class Cells:
     and drawn diameter.
     """
 
-    sites: Held
+    sites: ScratchArray
     diameters_nm: Array
     counts: Array
     rounding_nm: float
@@ -40,7 +40,7 @@ class Cells:
         return self.sites.whole()
 
 
-def quantise(diameters: DiameterMap, process: Process) -> Cells:
+def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses:
     """Drawn diameters (bias taken off) rounded to the diameter step of the process, as
     classes; blocks of rows.
 
@@ -58,7 +58,7 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
             counts[: len(found)] += found
             yield first, block
 
-    drawn = hold(diameters.diameter_um.shape, np.dtype(np.uint16), counted())
+    drawn = hold_on_disk(diameters.diameter_um.shape, np.dtype(np.uint16), counted())
     if counts[1:].sum() == 0:
         raise LensError("empty lens: the map holds no pillar; check the aperture")
     used = np.flatnonzero(counts)
@@ -73,8 +73,11 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
         (first, lookup.take(block)) for first, block in drawn.blocks(_BLOCK_SITES)
     )
     step = process.rules.diameter_step_nm
-    return Cells(
-        hold(drawn.shape, lookup.dtype, blocks), used * step, counts[used], step / 2
+    return DrawnClasses(
+        hold_on_disk(drawn.shape, lookup.dtype, blocks),
+        used * step,
+        counts[used],
+        step / 2,
     )
 
 
@@ -112,7 +115,9 @@ def with_isolation(
     """
     design, bias = diameters.diameter_um, process.bias
     reach = (
-        isolation.halo(diameters.steps_um[1], bias.range_um) if bias.isolated_nm else 0
+        isolation.isolation_halo(diameters.steps_um[1], bias.range_um)
+        if bias.isolated_nm
+        else 0
     )
     size = max(1, sites // max(1, design.shape[1]), 4 * reach)
     for first in range(0, design.shape[0], size):
@@ -122,7 +127,7 @@ def with_isolation(
         alone = None
         if reach:
             lattice = diameters.lattice.centred
-            alone = isolation.isolation(
+            alone = isolation.isolation_map(
                 around > 0, diameters.steps_um, bias.range_um, centred=lattice
             )[here]
         yield first, around[here], alone

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from layout.mask import font, marks
-from layout.mask.marks import CLEAR_UM, Box, Units
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, Role
+from layout.mask.marks import CLEAR_UM, DatabaseUnits, MarkBox
+from layout.mask.plan import FigureCell, MaskPlan, PillarClass, PillarLattice, Role
 from layout.process import Process
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 DOSES = tuple(
     0.8 + 0.05 * k for k in range(9)
@@ -33,7 +33,7 @@ _TESTED, _WITNESSED = (
 _ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
 
 
-def furnish(
+def add_die_frame(
     plan: MaskPlan,
     process: Process,
     *,
@@ -53,11 +53,11 @@ def furnish(
             which would lie on each other, or
             the label cannot be drawn.
     """
-    unit = Units(plan)
+    unit = DatabaseUnits(plan)
     die = _outline(process, unit, radius_um)
     classes, lattices, windows = _tests(plan, process, unit, radius_um, die)
-    crosses, mark_windows = marks.crosses(process, unit, die)
-    scales = marks.scales(process, unit, die)
+    crosses, mark_windows = marks.alignment_crosses(process, unit, die)
+    scales = marks.vernier_scales(process, unit, die)
     words, label_window = _label(process, unit, die, label)
     _refuse_overlaps(
         {
@@ -65,7 +65,7 @@ def furnish(
             "WITNESS": windows[1:],
             "MARKS": mark_windows,
             "VERNIERS": [
-                marks.around(shape) for shape in (*scales.drawn, *scales.openings)
+                marks.bounding_box(shape) for shape in (*scales.drawn, *scales.openings)
             ],
             "LABEL": [label_window],
         },
@@ -73,18 +73,22 @@ def furnish(
         unit,
         die,
     )
-    openings = [disc(radius_um * unit.per_um, plan.axis, plan.grid)]
+    openings = [disc_polygon(radius_um * unit.per_um, plan.axis, plan.grid)]
     openings += [
         unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)
     ]
     openings += scales.openings
     layers = process.layers
     figures = (
-        Figure("APERTURE", {layers.aperture: tuple(openings)}),
-        Figure("MARKS", {layers.marks: crosses}),
-        *([Figure("VERNIERS", {layers.marks: scales.drawn})] if scales.drawn else []),
-        Figure("LABEL", {layers.labels: words}),
-        Figure("OUTLINE", {layers.outline: (die.polygon,)}),
+        FigureCell("APERTURE", {layers.aperture: tuple(openings)}),
+        FigureCell("MARKS", {layers.marks: crosses}),
+        *(
+            [FigureCell("VERNIERS", {layers.marks: scales.drawn})]
+            if scales.drawn
+            else []
+        ),
+        FigureCell("LABEL", {layers.labels: words}),
+        FigureCell("OUTLINE", {layers.outline: (die.polygon,)}),
     )
     return plan.replace(
         classes=(*plan.classes, *classes),
@@ -99,11 +103,12 @@ def furnish(
     )
 
 
-def opened(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
+def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
     """``plan`` (the lens alone) with the opening of its aperture and nothing else."""
-    layer, unit = process.layers.aperture, Units(plan)
-    figure = Figure(
-        "APERTURE", {layer: (disc(radius_um * unit.per_um, plan.axis, plan.grid),)}
+    layer, unit = process.layers.aperture, DatabaseUnits(plan)
+    figure = FigureCell(
+        "APERTURE",
+        {layer: (disc_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
     )
     return plan.replace(
         figures=(*plan.figures, figure),
@@ -120,7 +125,7 @@ def wafer_mark(
 
     plan: of a lens, whose pillars the witness cells repeat.
     """
-    unit, layers = Units(plan), process.layers
+    unit, layers = DatabaseUnits(plan), process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
     some = [
         _variant(made, "witness", f"W{n}", layers.witness, 1.0)
@@ -134,11 +139,11 @@ def wafer_mark(
     lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
     half = unit(mark_um / 2)
     window = unit.snapped(
-        Box(-half, -half, half, half).grown(unit(CLEAR_UM / 2))
+        MarkBox(-half, -half, half, half).grown(unit(CLEAR_UM / 2))
     ).polygon
     figures = (
-        Figure("APERTURE", {layers.aperture: (window,)}),
-        Figure("MARKS", {layers.marks: marks.wafer_cross(unit, mark_um, width_um)}),
+        FigureCell("APERTURE", {layers.aperture: (window,)}),
+        FigureCell("MARKS", {layers.marks: marks.wafer_cross(unit, mark_um, width_um)}),
     )
     names = {
         layers.aperture: "aperture",
@@ -154,7 +159,7 @@ def wafer_mark(
     )
 
 
-def disc(radius: float, centre: tuple[float, float], grid: int) -> Array:
+def disc_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
     """Polygon of the area of a circle whose edges stay within half a grid step of it,
     at most 8000 vertices.
     """
@@ -165,16 +170,20 @@ def disc(radius: float, centre: tuple[float, float], grid: int) -> Array:
     return np.asarray(np.rint(points / grid) * grid, np.int64)
 
 
-def _outline(process: Process, unit: Units, radius_um: float) -> Box:
+def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
     die = process.die
     size = die.size_um or (2 * (radius_um + die.margin_um),) * 2
     half_x, half_y = unit(size[0] / 2), unit(size[1] / 2)
-    return Box(-half_x, -half_y, half_x, half_y)
+    return MarkBox(-half_x, -half_y, half_x, half_y)
 
 
 def _tests(
-    plan: MaskPlan, process: Process, unit: Units, radius_um: float, die: Box
-) -> tuple[list[PillarClass], list[Lattice], list[Box]]:
+    plan: MaskPlan,
+    process: Process,
+    unit: DatabaseUnits,
+    radius_um: float,
+    die: MarkBox,
+) -> tuple[list[PillarClass], list[PillarLattice], list[MarkBox]]:
     """Dose array left of the lens, witness cells right of it: classes, lattices,
     openings.
     """
@@ -238,10 +247,10 @@ def _tests(
 
 
 def _refuse_overlaps(
-    boxes: dict[str, list[Box]],
+    boxes: dict[str, list[MarkBox]],
     aperture: tuple[tuple[float, float], float],
-    unit: Units,
-    die: Box,
+    unit: DatabaseUnits,
+    die: MarkBox,
 ) -> None:
     """Raises: ProcessError: a structure stands on another one or on the aperture, by
     name.
@@ -303,7 +312,7 @@ def _spread(sizes: Sequence[PillarClass], count: int) -> list[PillarClass]:
     return [sizes[i] for i in picked]
 
 
-def _blocks(numbers: Array, side: int, lattice: Lattice) -> Array:
+def _blocks(numbers: Array, side: int, lattice: PillarLattice) -> Array:
     """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with
     spaces between, on a lattice.
     """
@@ -321,28 +330,28 @@ def _blocks(numbers: Array, side: int, lattice: Lattice) -> Array:
     return sites
 
 
-def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> Lattice:
+def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarLattice:
     """Sites about (x, 0), as far apart as those of the lens."""
     (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
     left, top = x - (columns - 1) * like.pitch // 2, (rows - 1) * like.down // 2
-    made = Lattice.of(
+    made = PillarLattice.of(
         name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid
     )
     return dataclasses.replace(made, row_pitch=like.row_pitch, centred=like.centred)
 
 
-def _extent(lattice: Lattice) -> Box:
+def _extent(lattice: PillarLattice) -> MarkBox:
     right, bottom = (
         (lattice.columns - 1) * lattice.pitch,
         (lattice.rows - 1) * lattice.down,
     )
-    box = Box(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
+    box = MarkBox(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
     return box.grown(max(lattice.constant, lattice.down) // 2)
 
 
 def _label(
-    process: Process, unit: Units, die: Box, default: str
-) -> tuple[tuple[Array, ...], Box]:
+    process: Process, unit: DatabaseUnits, die: MarkBox, default: str
+) -> tuple[tuple[Array, ...], MarkBox]:
     """Along the lower edge, between the crosses; letters as large as fit, 35 um high at
     most.
     """
@@ -355,10 +364,10 @@ def _label(
         raise ProcessError(
             f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um"
         )
-    long = font.width(words, square)
+    long = font.text_width(words, square)
     x, y = -(long // 2) // unit.grid * unit.grid, die.bottom + inset
-    box = Box(x, y, x + long, y + 7 * square).grown(unit(CLEAR_UM / 2))
-    return font.text(words, x=x, y=y, square=square), box
+    box = MarkBox(x, y, x + long, y + 7 * square).grown(unit(CLEAR_UM / 2))
+    return font.text_rectangles(words, x=x, y=y, square=square), box
 
 
 def _layer_names(

@@ -8,32 +8,40 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.held import hold
-from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
-from layout.pec import Discs, DoseLadder, Drawn, Outlines, PillarArray, Rects, Solution
+from layout.mask.held import hold_on_disk
+from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarClass, PillarLattice
+from layout.pec import (
+    DoseLadder,
+    DoseSolution,
+    DrawnDiscs,
+    DrawnKinds,
+    DrawnOutlines,
+    ExposedRectangles,
+    PillarArray,
+)
 from layout.pec import correct as dose
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
-from metalens.ground.arrays import Array
-from metalens.ground.units import nm
+from metalens.core.arrays import Array
+from metalens.core.units import nm
 
 _BLOCK_SITES = 1 << 22
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Wanted:
+class WantedPlan:
     """A plan and the doses that it wants.
 
     boxes: (n, 4) pieces of its figures; of: (n, 2) figure and layer number of each.
     """
 
     plan: MaskPlan
-    doses: dose.Wanted
+    doses: dose.WantedDoses
     boxes: Array
     of: Array
 
 
-def want(plan: MaskPlan, process: Process) -> Wanted:
+def solve_wanted_doses(plan: MaskPlan, process: Process) -> WantedPlan:
     """The doses that everything on a plan needs, before they are rounded to classes.
 
     Raises:
@@ -44,14 +52,16 @@ def want(plan: MaskPlan, process: Process) -> Wanted:
     parts = [_body(lattice, unit) for lattice in plan.lattices]
     goals = np.array([1.0, *(made.goal for made in plan.classes)])
     boxes, of, group = _pieces(plan, parts, process)
-    cut = Rects(boxes * unit, group, np.ones(len(boxes)))
-    found = dose.solve(parts, _drawn(plan, unit), goals, process.exposure, cut=cut)
-    return Wanted(plan, found, boxes, of)
+    cut = ExposedRectangles(boxes * unit, group, np.ones(len(boxes)))
+    found = dose.solve_doses(
+        parts, _drawn(plan, unit), goals, process.exposure, cut=cut
+    )
+    return WantedPlan(plan, found, boxes, of)
 
 
-def corrected(
-    wanted: Wanted, process: Process, ladder: DoseLadder, needed: int
-) -> tuple[MaskPlan, Solution]:
+def apply_dose_classes(
+    wanted: WantedPlan, process: Process, ladder: DoseLadder, needed: int
+) -> tuple[MaskPlan, DoseSolution]:
     """The plan with corrected doses: classes of diameter and dose, marks and labels in
     pieces of one dose each.
 
@@ -85,18 +95,22 @@ def corrected(
     )
 
 
-def _body(lattice: Lattice, unit: float) -> PillarArray:
+def _body(lattice: PillarLattice, unit: float) -> PillarArray:
     """Sites in um."""
     place = lattice.pitch * unit, lattice.x0 * unit, lattice.y0 * unit
     rows = lattice.row_pitch * unit, lattice.centred
     return PillarArray(lattice.rows, lattice.columns, *place, lattice.source, *rows)
 
 
-def _drawn(plan: MaskPlan, unit: float) -> Drawn:
+def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
     """The classes as discs where all stand for one, else as polygons."""
     if all(made.round for made in plan.classes):
-        return Discs(np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)]))
-    return Outlines([(), *([c * unit for c in made.contours] for made in plan.classes)])
+        return DrawnDiscs(
+            np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
+        )
+    return DrawnOutlines(
+        [(), *([c * unit for c in made.contours] for made in plan.classes)]
+    )
 
 
 def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
@@ -121,10 +135,10 @@ def _name(plan: MaskPlan, layer: LayerNumber, level: float) -> str:
         (name for (number, _), name in plan.layer_names.items() if number == layer[0]),
         "shape",
     )
-    return title(kind, level)
+    return layer_title(kind, level)
 
 
-def title(kind: str, level: float) -> str:
+def layer_title(kind: str, level: float) -> str:
     """Name of a layer that says its relative dose."""
     return f"{kind}_dose_{level:.4f}"
 
@@ -145,14 +159,14 @@ def _pieces(
         if figure.name not in EXPOSED:
             continue
         for m, polygons in enumerate(figure.polygons.values()):
-            boxes = np.concatenate([rectilinear.rectangles(p) for p in polygons])
+            boxes = np.concatenate([rectilinear.split_rectilinear(p) for p in polygons])
             whole.append(boxes)
             of.append(np.tile([f, m], (len(boxes), 1)))
             group.append(shapes + _touching(boxes))
             shapes = int(group[-1].max()) + 1
     every = np.concatenate(whole)
     step_um = plan.grid * plan.unit_nm * nm
-    made, box = dose.pieces(
+    made, box = dose.fracture_by_surroundings(
         every // plan.grid, parts, process.exposure, step_um=step_um
     )
     return made * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
@@ -185,7 +199,7 @@ def _touching(boxes: Array) -> Array:
 
 
 def _classes(
-    plan: MaskPlan, found: Solution, process: Process
+    plan: MaskPlan, found: DoseSolution, process: Process
 ) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
     """Classes of diameter and dose, (old class, dose) -> new class number, and names of
     their layers.
@@ -211,14 +225,16 @@ def _classes(
         old = plan.classes[k - 1]
         kind, level = old.role, float(found.ladder.factors[j])
         layer = (bases[kind][0], bases[kind][1] + number[kind][j])
-        names[layer] = title({"dose": "dose_test"}.get(kind, kind), level)
+        names[layer] = layer_title({"dose": "dose_test"}.get(kind, kind), level)
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
         made.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
         lookup[k, j] = n
     return tuple(made), lookup, names
 
 
-def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> Lattice:
+def _redrawn(
+    lattice: PillarLattice, number: int, found: DoseSolution, lookup: Array
+) -> PillarLattice:
     """A lattice with the classes of diameter and dose, in blocks of rows."""
 
     def blocks() -> Iterator[tuple[int, Array]]:
@@ -227,7 +243,7 @@ def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> L
             whole = np.ascontiguousarray(block)
             yield first, lookup[whole, found.classes(number, first, whole)]
 
-    kept = hold((lattice.rows, lattice.columns), lookup.dtype, blocks())
+    kept = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
     made = kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
     return dataclasses.replace(
         made, row_pitch=lattice.row_pitch, centred=lattice.centred
@@ -235,8 +251,8 @@ def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> L
 
 
 def _figures(
-    plan: MaskPlan, found: Solution, cut: tuple[Array, Array]
-) -> tuple[tuple[Figure, ...], Mapping[LayerNumber, float]]:
+    plan: MaskPlan, found: DoseSolution, cut: tuple[Array, Array]
+) -> tuple[tuple[FigureCell, ...], Mapping[LayerNumber, float]]:
     """The exposed figures in pieces, each on the datatype of its dose, and the doses of
     these.
     """
@@ -257,7 +273,7 @@ def _figures(
                 some = boxes[mine & (found.rect_class == j)]
                 if len(some):
                     own = (layer[0], layer[1] + n)
-                    shapes[own] = tuple(rectilinear.corners(box) for box in some)
+                    shapes[own] = tuple(rectilinear.box_corners(box) for box in some)
                     doses[own] = float(found.ladder.factors[j])
         figures[f] = dataclasses.replace(figure, polygons=shapes)
     return tuple(figures), doses

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from layout.mask.fields import FieldPlan
-from layout.mask.plan import Figure, MaskPlan
+from layout.mask.plan import FigureCell, MaskPlan
 from layout.process import Process
 
 
@@ -28,7 +28,7 @@ def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
         )
     )
     layer = process.layers.fields
-    figure = Figure("FIELDS", {layer: boxes})
+    figure = FigureCell("FIELDS", {layer: boxes})
     return plan.replace(
         figures=(*plan.figures, figure),
         layer_names={**plan.layer_names, layer: "fields"},

@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from layout.mask.cells import Cells, quantise
+from layout.mask.cells import DrawnClasses, quantise_diameters
 from layout.process import Process, WriteField
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 from metalens.lens import DiameterMap
 
 _BLOCK_SITES = 1 << 20
@@ -87,8 +87,8 @@ class FieldPlan:
         return [(row, column) for row in spans[0] for column in spans[1]]
 
 
-def split(
-    diameters: DiameterMap, process: Process, *, drawn: Cells | None = None
+def split_write_fields(
+    diameters: DiameterMap, process: Process, *, drawn: DrawnClasses | None = None
 ) -> FieldPlan:
     """Fields for the pillars as they are drawn (bias taken off), found in blocks of
     rows.
@@ -98,7 +98,7 @@ def split(
 
     Raises:
         ProcessError: a field smaller than the pitch; as
-            :func:`layout.mask.cells.quantise`.
+            :func:`layout.mask.cells.quantise_diameters`.
     """
     settings, (pitch, down) = process.write_field, diameters.steps_um
     across, sites = (int(settings.size_um / step + 1e-9) for step in (pitch, down))
@@ -106,7 +106,7 @@ def split(
         raise ProcessError(
             f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it"
         )
-    made = quantise(diameters, process) if drawn is None else drawn
+    made = quantise_diameters(diameters, process) if drawn is None else drawn
     seen = _Seen.of(diameters, made, settings.size_um)
     rows, columns = (
         _edges(settings, seen.rows, sites),
@@ -140,7 +140,7 @@ class _Seen:
     cut: int = 0
 
     @classmethod
-    def of(cls, diameters: DiameterMap, made: Cells, size_um: float) -> "_Seen":
+    def of(cls, diameters: DiameterMap, made: DrawnClasses, size_um: float) -> "_Seen":
         """In one pass over the classes."""
         shape, table = made.sites.shape, np.r_[0.0, made.diameters_nm * nm]
         found = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
@@ -158,7 +158,7 @@ class _Seen:
         return found
 
 
-def _counted(made: Cells, rows: Array, columns: Array) -> Array:
+def _counted(made: DrawnClasses, rows: Array, columns: Array) -> Array:
     """(y fields, x fields) pillars in each field."""
     down, across = (
         np.clip(rows, 0, made.sites.shape[0]).tolist(),

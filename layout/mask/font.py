@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from layout.shapes import rectilinear
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 # seven rows from top to bottom, five bits each, leftmost highest, as two hexadecimal
 # digits a row
@@ -33,7 +33,7 @@ _GLYPHS = {
 }  # fmt: skip
 
 
-def text(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
+def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
     """Rectangles of a line of text, small letters as capitals.
 
     Args:
@@ -46,7 +46,7 @@ def text(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
     return tuple(_rectangles(words, x, y, square))
 
 
-def width(words: str, square: int) -> int:
+def text_width(words: str, square: int) -> int:
     """Length of the line."""
     return max(len(words) * 6 - 1, 0) * square
 
@@ -76,7 +76,7 @@ def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
 
 
 def _box(left: int, bottom: int, wide: int, high: int) -> Array:
-    return rectilinear.corners(np.array([left, bottom, left + wide, bottom + high]))
+    return rectilinear.box_corners(np.array([left, bottom, left + wide, bottom + high]))
 
 
 def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask.plan import Lattice, RowSource
-from metalens.ground.arrays import Array
+from layout.mask.plan import PillarLattice, RowSource
+from metalens.core.arrays import Array
 
 MOST_BYTES = 1 << 27  # kept in memory
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Held:
+class ScratchArray:
     """(rows, columns) class numbers; ``source`` gives blocks of rows, ``array`` all,
     where they are in memory.
     """
@@ -38,26 +38,26 @@ class Held:
 
     def lattice(
         self, name: str, *, pitch: int, x0: int, y0: int, upside_down: bool = False
-    ) -> Lattice:
+    ) -> PillarLattice:
         """As a lattice of the mask; ``upside_down``: the last row on top."""
         rows, columns = self.shape
         if self.array is not None:
             array = (
                 np.ascontiguousarray(self.array[::-1]) if upside_down else self.array
             )
-            return Lattice.of(name, array, pitch=pitch, x0=x0, y0=y0)
+            return PillarLattice.of(name, array, pitch=pitch, x0=x0, y0=y0)
 
         def turned(first: int, end: int) -> Array:
             return np.ascontiguousarray(self.source(rows - end, rows - first)[::-1])
 
-        return Lattice(
+        return PillarLattice(
             name, rows, columns, pitch, x0, y0, turned if upside_down else self.source
         )
 
 
-def hold(
+def hold_on_disk(
     shape: tuple[int, ...], dtype: "np.dtype[Any]", blocks: Iterable[tuple[int, Array]]
-) -> Held:
+) -> ScratchArray:
     """Keep blocks of rows (first row, class numbers), which together are all of them.
 
     Beyond 128 MB they go to a nameless file in the folder for temporary files
@@ -68,7 +68,7 @@ def hold(
         array = np.empty((rows, columns), dtype)
         for first, block in blocks:
             array[first : first + len(block)] = block
-        return Held((rows, columns), lambda first, end: array[first:end], array)
+        return ScratchArray((rows, columns), lambda first, end: array[first:end], array)
     scratch, line = tempfile.TemporaryFile(), columns * dtype.itemsize  # noqa: SIM115 - closed with its last reader
     for first, block in blocks:
         _write_at(scratch.fileno(), np.ascontiguousarray(block, dtype), first * line)
@@ -78,7 +78,7 @@ def hold(
         _read_at(scratch.fileno(), out, first * line)
         return out
 
-    return Held((rows, columns), read, None)
+    return ScratchArray((rows, columns), read, None)
 
 
 def _write_at(file: int, block: Array, at: int) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 
 from layout.mask.plan import MaskPlan
 from layout.process import Process
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 CLEAR_UM = 10.0  # between the structures on the die, and of the openings around them
 BARS = 10  # of a vernier on each side of the middle one
@@ -30,7 +30,7 @@ _FINE = 5  # a fine cross has a fifth of the arms and of the width of a coarse o
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class MarkBox:
     """A rectangle in database units."""
 
     left: int
@@ -50,22 +50,22 @@ class Box:
             ]
         )
 
-    def grown(self, by: int) -> "Box":
+    def grown(self, by: int) -> "MarkBox":
         """A rectangle that is larger by ``by`` on each side."""
-        return Box(self.left - by, self.bottom - by, self.right + by, self.top + by)
+        return MarkBox(self.left - by, self.bottom - by, self.right + by, self.top + by)
 
-    def meets(self, other: "Box") -> bool:
+    def meets(self, other: "MarkBox") -> bool:
         """Whether both have more than their edges in common."""
         across = self.left < other.right and other.left < self.right
         return across and self.bottom < other.top and other.bottom < self.top
 
 
-def around(polygon: Array) -> Box:
+def bounding_box(polygon: Array) -> MarkBox:
     """The box around a polygon."""
-    return Box(*(int(v) for v in (*polygon.min(0), *polygon.max(0))))
+    return MarkBox(*(int(v) for v in (*polygon.min(0), *polygon.max(0))))
 
 
-class Units:
+class DatabaseUnits:
     """From micrometres to database units on the grid."""
 
     def __init__(self, plan: MaskPlan) -> None:
@@ -78,10 +78,10 @@ class Units:
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid
 
-    def snapped(self, box: Box) -> Box:
+    def snapped(self, box: MarkBox) -> MarkBox:
         """The box on the grid, no smaller."""
         g = self.grid
-        return Box(
+        return MarkBox(
             box.left // g * g,
             box.bottom // g * g,
             -(-box.right // g) * g,
@@ -90,16 +90,16 @@ class Units:
 
 
 @dataclass(frozen=True, slots=True)
-class Scales:
+class VernierScales:
     """Verniers and boxes: drawn with the pillars, opened with the aperture."""
 
     drawn: tuple[Array, ...]
     openings: tuple[Array, ...]
 
 
-def crosses(
-    process: Process, unit: Units, die: Box
-) -> tuple[tuple[Array, ...], list[Box]]:
+def alignment_crosses(
+    process: Process, unit: DatabaseUnits, die: MarkBox
+) -> tuple[tuple[Array, ...], list[MarkBox]]:
     """A cross in each corner, a fine one beside it, and beside the upper left an F,
     unlike all its turns and mirrors.
 
@@ -117,24 +117,24 @@ def crosses(
         x, y = sx * (die.right - inset), sy * (die.top - inset)
         away = y - sy * (arm + unit(CLEAR_UM) + fine)
         for at, reach, half in (((x, y), arm, width), ((x, away), fine, thin)):
-            shapes.append(cross(*at, reach, half))
+            shapes.append(cross_polygon(*at, reach, half))
             boxes.append(
-                Box(at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach).grown(
-                    unit(CLEAR_UM / 2)
-                )
+                MarkBox(
+                    at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach
+                ).grown(unit(CLEAR_UM / 2))
             )
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
     left, bottom = die.left + inset + arm + unit(CLEAR_UM), die.top - inset - arm
     shapes.append(_letter_f(left, bottom, square))
     boxes.append(
-        Box(left, bottom, left + 5 * square, bottom + 7 * square).grown(
+        MarkBox(left, bottom, left + 5 * square, bottom + 7 * square).grown(
             unit(CLEAR_UM / 2)
         )
     )
     return tuple(shapes), boxes
 
 
-def cross(x: int, y: int, arm: int, half: int) -> Array:
+def cross_polygon(x: int, y: int, arm: int, half: int) -> Array:
     """(12, 2) corners of a cross at (x, y): arms of length ``arm`` from its middle,
     twice ``half`` wide.
     """
@@ -156,7 +156,9 @@ def cross(x: int, y: int, arm: int, half: int) -> Array:
     return np.add(corners, (x, y))
 
 
-def wafer_cross(unit: Units, mark_um: float, width_um: float) -> tuple[Array, ...]:
+def wafer_cross(
+    unit: DatabaseUnits, mark_um: float, width_um: float
+) -> tuple[Array, ...]:
     """Four bars for the coarse alignment about (0, 0), and a fine cross in the middle
     that they leave free.
     """
@@ -167,14 +169,16 @@ def wafer_cross(unit: Units, mark_um: float, width_um: float) -> tuple[Array, ..
     bars = [upright]
     for _ in range(3):
         bars.append(bars[-1] @ turn)
-    return (*bars, cross(0, 0, inner // 2, thin))
+    return (*bars, cross_polygon(0, 0, inner // 2, thin))
 
 
-def _thin(half: int, unit: Units) -> int:
+def _thin(half: int, unit: DatabaseUnits) -> int:
     return max(unit.grid, half // _FINE // unit.grid * unit.grid)
 
 
-def scales(process: Process, unit: Units, die: Box) -> Scales:
+def vernier_scales(
+    process: Process, unit: DatabaseUnits, die: MarkBox
+) -> VernierScales:
     """Verniers along x and y and a box in a box, from the upper right cross to the
     left; none where none are wanted.
 
@@ -183,7 +187,7 @@ def scales(process: Process, unit: Units, die: Box) -> Scales:
             below the grid.
     """
     if not process.die.verniers:
-        return Scales((), ())
+        return VernierScales((), ())
     pitch, step = (
         unit(process.die.vernier_pitch_um),
         unit(process.die.vernier_step_nm * 1e-3),
@@ -218,12 +222,14 @@ def scales(process: Process, unit: Units, die: Box) -> Scales:
         openings += [_placed(bar, at, turned) for bar in two]
     x, y = middle
     half = unit(_INNER_UM / 2)
-    drawn.append(Box(x - half, y - half, x + half, y + half).polygon)
-    openings.append(Box(x - outer, y - outer, x + outer, y + outer).polygon)
-    return Scales(tuple(drawn), tuple(openings))
+    drawn.append(MarkBox(x - half, y - half, x + half, y + half).polygon)
+    openings.append(MarkBox(x - outer, y - outer, x + outer, y + outer).polygon)
+    return VernierScales(tuple(drawn), tuple(openings))
 
 
-def _vernier(unit: Units, pitch: int, step: int) -> tuple[list[Array], list[Array]]:
+def _vernier(
+    unit: DatabaseUnits, pitch: int, step: int
+) -> tuple[list[Array], list[Array]]:
     """Bars about (0, 0): drawn ones above, within a window of the film; openings of the
     film below.
     """
@@ -232,21 +238,21 @@ def _vernier(unit: Units, pitch: int, step: int) -> tuple[list[Array], list[Arra
         unit(_GAP_UM),
     )
     drawn = [
-        Box(x - half, gap, x + half, gap + long).polygon
+        MarkBox(x - half, gap, x + half, gap + long).polygon
         for x, long in _bars(unit, pitch)
     ]
     opened = [
-        Box(x - half, -gap - long, x + half, -gap).polygon
+        MarkBox(x - half, -gap - long, x + half, -gap).polygon
         for x, long in _bars(unit, pitch + step)
     ]
     reach = BARS * pitch + pitch // 2
     return drawn, [
         *opened,
-        unit.snapped(Box(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon,
+        unit.snapped(MarkBox(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon,
     ]
 
 
-def _bars(unit: Units, pitch: int) -> Iterator[tuple[int, int]]:
+def _bars(unit: DatabaseUnits, pitch: int) -> Iterator[tuple[int, int]]:
     """(middle, length) of the bars, from the left."""
     for n in range(-BARS, BARS + 1):
         yield n * pitch, unit(_BAR_UM if n else _LONG_UM)

@@ -22,8 +22,8 @@ import numpy as np
 
 from layout.process import LayerNumber, names
 from layout.shapes import polygon
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 MOST_CLASSES = 65535
 Role = Literal["pillar", "dose", "witness"]
@@ -86,7 +86,7 @@ class PillarClass:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lattice:
+class PillarLattice:
     """Pillars on a lattice, written as one cell.
 
     rows, columns: of sites. source: gives any block of rows as class numbers (0: none);
@@ -111,7 +111,7 @@ class Lattice:
     centred: bool = False
 
     def __post_init__(self) -> None:
-        names.check(self.name)
+        names.check_cell_name(self.name)
         corners = (
             self.x0,
             self.y0,
@@ -144,7 +144,7 @@ class Lattice:
     @classmethod
     def of(
         cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int
-    ) -> "Lattice":
+    ) -> "PillarLattice":
         """A square lattice held in memory: (rows, columns) uint8 or uint16."""
         if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
             raise ProcessError(
@@ -173,7 +173,7 @@ class Lattice:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Figure:
+class FigureCell:
     """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database
     units.
     """
@@ -182,7 +182,7 @@ class Figure:
     polygons: Mapping[LayerNumber, tuple[Array, ...]]
 
     def __post_init__(self) -> None:
-        names.check(self.name)
+        names.check_cell_name(self.name)
         for shapes in self.polygons.values():
             for shape in shapes:
                 if len(shape) and np.abs(np.asarray(shape, np.int64)).max() > FARTHEST:
@@ -210,8 +210,8 @@ class MaskPlan:
 
     name: str
     classes: tuple[PillarClass, ...]
-    lattices: tuple[Lattice, ...]
-    figures: tuple[Figure, ...] = ()
+    lattices: tuple[PillarLattice, ...]
+    figures: tuple[FigureCell, ...] = ()
     unit_nm: float = 1.0
     grid: int = 1
     layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
@@ -224,7 +224,7 @@ class MaskPlan:
             raise ProcessError(
                 f"{len(self.classes)} pillar classes, need 1 to {MOST_CLASSES}; take a coarser diameter_step_nm"
             )
-        names.distinct(self.cell_names)
+        names.check_distinct_names(self.cell_names)
 
     @property
     def cell_names(self) -> list[str]:
@@ -277,7 +277,8 @@ def pillar_classes(
     made = []
     for d in diameters:
         outline = (
-            polygon.pillar(int(d) / grid, vertices=vertices, shape=shape).points * grid
+            polygon.pillar_polygon(int(d) / grid, vertices=vertices, shape=shape).points
+            * grid
         )
         made.append(
             PillarClass(

@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask.cells import Cells, with_isolation
-from layout.mask.held import hold
+from layout.mask.cells import DrawnClasses, with_isolation
+from layout.mask.held import hold_on_disk
 from layout.mask.plan import MOST_CLASSES, PillarClass
 from layout.process import Process
 from layout.shapes import polygon, region
 from metalens.cell import Cell
-from metalens.cell.shapes import Conic, Loop, Outline, turned
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError, ProcessError
-from metalens.ground.units import nm
+from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop, rotate_corners
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError, ProcessError
+from metalens.core.units import nm
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars.axes import sized
+from metalens.pillars.axes import cell_of_sizes
 
 _BLOCK_SITES = 1 << 20
 _FLAT = 1e-9
@@ -35,9 +35,9 @@ _LENGTHS = 1 << 20  # above any drawn size in nm
 _TABLED = 1 << 20  # keys below are counted and numbered by a table, others by sorting
 
 
-def classes(
+def shape_classes(
     source: Lens, process: Process, *, unit_nm: float
-) -> tuple[Cells, tuple[PillarClass, ...]]:
+) -> tuple[DrawnClasses, tuple[PillarClass, ...]]:
     """The pillars of a lens as classes, and what is drawn for each.
 
     Raises:
@@ -63,13 +63,13 @@ def classes(
         (first, _numbered(block, used, kind))
         for first, block in _keys(d, process, turns)
     )
-    sites = hold(d.diameter_um.shape, kind, numbered)
+    sites = hold_on_disk(d.diameter_um.shape, kind, numbered)
     made = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
     across = np.array(
         [2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made]
     )
     found = np.array([counts[int(key)] for key in used])
-    return Cells(sites, across, found, process.rules.diameter_step_nm / 2), made
+    return DrawnClasses(sites, across, found, process.rules.diameter_step_nm / 2), made
 
 
 def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
@@ -156,7 +156,7 @@ def _class(
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
     if source.diameters.length_um is not None:
         name = f"D{drawn:05}L{second:05}"
-        made = sized(source.cell, float(drawn), float(second)).outline(
+        made = cell_of_sizes(source.cell, float(drawn), float(second)).outline(
             drawn * nm
         )  # each axis by the bias of its size
     else:
@@ -182,7 +182,11 @@ def _class(
 
 
 def _gridded(
-    part: Conic | Loop, turn_rad: float, step_nm: float, process: Process, name: str
+    part: EllipseArc | PolygonLoop,
+    turn_rad: float,
+    step_nm: float,
+    process: Process,
+    name: str,
 ) -> Array:
     """(n, 2) whole grid steps about the site, counter-clockwise: a circle of its area,
     any other part corner by corner.
@@ -191,16 +195,18 @@ def _gridded(
         ProcessError: fewer than three corners are left, or a circle of less than four
             steps.
     """
-    if isinstance(part, Conic) and part.half_x_um == part.half_y_um:
+    if isinstance(part, EllipseArc) and part.half_x_um == part.half_y_um:
         across = 2 * part.half_x_um / nm / step_nm
         if across < 4:
             raise ProcessError(
                 f"class {name}: a circle of {across * step_nm:.3g} nm; need four steps of the grid"
             )
-        return polygon.pillar(
+        return polygon.pillar_polygon(
             across, vertices=process.rules.vertices, shape=process.rules.shape
         ).points
-    corners = turned(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
+    corners = (
+        rotate_corners(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
+    )
     points = np.asarray(np.rint(corners), np.int64)
     points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
     if len(points) < 3 or polygon.twice_area(points) <= 0:

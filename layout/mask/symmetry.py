@@ -7,24 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.plan import Lattice
-from metalens.ground.arrays import Array
+from layout.mask.plan import PillarLattice
+from metalens.core.arrays import Array
 
 ALL_EIGHT = tuple((quarter, flip) for flip in (False, True) for quarter in range(4))
 FOUR_TURNS = tuple((quarter, False) for quarter in range(4))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Piece:
+class LatticePiece:
     """Part of a lattice, and how it is placed at (0, 0): (quarter turns
     counter-clockwise, mirrored at x first).
     """
 
-    lattice: Lattice
+    lattice: PillarLattice
     placed: Sequence[tuple[int, bool]]
 
 
-def is_square_symmetric(lattice: Lattice) -> bool:
+def is_square_symmetric(lattice: PillarLattice) -> bool:
     """Whether the lattice, centred at (0, 0), is the same under the eight symmetries of
     the square.
     """
@@ -46,7 +46,7 @@ def is_square_symmetric(lattice: Lattice) -> bool:
     )
 
 
-def least(values: Array) -> Array:
+def least_of_images(values: Array) -> Array:
     """(n, n) the least of the values at a site and its seven images, which makes all
     eighths alike.
     """
@@ -55,7 +55,7 @@ def least(values: Array) -> Array:
     return np.minimum(quarters, quarters.T)
 
 
-def pieces(lattice: Lattice) -> list[Piece]:
+def symmetry_pieces(lattice: PillarLattice) -> list[LatticePiece]:
     """The open eighth between the +x axis and the diagonal, the diagonal, and (odd
     counts) axis and centre.
     """
@@ -76,17 +76,17 @@ def pieces(lattice: Lattice) -> list[Piece]:
     for letter, mask, placed in masks:
         part = np.where(mask, quarter, 0).astype(quarter.dtype)
         if part.any():
-            made.append(Piece(_lattice(lattice, part, letter), placed))
+            made.append(LatticePiece(_lattice(lattice, part, letter), placed))
     return made
 
 
-def _upper_right(lattice: Lattice) -> Array:
+def _upper_right(lattice: PillarLattice) -> Array:
     half = (lattice.rows + 1) // 2
     return lattice.whole()[:half, lattice.columns - half :]
 
 
-def _lattice(lattice: Lattice, part: Array, letter: str) -> Lattice:
+def _lattice(lattice: PillarLattice, part: Array, letter: str) -> PillarLattice:
     x0 = lattice.x0 + (lattice.columns - part.shape[1]) * lattice.pitch
-    return Lattice.of(
+    return PillarLattice.of(
         f"{lattice.name[:29]}_{letter}", part, pitch=lattice.pitch, x0=x0, y0=lattice.y0
     )

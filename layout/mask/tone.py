@@ -18,17 +18,17 @@ import dataclasses
 
 import numpy as np
 
-from layout.mask.plan import UNDRAWN, Figure, Lattice, MaskPlan, PillarClass
+from layout.mask.plan import UNDRAWN, FigureCell, MaskPlan, PillarClass, PillarLattice
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear, region
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 _WINDOW_UM = 5.0  # around marks and labels, on their own layer
 _BLOCK_SITES = 1 << 20
 
 
-def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
+def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     """The mask that leaves standing what ``plan`` draws; the layers of a second step
     (aperture) stay as they are.
 
@@ -56,14 +56,14 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
         _rim(boxes, plan.lattices[0].constant, process)
     ]
     if clear:
-        figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
+        figures.append(FigureCell("CLEAR", {process.layers.pillar: tuple(clear)}))
     kept = [
         figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)
     ]
     return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
 
 
-def lattice_box(lattice: Lattice, grid: int) -> Array:
+def lattice_box(lattice: PillarLattice, grid: int) -> Array:
     """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
     the ends of every other row).
     """
@@ -73,7 +73,7 @@ def lattice_box(lattice: Lattice, grid: int) -> Array:
         (lattice.rows - 1) * lattice.down,
     )
     x, y = lattice.x0, lattice.y0
-    return rectilinear.corners(
+    return rectilinear.box_corners(
         np.array([x + left, y - down + bottom, x + across + right, y + top])
     )
 
@@ -83,7 +83,7 @@ def _unexposed(process: Process) -> set[LayerNumber]:
     return {process.layers.aperture, process.layers.outline, process.layers.fields}
 
 
-def _square(lattice: Lattice, grid: int) -> tuple[int, int, int, int]:
+def _square(lattice: PillarLattice, grid: int) -> tuple[int, int, int, int]:
     """Left, bottom, right, top of the lattice square about a site, on the grid; squares
     of neighbours abut.
     """
@@ -103,15 +103,15 @@ def _around(
             f"{square[2] - square[0]} by {square[3] - square[1]}: tone 'negative' draws what is left of the square; "
             "widen the pitch"
         )
-    left_over = region.difference(
-        [rectilinear.corners(np.array(square))], made.contours
+    left_over = region.subtract_contours(
+        [rectilinear.box_corners(np.array(square))], made.contours
     )
     return dataclasses.replace(
         made, drawn=tuple(region.without_holes(left_over, grid=grid))
     )
 
 
-def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
+def _empty(lattice: PillarLattice, left_of: int, top_of: int) -> list[Array]:
     """Rectangles over what no pillar's square covers: equal runs of neighbouring rows
     together.
 
@@ -127,7 +127,7 @@ def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
             lattice.y0 - row * lattice.down + top_of
             for row in (open_runs.pop(run), end)
         )
-        return rectilinear.corners(np.array([left, bottom, right, top]))
+        return rectilinear.box_corners(np.array([left, bottom, right, top]))
 
     wide = 2 if lattice.centred else 1
     for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
@@ -142,7 +142,9 @@ def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
     return made + [close(run, lattice.rows) for run in sorted(open_runs)]
 
 
-def _surroundings(plan: MaskPlan, process: Process, boxes: list[Array]) -> list[Figure]:
+def _surroundings(
+    plan: MaskPlan, process: Process, boxes: list[Array]
+) -> list[FigureCell]:
     """Windows without their marks and labels, and the rest of the die."""
     die = [
         p
@@ -168,23 +170,24 @@ def _surroundings(plan: MaskPlan, process: Process, boxes: list[Array]) -> list[
     for figure in drawn:
         left = {}
         for layer, shapes in figure.polygons.items():
-            window = region.overlap(
-                region.difference([_grown(s, margin) for s in shapes], taken), die
+            window = region.overlap_contours(
+                region.subtract_contours([_grown(s, margin) for s in shapes], taken),
+                die,
             )
             left[layer] = tuple(
                 region.without_holes(
-                    region.difference(window, standing), grid=plan.grid
+                    region.subtract_contours(window, standing), grid=plan.grid
                 )
             )
             taken += [_grown(s, margin) for s in shapes]
-        made.append(Figure(figure.name, left))
+        made.append(FigureCell(figure.name, left))
     rest = region.without_holes(
-        region.difference(die, [*taken, *standing]), grid=plan.grid
+        region.subtract_contours(die, [*taken, *standing]), grid=plan.grid
     )
-    return [*made, Figure("FRAME", {process.layers.pillar: tuple(rest)})]
+    return [*made, FigureCell("FRAME", {process.layers.pillar: tuple(rest)})]
 
 
-def _rim(boxes: list[Array], width: int, process: Process) -> Figure:
+def _rim(boxes: list[Array], width: int, process: Process) -> FigureCell:
     """A frame around lattices of their own, four rectangles each."""
     shapes: list[Array] = []
     for box in boxes:
@@ -196,12 +199,12 @@ def _rim(boxes: list[Array], width: int, process: Process) -> Figure:
             (x0, bottom, left, top),
             (right, bottom, x1, top),
         )
-        shapes += [rectilinear.corners(np.array(side)) for side in sides]
-    return Figure("RIM", {process.layers.pillar: tuple(shapes)})
+        shapes += [rectilinear.box_corners(np.array(side)) for side in sides]
+    return FigureCell("RIM", {process.layers.pillar: tuple(shapes)})
 
 
 def _grown(shape: Array, margin: int) -> Array:
     """Box around a shape, wider by a margin on all sides."""
-    return rectilinear.corners(
+    return rectilinear.box_corners(
         np.array([*(shape.min(0) - margin), *(shape.max(0) + margin)])
     )

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.pec import bodies as bodies
@@ -12,27 +12,27 @@ if TYPE_CHECKING:
     from layout.pec import sampled as sampled
     from layout.pec.assign import DoseLadder as DoseLadder
     from layout.pec.assign import dose_ladder as dose_ladder
+    from layout.pec.bodies import ExposedRectangles as ExposedRectangles
     from layout.pec.bodies import PillarArray as PillarArray
-    from layout.pec.bodies import Rects as Rects
     from layout.pec.correct import DoseResult as DoseResult
-    from layout.pec.correct import Solution as Solution
-    from layout.pec.drawn import Discs as Discs
-    from layout.pec.drawn import Drawn as Drawn
-    from layout.pec.drawn import Outlines as Outlines
-    from layout.pec.uniformity import Uniformity as Uniformity
+    from layout.pec.correct import DoseSolution as DoseSolution
+    from layout.pec.drawn import DrawnDiscs as DrawnDiscs
+    from layout.pec.drawn import DrawnKinds as DrawnKinds
+    from layout.pec.drawn import DrawnOutlines as DrawnOutlines
+    from layout.pec.uniformity import DoseUniformity as DoseUniformity
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "PillarArray": "bodies",
-        "Discs": "drawn",
+        "DrawnDiscs": "drawn",
         "DoseResult": "correct",
-        "Drawn": "drawn",
+        "DrawnKinds": "drawn",
         "DoseLadder": "assign",
-        "Outlines": "drawn",
-        "Rects": "bodies",
-        "Solution": "correct",
-        "Uniformity": "uniformity",
+        "DrawnOutlines": "drawn",
+        "ExposedRectangles": "bodies",
+        "DoseSolution": "correct",
+        "DoseUniformity": "uniformity",
         "bodies": "",
         "correct": "",
         "dose_ladder": "assign",

@@ -7,12 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.pec.bodies import NONE, PillarArray, Ranges, Rects, Table
-from layout.pec.nodes import Convolution, Grid, spread
+from layout.pec.bodies import (
+    NONE,
+    ExposedRectangles,
+    ExposureTable,
+    PillarArray,
+    ScatterRanges,
+)
+from layout.pec.nodes import NodeGrid, RadialConvolution, interpolate_from_nodes
 from layout.pec.psf import THRESHOLD, PointExposure
-from layout.pec.uniformity import Tally, Uniformity
-from layout.process import Exposure, compiled
-from metalens.ground.arrays import Array
+from layout.pec.uniformity import DoseUniformity, ErrorTally
+from layout.process import ExposureSettings, compile_loop
+from metalens.core.arrays import Array
 
 _NOTHING = np.zeros((0, 0), np.float32)
 _ROUNDED = 0.75  # of the tolerance, for doses rounded to classes
@@ -20,28 +26,28 @@ _SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fields:
+class ExposedBodies:
     """Everything that is exposed, and its backgrounds.
 
     far: (y, x) on the nodes with the wanted doses; alone: with dose 1. near,
     near_alone: (rows, columns) for each
     body, the middle ranges; empty lists where there is none.
-    own: (pieces,) as in :func:`layout.pec.rects.own`; points, piece: outer edges of
+    own: (pieces,) as in :func:`layout.pec.rects.self_exposure`; points, piece: outer edges of
     the pieces and whose they are.
     spots: points, areas and pieces that stand for the rectangles on the nodes.
     """
 
     bodies: Sequence[PillarArray]
-    table: Table
-    ranges: Ranges
-    grid: Grid
-    reach: Convolution
-    middles: Sequence[Convolution]
+    table: ExposureTable
+    ranges: ScatterRanges
+    grid: NodeGrid
+    reach: RadialConvolution
+    middles: Sequence[RadialConvolution]
     far: Array
     alone: Array
     near: Sequence[Array]
     near_alone: Sequence[Array]
-    rects: Rects
+    rects: ExposedRectangles
     own: Array
     points: Array
     piece: Array
@@ -53,7 +59,7 @@ class Fields:
         """(rows, columns) float32 background at the sites of rows of a body."""
         body = self.bodies[number]
         out = np.empty((count, body.columns), np.float32)
-        spread(
+        interpolate_from_nodes(
             field,
             *self.grid.y.at(body.rows_um(first, count)),
             *self.grid.x.at(body.columns_um),
@@ -91,13 +97,13 @@ class DoseLadder:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Assigned:
+class AssignedDoses:
     """Uniformity over the first body, worst error over everything, the far and middle
     fields of the rounded doses.
     """
 
-    before: Uniformity
-    after: Uniformity
+    before: DoseUniformity
+    after: DoseUniformity
     worst: float
     far: Array
     near: Sequence[Array]
@@ -116,7 +122,7 @@ class DoseRange:
     share: float
 
 
-def dose_range(fields: Fields, settings: Exposure) -> DoseRange:
+def dose_range(fields: ExposedBodies, settings: ExposureSettings) -> DoseRange:
     """The doses that pillars and pieces want, and how finely they must be met.
 
     Where the edge is so soft that the tolerance moves it by more than a nanometre of
@@ -159,7 +165,7 @@ def dose_range(fields: Fields, settings: Exposure) -> DoseRange:
 
 
 def dose_ladder(
-    ranges: Sequence[DoseRange], settings: Exposure
+    ranges: Sequence[DoseRange], settings: ExposureSettings
 ) -> tuple[DoseLadder, int]:
     """The doses of a job (at most ``maximum_classes``), and how many its tolerance
     needs.
@@ -183,7 +189,7 @@ def straight_edge_error(point: PointExposure) -> float:
     return float(_SOFTEST_UM * steep / 2 / THRESHOLD)
 
 
-@compiled
+@compile_loop
 def _span(
     block: Array,
     field: Array,
@@ -206,8 +212,8 @@ def _span(
                 )
 
 
-def classes(
-    fields: Fields, number: int, first: int, block: Array, steps: DoseLadder
+def dose_class_map(
+    fields: ExposedBodies, number: int, first: int, block: Array, steps: DoseLadder
 ) -> Array:
     """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is
     none.
@@ -227,7 +233,7 @@ def classes(
     return out
 
 
-@compiled
+@compile_loop
 def _classes(
     block: Array,
     field: Array,
@@ -248,7 +254,9 @@ def _classes(
             out[row, column] = min(max(level, 0.0), count - 1.0)
 
 
-def assign(fields: Fields, steps: DoseLadder) -> tuple[Array, Array, Assigned]:
+def assign_dose_classes(
+    fields: ExposedBodies, steps: DoseLadder
+) -> tuple[Array, Array, AssignedDoses]:
     """((entries, doses) pillars, (pieces,) class, outcome) of the nearest doses, over
     everything.
     """
@@ -258,7 +266,7 @@ def assign(fields: Fields, steps: DoseLadder) -> tuple[Array, Array, Assigned]:
     dose[: len(steps.factors)] = steps.factors
     mean = _mean_edge(fields)
     tallies = [
-        Tally() for _ in range(3)
+        ErrorTally() for _ in range(3)
     ]  # first body with dose 1, first body, the others
     given: list[Array] = []
     for number, body in enumerate(fields.bodies):
@@ -269,7 +277,7 @@ def assign(fields: Fields, steps: DoseLadder) -> tuple[Array, Array, Assigned]:
             )
         )
         for first, block in body.blocks():
-            chosen = classes(fields, number, first, block, steps)
+            chosen = dose_class_map(fields, number, first, block, steps)
             field = fields.at(fields.far, number, first, len(block), fields.near)
             yn, yw = fields.grid.y.at(body.rows_um(first, len(block)))
             ends = np.zeros((2, 4))
@@ -328,11 +336,11 @@ def assign(fields: Fields, steps: DoseLadder) -> tuple[Array, Array, Assigned]:
     return (
         pairs[:, : len(steps.factors)],
         own_class,
-        Assigned(before, found, worst, after, near),
+        AssignedDoses(before, found, worst, after, near),
     )
 
 
-def _mean_edge(fields: Fields) -> float:
+def _mean_edge(fields: ExposedBodies) -> float:
     """Mean exposure of the edges of the first body with dose 1, by area."""
     t, body = fields.table, fields.bodies[0]
     total = weight = 0.0
@@ -344,7 +352,7 @@ def _mean_edge(fields: Fields) -> float:
     return total / weight
 
 
-@compiled
+@compile_loop
 def _take(
     block: Array,
     chosen: Array,
@@ -390,7 +398,9 @@ def _take(
                 out[yn[row] + i, node] += yw[row, i] * line[node]
 
 
-def _rect_error(fields: Fields, own_class: Array, dose: Array, mass: Array) -> float:
+def _rect_error(
+    fields: ExposedBodies, own_class: Array, dose: Array, mass: Array
+) -> float:
     """Worst relative error over the outer edges of the pieces; their masses are added
     to the nodes.
     """

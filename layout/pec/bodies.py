@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.pec.drawn import Drawn
+from layout.pec.drawn import DrawnKinds
 from layout.pec.psf import PointExposure
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 NONE = 255  # dose class of a site without pillar
 _BLOCK_SITES = 1 << 20
@@ -102,7 +102,7 @@ class PillarArray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rects:
+class ExposedRectangles:
     """Rectangles that are written in the same exposure, a dose each.
 
     box_um: (n, 4) left, bottom, right, top. group: (n,) which shape each is a piece of.
@@ -114,7 +114,7 @@ class Rects:
     goal: Array
 
     @classmethod
-    def none(cls) -> "Rects":
+    def none(cls) -> "ExposedRectangles":
         """No rectangle."""
         return cls(np.empty((0, 4)), np.empty(0, np.int64), np.empty(0))
 
@@ -128,7 +128,7 @@ class Rects:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Table:
+class ExposureTable:
     """What each entry exposes at unit dose; entry 0 is no pillar.
 
     drawn: the kinds. area_um2: (entries,), 0 for those that do not occur.
@@ -139,7 +139,7 @@ class Table:
     of each.
     """
 
-    drawn: Drawn
+    drawn: DrawnKinds
     area_um2: Array
     goal: Array
     own: Array
@@ -153,7 +153,7 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ranges:
+class ScatterRanges:
     """The point exposure split by how far its Gaussians reach.
 
     far: at least six times as wide as neighbours are apart, summed on nodes over the
@@ -170,7 +170,7 @@ class Ranges:
     near: PointExposure
 
 
-def count(bodies: Sequence[PillarArray], entries: int) -> Array:
+def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
     """(entries,) pillars of each entry in all bodies."""
     total = np.zeros(entries, np.int64)
     for body in bodies:
@@ -180,9 +180,9 @@ def count(bodies: Sequence[PillarArray], entries: int) -> Array:
     return total
 
 
-def split(
-    point: PointExposure, drawn: Drawn, number: Array, body: PillarArray
-) -> Ranges:
+def split_ranges(
+    point: PointExposure, drawn: DrawnKinds, number: Array, body: PillarArray
+) -> ScatterRanges:
     """Which Gaussians reach how far, for these pillars on the densest of the lattices."""
     mass = number * drawn.area_um2
     total = float(mass.sum())
@@ -200,10 +200,12 @@ def split(
             np.sqrt(point.widths_um[chosen] ** 2 + wider), point.weights[chosen]
         )
 
-    return Ranges(some(far, wider), some(middle, wider), some(~far & ~middle, 0.0))
+    return ScatterRanges(
+        some(far, wider), some(middle, wider), some(~far & ~middle, 0.0)
+    )
 
 
-def _given(drawn: Drawn, used: Array, steps_um: Array, width_um: float) -> float:
+def _given(drawn: DrawnKinds, used: Array, steps_um: Array, width_um: float) -> float:
     """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind
     that receives most.
     """
@@ -214,15 +216,15 @@ def _given(drawn: Drawn, used: Array, steps_um: Array, width_um: float) -> float
     return max(found)
 
 
-def table(
-    drawn: Drawn,
+def exposure_table(
+    drawn: DrawnKinds,
     goal: Array,
     number: Array,
     *,
     point: PointExposure,
-    ranges: Ranges,
+    ranges: ScatterRanges,
     body: PillarArray,
-) -> Table:
+) -> ExposureTable:
     """The table of a mask.
 
     Args:
@@ -245,7 +247,7 @@ def table(
             f"a pillar of {thin:.0f} nm gives its own edge an exposure of {own[used].min():.3f} only, less than its "
             "neighbours do: the core of the point exposure (alpha_um) is too wide for these pillars"
         )
-    return Table(drawn, area, goal, own, slope, number)
+    return ExposureTable(drawn, area, goal, own, slope, number)
 
 
 def _beside(middle: PointExposure, body: PillarArray) -> float:

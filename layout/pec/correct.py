@@ -21,16 +21,28 @@ import numpy as np
 
 from layout.pec import assign, bodies, psf, rects
 from layout.pec.assign import DoseLadder
-from layout.pec.bodies import NONE, PillarArray, Ranges, Rects, Table
-from layout.pec.drawn import Discs, Drawn
+from layout.pec.bodies import (
+    NONE,
+    ExposedRectangles,
+    ExposureTable,
+    PillarArray,
+    ScatterRanges,
+)
+from layout.pec.drawn import DrawnDiscs, DrawnKinds
 from layout.pec.fracture import fracture_boxes
-from layout.pec.nodes import Convolution, Grid, convolution, gather, spread
+from layout.pec.nodes import (
+    NodeGrid,
+    RadialConvolution,
+    gather_to_nodes,
+    gaussian_convolution,
+    interpolate_from_nodes,
+)
 from layout.pec.psf import THRESHOLD, PointExposure
-from layout.pec.sampled import Exposed, exact_edges
-from layout.pec.uniformity import Uniformity
-from layout.process import Exposure, Process
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from layout.pec.sampled import ExposedLattices, exact_edges
+from layout.pec.uniformity import DoseUniformity
+from layout.process import ExposureSettings, Process
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 from metalens.lens import DiameterMap
 
 _UNIT_UM = 1e-4  # resolution of the diameters in the table
@@ -58,14 +70,14 @@ class DoseResult:
     classes: Array
     needed: int
     met: bool
-    before: Uniformity
-    after: Uniformity
+    before: DoseUniformity
+    after: DoseUniformity
     error: float
     point: PointExposure
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
+class DoseSolution:
     """Doses of everything on a die; ``before`` and ``after`` as in DoseResult, over the
     pillars of the first body.
 
@@ -78,65 +90,67 @@ class Solution:
     ladder: DoseLadder
     needed: int
     pairs: Array
-    rects: Rects
+    rects: ExposedRectangles
     rect_class: Array
-    before: Uniformity
-    after: Uniformity
+    before: DoseUniformity
+    after: DoseUniformity
     worst: float
     error: float
     point: PointExposure
-    _fields: assign.Fields
+    _fields: assign.ExposedBodies
 
     def classes(self, number: int, first: int, block: Array) -> Array:
         """(rows, columns) uint8 dose class of the pillars of a block of body
         ``number``, 255 where there is none.
         """
-        return assign.classes(self._fields, number, first, block, self.ladder)
+        return assign.dose_class_map(self._fields, number, first, block, self.ladder)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Wanted:
+class WantedDoses:
     """Doses that give every edge its exposure, before they are rounded to classes.
 
     fields: backgrounds that belong to them. range: what they need of a ladder.
     """
 
-    fields: assign.Fields
+    fields: assign.ExposedBodies
     range: assign.DoseRange
     point: PointExposure
 
 
-def solve(
+def solve_doses(
     parts: Sequence[PillarArray],
-    kinds: Drawn,
+    kinds: DrawnKinds,
     goal: Array,
-    settings: Exposure,
+    settings: ExposureSettings,
     *,
-    cut: Rects | None = None,
-) -> Wanted:
+    cut: ExposedRectangles | None = None,
+) -> WantedDoses:
     """The wanted doses of pillars and rectangles that are exposed together.
 
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
         kinds, goal: (entries,) of the table, entry 0 for none.
         cut: rectangles along whose outer sides the background hardly changes
-            (:func:`pieces`).
+            (:func:`fracture_boxes`).
 
     Raises:
         ProcessError: as :func:`correct`.
     """
     point = psf.point_exposure(settings)
-    number = bodies.count(parts, len(goal))
+    number = bodies.count_pillars(parts, len(goal))
     densest = min(parts, key=lambda body: body.apart_um)
-    ranges = bodies.split(point, kinds, number, densest)
-    drawn = bodies.table(kinds, goal, number, point=point, ranges=ranges, body=densest)
-    fields = _fields(parts, drawn, ranges, cut or Rects.none())
-    return Wanted(fields, assign.dose_range(fields, settings), point)
+    ranges = bodies.split_ranges(point, kinds, number, densest)
+    drawn = bodies.exposure_table(
+        kinds, goal, number, point=point, ranges=ranges, body=densest
+    )
+    fields = _fields(parts, drawn, ranges, cut or ExposedRectangles.none())
+    return WantedDoses(fields, assign.dose_range(fields, settings), point)
 
 
 def round_doses(
-    wanted: Wanted, ladder: DoseLadder, needed: int, *, samples: int = 8
-) -> Solution:
+    wanted: WantedDoses, ladder: DoseLadder, needed: int, *, samples: int = 8
+) -> DoseSolution:
     """Every wanted dose rounded to the nearest of a ladder.
 
     Args:
@@ -145,9 +159,9 @@ def round_doses(
         samples: pillars at which the exposure is summed exactly.
     """
     fields, point = wanted.fields, wanted.point
-    pairs, rect_class, after = assign.assign(fields, ladder)
+    pairs, rect_class, after = assign.assign_dose_classes(fields, ladder)
     error = _sampled_error(wanted, ladder, after, samples)
-    return Solution(
+    return DoseSolution(
         ladder,
         needed,
         pairs,
@@ -163,7 +177,7 @@ def round_doses(
 
 
 def _sampled_error(
-    wanted: Wanted, ladder: DoseLadder, found: assign.Assigned, samples: int
+    wanted: WantedDoses, ladder: DoseLadder, found: assign.AssignedDoses, samples: int
 ) -> float:
     """Largest |fast - exact| / wanted exposure at sample pillars of the first body."""
     fields, table = wanted.fields, wanted.fields.table
@@ -171,7 +185,7 @@ def _sampled_error(
     dose[: len(ladder.factors)] = ladder.factors
     points, areas, of = fields.spots
     needed = (THRESHOLD * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
-    scene = Exposed(
+    scene = ExposedLattices(
         fields.bodies,
         table.drawn,
         table.own + table.area_um2 * float(fields.ranges.far.density(np.array(0.0))),
@@ -179,7 +193,7 @@ def _sampled_error(
         wanted.point,
         (points, areas * dose[ladder.nearest(needed)][of]),
         lambda number, first, block: dose.take(
-            assign.classes(fields, number, first, block, ladder)
+            assign.dose_class_map(fields, number, first, block, ladder)
         ),
     )
     rows, columns, exact = exact_edges(scene, samples)
@@ -233,8 +247,8 @@ def correct_table(
     """
     refuse_negative(process)
     body = PillarArray.of(index, pitch_um)
-    wanted = solve(
-        [body], Discs(diameter_um), np.ones(len(diameter_um)), process.exposure
+    wanted = solve_doses(
+        [body], DrawnDiscs(diameter_um), np.ones(len(diameter_um)), process.exposure
     )
     ladder, needed = assign.dose_ladder([wanted.range], process.exposure)
     found = round_doses(wanted, ladder, needed, samples=samples)
@@ -266,8 +280,12 @@ def refuse_negative(process: Process) -> None:
         )
 
 
-def pieces(
-    boxes: Array, parts: Sequence[PillarArray], settings: Exposure, *, step_um: float
+def fracture_by_surroundings(
+    boxes: Array,
+    parts: Sequence[PillarArray],
+    settings: ExposureSettings,
+    *,
+    step_um: float,
 ) -> tuple[Array, Array]:
     """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and
     (m,) the box of each.
@@ -281,26 +299,33 @@ def pieces(
     return fracture_boxes(boxes, around, step_um=step_um, point=point, tolerance=most)
 
 
-def _box(parts: Sequence[PillarArray], cut: Rects) -> tuple[float, float, float, float]:
+def _box(
+    parts: Sequence[PillarArray], cut: ExposedRectangles
+) -> tuple[float, float, float, float]:
     boxes = np.array([*(body.box_um for body in parts), *cut.box_um])
     return *boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()
 
 
 def _fields(
-    parts: Sequence[PillarArray], drawn: Table, ranges: Ranges, cut: Rects
-) -> assign.Fields:
+    parts: Sequence[PillarArray],
+    drawn: ExposureTable,
+    ranges: ScatterRanges,
+    cut: ExposedRectangles,
+) -> assign.ExposedBodies:
     """Backgrounds that belong to the wanted doses, and to dose 1 everywhere."""
     width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
-    grid = Grid.over(_box(parts, cut), width)
+    grid = NodeGrid.over(_box(parts, cut), width)
     beside = PointExposure(
         np.r_[ranges.near.widths_um, ranges.middle.widths_um],
         np.r_[ranges.near.weights, ranges.middle.weights],
     )
-    own, points, piece = rects.own(cut, beside)
-    pads = _Pads(cut, own, (points, piece), rects.samples(cut, width / _SPOTS), grid)
+    own, points, piece = rects.self_exposure(cut, beside)
+    pads = _Pads(
+        cut, own, (points, piece), rects.rectangle_samples(cut, width / _SPOTS), grid
+    )
     plain, wanted, goal = _masses(parts, drawn, grid)
     plain += pads.deposited(np.ones(len(own)))
-    reach = convolution(
+    reach = gaussian_convolution(
         grid.shape,
         (grid.y.spacing_um, grid.x.spacing_um),
         point=ranges.far,
@@ -316,7 +341,7 @@ def _fields(
         for body, middle in zip(parts, middles, strict=False)
     ]
     field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles, pads)
-    return assign.Fields(
+    return assign.ExposedBodies(
         parts,
         drawn,
         ranges,
@@ -345,11 +370,11 @@ class _Pads:
     areas and pieces that stand for them.
     """
 
-    rects: Rects
+    rects: ExposedRectangles
     own: Array
     edges: tuple[Array, Array]
     spots: tuple[Array, Array, Array]
-    grid: Grid
+    grid: NodeGrid
 
     def deposited(self, dose: Array) -> Array:
         """(y, x) masses of doses (pieces,)."""
@@ -372,7 +397,7 @@ class _Pads:
 
 
 def _masses(
-    parts: Sequence[PillarArray], drawn: Table, grid: Grid
+    parts: Sequence[PillarArray], drawn: ExposureTable, grid: NodeGrid
 ) -> tuple[Array, Array, Array]:
     """Node sums of area, area / own, and goal area / own."""
     per_own = np.divide(
@@ -386,11 +411,11 @@ def _masses(
         xn, xw = grid.x.at(body.columns_um)
         for first, block in body.blocks():
             yn, yw = grid.y.at(body.rows_um(first, len(block)))
-            gather(block, value, yn, yw, xn, xw, out)
+            gather_to_nodes(block, value, yn, yw, xn, xw, out)
     return out[0], out[1], out[2]
 
 
-def middle_convolution(body: PillarArray, ranges: Ranges) -> Convolution:
+def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:
     """Convolution on the sites of a lattice with the Gaussians that reach neighbours
     only.
     """
@@ -400,7 +425,7 @@ def middle_convolution(body: PillarArray, ranges: Ranges) -> Convolution:
             f"{np.array2string(ranges.middle.widths_um, precision=3)} um: such middle ranges are corrected on at most "
             f"{_MOST_SITES:,} sites; give a point exposure of core and backscatter alone"
         )
-    return convolution(
+    return gaussian_convolution(
         (body.rows, body.columns),
         (body.down_um, body.pitch_um),
         point=ranges.middle,
@@ -408,7 +433,7 @@ def middle_convolution(body: PillarArray, ranges: Ranges) -> Convolution:
     )
 
 
-def _times(body: PillarArray, value: Array, middle: Convolution) -> Array:
+def _times(body: PillarArray, value: Array, middle: RadialConvolution) -> Array:
     """(rows, columns) what pillars that carry ``value`` (entries,) give to each other."""
     mass = np.concatenate([value.take(block) for _, block in body.blocks()])
     return middle(mass).astype(np.float32)
@@ -416,11 +441,11 @@ def _times(body: PillarArray, value: Array, middle: Convolution) -> Array:
 
 def _backgrounds(
     parts: Sequence[PillarArray],
-    drawn: Table,
-    grid: Grid,
-    reach: Convolution,
+    drawn: ExposureTable,
+    grid: NodeGrid,
+    reach: RadialConvolution,
     masses: tuple[Array, Array],
-    middles: Sequence[Convolution],
+    middles: Sequence[RadialConvolution],
     pads: _Pads,
 ) -> tuple[Array, list[Array]]:
     """Far field on the nodes and middle field on the sites that belong to the wanted
@@ -439,7 +464,7 @@ def _backgrounds(
             xn, xw = grid.x.at(body.columns_um)
             yn, yw = grid.y.at(body.rows_um(0, body.rows))
             far = np.empty(index.shape, np.float32)
-            spread(field, yn, yw, xn, xw, far)
+            interpolate_from_nodes(field, yn, yw, xn, xw, far)
             mass = per_own.take(index)
             own = _relaxed(
                 middle,
@@ -461,7 +486,7 @@ def _backgrounds(
 
 
 def _relaxed(
-    reach: Convolution,
+    reach: RadialConvolution,
     mass: Array,
     drive: Array,
     *,

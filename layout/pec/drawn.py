@@ -20,10 +20,15 @@ from typing import Protocol
 
 import numpy as np
 
-from layout.pec.psf import PointExposure, disc, rim_of_own_disc, slope_at_rim
-from layout.process import compiled
-from layout.shapes.moments import Contours, along, moments, perimeter
-from metalens.ground.arrays import Array
+from layout.pec.psf import PointExposure, disc_exposure, rim_of_own_disc, slope_at_rim
+from layout.process import compile_loop
+from layout.shapes.moments import (
+    Contours,
+    perimeter,
+    points_along_edges,
+    polygon_moments,
+)
+from metalens.core.arrays import Array
 
 _RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
 _SEEN = 48  # points along the edges that neighbours are seen from
@@ -33,7 +38,7 @@ _MOST_PIXELS = 1200  # along a side
 _HALVINGS = 34
 
 
-class Drawn(Protocol):
+class DrawnKinds(Protocol):
     """Kinds of pillars, entry 0 for none."""
 
     @property
@@ -69,7 +74,7 @@ class Drawn(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Discs:
+class DrawnDiscs:
     """Round pillars. diameter_um: (entries,)."""
 
     diameter_um: Array
@@ -85,7 +90,7 @@ class Discs:
         return np.asarray(1.5 * self.diameter_um**2 / 4)
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`Drawn`, exact."""
+        """As in :class:`DrawnKinds`, exact."""
         d, terms = (
             np.where(used, self.diameter_um, 0.0),
             list(zip(point.widths_um, point.weights, strict=True)),
@@ -96,14 +101,14 @@ class Discs:
         return np.asarray(own), np.where(used, slope, 0)
 
     def edge_um(self, entry: int) -> Array:
-        """As in :class:`Drawn`."""
+        """As in :class:`DrawnKinds`."""
         return np.asarray(
             self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1)
         )
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """As in :class:`Drawn`, exact."""
-        return disc(
+        """As in :class:`DrawnKinds`, exact."""
+        return disc_exposure(
             np.hypot(at_um[..., 0], at_um[..., 1]), self.diameter_um[entry], width_um
         )
 
@@ -113,7 +118,7 @@ class Discs:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlines:
+class DrawnOutlines:
     """Pillars of any shape. contours: of each entry, those of entry 0 empty."""
 
     contours: Sequence[Contours]
@@ -121,7 +126,7 @@ class Outlines:
     @cached_property
     def area_um2(self) -> Array:
         """By Green's theorem."""
-        return np.array([moments(each)[0] for each in self.contours])
+        return np.array([polygon_moments(each)[0] for each in self.contours])
 
     @property
     def diameter_um(self) -> Array:
@@ -134,7 +139,7 @@ class Outlines:
         return np.array([_wider(each) if each else 0.0 for each in self.contours])
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`Drawn`; to 5e-4 of itself (pixels of a sixth of the narrowest
+        """As in :class:`DrawnKinds`; to 5e-4 of itself (pixels of a sixth of the narrowest
         Gaussian).
         """
         found = np.zeros((2, len(self.contours)))
@@ -143,11 +148,11 @@ class Outlines:
         return found[0], found[1]
 
     def edge_um(self, entry: int) -> Array:
-        """As in :class:`Drawn`, evenly spaced."""
-        return along(self.contours[entry], _SEEN)
+        """As in :class:`DrawnKinds`, evenly spaced."""
+        return points_along_edges(self.contours[entry], _SEEN)
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """As in :class:`Drawn`; four Gauss points to 0.8 widths, 1e-6."""
+        """As in :class:`DrawnKinds`; four Gauss points to 0.8 widths, 1e-6."""
         places = at_um.reshape(-1, 2)
         y, weight, crossing = _lines(self.contours[entry], width_um)
         bell = (
@@ -169,9 +174,9 @@ class Outlines:
 
 
 def _wider(contours: Contours) -> float:
-    area, first, second = moments(contours)
+    area, first, second = polygon_moments(contours)
     centre = first / area
-    points = along(contours, 4 * _SEEN) - centre
+    points = points_along_edges(contours, 4 * _SEEN) - centre
     return float(second / area - centre @ centre + (points**2).sum(1).mean())
 
 
@@ -242,7 +247,7 @@ def _level(
     )
 
 
-@compiled
+@compile_loop
 def _above(image: Array, down: Array, across: Array, level: float) -> float:
     """Pixels on which a picture is above a level: of each the share of the half plane
     by its slope.

@@ -13,9 +13,9 @@ import numpy as np
 
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.pec.rects import CORNER, pairs_near, sums_of_boxes
-from layout.process import compiled
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from layout.process import compile_loop
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 MOST_PIECES = 500_000
 # of the tolerance, which the background may change from the middle of a side to its end
@@ -187,7 +187,7 @@ def _halved(
     return _joined(done)
 
 
-@compiled
+@compile_loop
 def _uncover(
     box: Array, of: Array, whole: Array, first: Array, near: Array, outer: Array
 ) -> None:

@@ -16,16 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.pec.psf import PointExposure
-from layout.process import compiled
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from layout.process import compile_loop
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 MOST_NODES = 40_000_000
 _PER_WIDTH = 6  # nodes along the 1/e radius of the narrowest Gaussian
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class NodeAxis:
     """Nodes at ``origin_um + k spacing_um``, k from 0 to ``count - 1``."""
 
     origin_um: float
@@ -33,7 +33,7 @@ class Axis:
     count: int
 
     @classmethod
-    def over(cls, low_um: float, high_um: float, spacing_um: float) -> "Axis":
+    def over(cls, low_um: float, high_um: float, spacing_um: float) -> "NodeAxis":
         """Nodes that hold four around every position from ``low_um`` to ``high_um``."""
         return cls(
             low_um - 1.5 * spacing_um,
@@ -54,14 +54,16 @@ class Axis:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class NodeGrid:
     """Nodes of a die."""
 
-    y: Axis
-    x: Axis
+    y: NodeAxis
+    x: NodeAxis
 
     @classmethod
-    def over(cls, box_um: tuple[float, float, float, float], width_um: float) -> "Grid":
+    def over(
+        cls, box_um: tuple[float, float, float, float], width_um: float
+    ) -> "NodeGrid":
         """Nodes over (left, bottom, right, top), fine enough for Gaussians of
         ``width_um`` (1/e radius).
 
@@ -70,7 +72,7 @@ class Grid:
         """
         left, bottom, right, top = box_um
         step = width_um / _PER_WIDTH
-        made = cls(Axis.over(bottom, top, step), Axis.over(left, right, step))
+        made = cls(NodeAxis.over(bottom, top, step), NodeAxis.over(left, right, step))
         if made.y.count * made.x.count > MOST_NODES:
             raise ProcessError(
                 f"a Gaussian of {width_um:.3g} um over a die of {right - left:.0f} x {top - bottom:.0f} um needs "
@@ -99,7 +101,7 @@ class Grid:
         return out
 
 
-@compiled
+@compile_loop
 def _deposit(
     xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array
 ) -> None:
@@ -109,7 +111,7 @@ def _deposit(
                 out[yn[n] + i, xn[n] + j] += mass[n] * yw[n, i] * xw[n, j]
 
 
-@compiled
+@compile_loop
 def _sample(
     xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array
 ) -> None:
@@ -121,8 +123,8 @@ def _sample(
         out[n] = total
 
 
-@compiled
-def gather(
+@compile_loop
+def gather_to_nodes(
     block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
     """Add what the pillars of a block of rows carry to the nodes.
@@ -147,8 +149,8 @@ def gather(
                     out[f, yn[row] + i, node] += yw[row, i] * line[f, node]
 
 
-@compiled
-def spread(
+@compile_loop
+def interpolate_from_nodes(
     field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
     """The node field (y, x) at the sites of a block of rows: (rows, columns) float32."""
@@ -166,7 +168,7 @@ def spread(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Convolution:
+class RadialConvolution:
     """Convolution with a radial kernel on a grid of nodes, zero outside, by FFT.
 
     spectrum: of the kernel. shape: (y, x) of the nodes. size: (y, x) of the transform.
@@ -184,13 +186,13 @@ class Convolution:
         return np.asarray(field[: self.shape[0], : self.shape[1]])
 
 
-def convolution(
+def gaussian_convolution(
     shape: tuple[int, int],
     spacing_um: tuple[float, float],
     *,
     point: PointExposure,
     hollow: bool,
-) -> Convolution:
+) -> RadialConvolution:
     """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5
     widths out (exp(-25)).
 
@@ -217,4 +219,4 @@ def convolution(
         )
     if hollow:
         kernel[0, 0] = 0
-    return Convolution(fft.rfft2(kernel), shape, (ny, nx))
+    return RadialConvolution(fft.rfft2(kernel), shape, (ny, nx))

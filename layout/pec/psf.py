@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import Exposure
+from layout.process import ExposureSettings
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 from metalens.fabrication import read_csv
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
 
 THRESHOLD = 0.5  # exposure at the edge of a wide area of dose 1
 
@@ -47,7 +47,7 @@ class PointExposure:
         return np.asarray((self.weights * -np.expm1(-r2 / self.widths_um**2)).sum(-1))
 
 
-def point_exposure(exposure: Exposure) -> PointExposure:
+def point_exposure(exposure: ExposureSettings) -> PointExposure:
     """What the process file describes: the double or triple Gaussian, or the fit of its
     measured table.
 
@@ -56,7 +56,7 @@ def point_exposure(exposure: Exposure) -> PointExposure:
     """
     if exposure.csv is not None:
         radius, density = np.array(read_csv(exposure.csv)).T
-        return fit(radius, density, where=str(exposure.csv))
+        return fit_point_spread(radius, density, where=str(exposure.csv))
     if exposure.alpha_um is None or exposure.beta_um is None or exposure.eta is None:
         raise ProcessError(
             f"no point exposure is given: [exposure] needs {exposure.missing}"
@@ -71,7 +71,7 @@ def point_exposure(exposure: Exposure) -> PointExposure:
     )
 
 
-def fit(
+def fit_point_spread(
     radius_um: Array, density: Array, *, where: str = "point exposure"
 ) -> PointExposure:
     """Gaussians of non-negative weight through a measured radial function, by relative
@@ -154,7 +154,7 @@ def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
     return np.asarray(2 * radius / width_um**2 * i1e(2 * (radius / width_um) ** 2))
 
 
-def disc(
+def disc_exposure(
     distance_um: Array | float, diameter_um: Array | float, width_um: float
 ) -> Array:
     """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from layout.pec.bodies import Rects
+from layout.pec.bodies import ExposedRectangles
 from layout.pec.psf import PointExposure
-from layout.process import compiled
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from layout.process import compile_loop
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 _OUTSIDE_UM = (
     1e-4  # a point that far outside an edge tells whether another piece goes on there
@@ -18,7 +18,9 @@ _OUTSIDE_UM = (
 CORNER = 2.0  # widths of the core: an edge is round that near its ends
 
 
-def own(rects: Rects, near: PointExposure) -> tuple[Array, Array, Array]:
+def self_exposure(
+    rects: ExposedRectangles, near: PointExposure
+) -> tuple[Array, Array, Array]:
     """What a shape gives to its own edges by the Gaussians that are not summed on
     nodes, exact.
 
@@ -69,7 +71,7 @@ def pairs_near(
     return one[rank], two[rank]
 
 
-@compiled
+@compile_loop
 def _pairs(boxes: Array, starts: Array, apart: float, at: Array, near: Array) -> None:
     """Boxes of a shape (sorted by their left sides) within ``apart`` of each of its
     boxes: written to ``near`` from
@@ -135,11 +137,11 @@ def sums_of_boxes(
         )
 
     if len(row):
-        threads.split(len(row), work)
+        threads.run_split(len(row), work)
     return out
 
 
-@compiled
+@compile_loop
 def _sum(
     x: Array, y: Array, first: Array, last: Array, near: Array, boxes: Array, widths: Array, weights: Array,
     start: int, stop: int, out: Array,
@@ -171,7 +173,7 @@ def _sum(
 
 
 def _outer(
-    rects: Rects, starts: Array, near: Array, corner_um: float
+    rects: ExposedRectangles, starts: Array, near: Array, corner_um: float
 ) -> tuple[Array, Array]:
     """Points (n, 2) on those parts of the sides of each piece that no other piece of
     its shape covers, and the piece.
@@ -221,7 +223,7 @@ def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
     return low, high
 
 
-@compiled
+@compile_loop
 def _free(
     boxes: Array,
     starts: Array,
@@ -261,7 +263,9 @@ def _free(
     return count
 
 
-def samples(rects: Rects, step_um: float) -> tuple[Array, Array, Array]:
+def rectangle_samples(
+    rects: ExposedRectangles, step_um: float
+) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the
     rectangle of each (n,).
     """

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.pec.bodies import COARSE, PillarArray, Ranges
-from layout.pec.drawn import Drawn
+from layout.pec.bodies import COARSE, PillarArray, ScatterRanges
+from layout.pec.drawn import DrawnKinds
 from layout.pec.psf import PointExposure
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _NEIGHBOURS = 5  # sites on each side whose shapes are taken exactly
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Exposed:
+class ExposedLattices:
     """Doses on lattices, as the exact sum takes them.
 
     bodies: the samples are pillars of the first. drawn: their kinds, by entry. own:
@@ -25,15 +25,15 @@ class Exposed:
     """
 
     bodies: Sequence[PillarArray]
-    drawn: Drawn
+    drawn: DrawnKinds
     own: Array
-    ranges: Ranges
+    ranges: ScatterRanges
     point: PointExposure
     spots: tuple[Array, Array]
     dose_of: Callable[[int, int, Array], Array]
 
 
-def exact_edges(scene: Exposed, samples: int) -> tuple[Array, Array, Array]:
+def exact_edges(scene: ExposedLattices, samples: int) -> tuple[Array, Array, Array]:
     """Rows and columns of pillars, evenly drawn, and the exposure of their edges.
 
     Exact: whole shapes of all pillars within 5 sites, seen along the edges, and the
@@ -90,7 +90,7 @@ def _around(body: PillarArray, row: int) -> tuple[Array, int]:
     ), first
 
 
-def _distant(scene: Exposed, sites: tuple[Array, Array]) -> Array:
+def _distant(scene: ExposedLattices, sites: tuple[Array, Array]) -> Array:
     """(samples,) background from all that is more than 5 sites away, by the direct sum
     of Gaussians.
     """
@@ -143,7 +143,9 @@ def _own_block(
     return found
 
 
-def _close(scene: Exposed, block: tuple[Array, Array], site: tuple[int, int]) -> float:
+def _close(
+    scene: ExposedLattices, block: tuple[Array, Array], site: tuple[int, int]
+) -> float:
     """Exposure of the edges of one pillar by those within 5 sites: of exact shapes, or
     Gaussians of their second moments where the point exposure is far wider than these.
     """
@@ -176,7 +178,7 @@ def _close(scene: Exposed, block: tuple[Array, Array], site: tuple[int, int]) ->
     return total
 
 
-def _reach(drawn: Drawn, edge: Array, width: float) -> float:
+def _reach(drawn: DrawnKinds, edge: Array, width: float) -> float:
     """From middle to middle, where pillars expose each other's edges (exp(-36))."""
     widest = float(np.sqrt(drawn.wider_um2.max()))
     return float(np.hypot(*edge.T).max()) + widest + 6 * width

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Uniformity:
+class DoseUniformity:
     """Relative error of the exposure at the pillar edges, over all pillars.
 
     worst, rms: of exposure / wanted - 1.
@@ -21,7 +21,7 @@ class Uniformity:
     diameter_nm: float
 
 
-class Tally:
+class ErrorTally:
     """Running extremes and squares of relative errors."""
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class Tally:
         """Largest error; 0 where nothing was taken in."""
         return max(self._high, -self._low) if self._count else 0.0
 
-    def result(self, slope: float, shift: float) -> Uniformity:
+    def result(self, slope: float, shift: float) -> DoseUniformity:
         """Over all that was taken in, of edges that fall by ``slope`` per um, in units
         of the wanted exposure.
 
@@ -46,7 +46,7 @@ class Tally:
             numbers.
         """
         worst = self.worst + shift
-        return Uniformity(
+        return DoseUniformity(
             worst,
             (self._square / max(self._count, 1)) ** 0.5 + shift,
             2e3 * worst / slope,

@@ -2,34 +2,34 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.process import isolation as isolation
     from layout.process import names as names
     from layout.process import process as process
-    from layout.process.jit import compiled as compiled
-    from layout.process.jit import noticed as noticed
-    from layout.process.process import Exposure as Exposure
+    from layout.process.jit import announce_compilation as announce_compilation
+    from layout.process.jit import compile_loop as compile_loop
+    from layout.process.process import DesignRules as DesignRules
+    from layout.process.process import ExposureSettings as ExposureSettings
+    from layout.process.process import KeepOutZone as KeepOutZone
     from layout.process.process import LayerNumber as LayerNumber
     from layout.process.process import Process as Process
-    from layout.process.process import Rules as Rules
     from layout.process.process import WriteField as WriteField
-    from layout.process.process import Zone as Zone
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Exposure": "process",
+        "ExposureSettings": "process",
         "LayerNumber": "process",
         "Process": "process",
-        "Rules": "process",
+        "DesignRules": "process",
         "WriteField": "process",
-        "Zone": "process",
-        "compiled": "jit",
+        "KeepOutZone": "process",
+        "compile_loop": "jit",
         "isolation": "",
         "names": "",
-        "noticed": "jit",
+        "announce_compilation": "jit",
         "process": "",
     },
 )

@@ -4,15 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 _LEAST = (
     4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
 )
 
 
-def isolation(
+def isolation_map(
     present: Array,
     steps_um: tuple[float, float],
     range_um: float,
@@ -40,7 +40,7 @@ def isolation(
     """
     from scipy.ndimage import correlate1d
 
-    across, up = (halo(step, range_um) for step in steps_um)
+    across, up = (isolation_halo(step, range_um) for step in steps_um)
     along_x, along_y = (
         np.exp(-((np.arange(-n, n + 1) * step / range_um) ** 2)).astype(np.float32)
         for n, step in zip((across, up), steps_um, strict=True)
@@ -67,7 +67,7 @@ def isolation(
     return alone
 
 
-def halo(step_um: float, range_um: float) -> int:
+def isolation_halo(step_um: float, range_um: float) -> int:
     """Rows (or columns) of this distance whose pillars bear on a pillar."""
     return max(1, int(np.ceil(3 * range_um / step_um)))
 

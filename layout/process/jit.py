@@ -10,7 +10,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _NOTICE = "first run after an installation: compiling the loops over pillars, which takes some seconds and is kept"
 
 
-def compiled(function: Function) -> Function:
+def compile_loop(function: Function) -> Function:
     """Machine code of ``function``, kept on disk between runs; it releases the
     interpreter lock.
     """
@@ -20,7 +20,7 @@ def compiled(function: Function) -> Function:
 
 
 @contextmanager
-def noticed(say: Callable[[str], None]) -> Iterator[None]:
+def announce_compilation(say: Callable[[str], None]) -> Iterator[None]:
     """Say once that loops are compiled, if any must be: what is on disk already is
     loaded without a word.
     """

@@ -8,13 +8,15 @@ import numpy as np
 
 from layout.process.process import load
 from layout.shapes import convex, polygon
-from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
+from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 
 _MOST_STEPS = 4000
 
 
-def printable(path: Path, *, pitch_um: float, height_um: float) -> tuple[float, float]:
+def printable_limits(
+    path: Path, *, pitch_um: float, height_um: float
+) -> tuple[float, float]:
     """(thinnest pillar, least gap) in nm of designed pillars, so that what is drawn
     keeps the rules.
 
@@ -31,13 +33,13 @@ def printable(path: Path, *, pitch_um: float, height_um: float) -> tuple[float, 
     drawn = np.unique(-(-sizes // rules.diameter_step_nm) * rules.diameter_step_nm)
     drawn = drawn[(drawn >= 0.5 * rules.minimum_feature_nm) & (drawn < pitch)]
     shapes = [
-        polygon.pillar(
+        polygon.pillar_polygon(
             float(d) / rules.grid_nm, vertices=rules.vertices, shape=rules.shape
         ).points
         for d in drawn
     ]
     half = np.array([p[:, 0].max() for p in shapes]) * rules.grid_nm
-    width = np.array([convex.width(p) for p in shapes]) * rules.grid_nm
+    width = np.array([convex.least_width(p) for p in shapes]) * rules.grid_nm
     _, foot = process.top_foot_nm(
         process.made_diameter_nm(drawn) + max(0.0, process.bias.isolated_nm),
         height_um / nm,

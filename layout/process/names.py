@@ -2,13 +2,13 @@
 
 import re
 
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 LONGEST = 32
 _ILLEGAL = re.compile(r"[^A-Za-z0-9_$]")
 
 
-def check(name: str) -> str:
+def check_cell_name(name: str) -> str:
     """``name``, if GDSII and OASIS allow it: 1 to 32 letters, digits, ``_`` or ``$``.
 
     Raises:
@@ -17,18 +17,18 @@ def check(name: str) -> str:
     if 0 < len(name) <= LONGEST and not _ILLEGAL.search(name):
         return name
     raise ProcessError(
-        f"cell name {name!r}: need 1 to {LONGEST} of A-Z a-z 0-9 _ $; for example {legal(name)!r}"
+        f"cell name {name!r}: need 1 to {LONGEST} of A-Z a-z 0-9 _ $; for example {legal_cell_name(name)!r}"
     )
 
 
-def legal(text: str) -> str:
+def legal_cell_name(text: str) -> str:
     """The nearest legal name to any text."""
     return (
         _ILLEGAL.sub("_", text.encode("ascii", "replace").decode())[:LONGEST] or "LENS"
     )
 
 
-def distinct(names: list[str]) -> None:
+def check_distinct_names(names: list[str]) -> None:
     """Refuse a name that is used twice.
 
     Raises:
@@ -36,6 +36,6 @@ def distinct(names: list[str]) -> None:
     """
     seen: set[str] = set()
     for name in names:
-        if check(name) in seen:
+        if check_cell_name(name) in seen:
             raise ProcessError(f"two cells are named {name!r}; give each its own name")
         seen.add(name)

@@ -14,17 +14,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from metalens.core import config
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, ProcessError
+from metalens.core.units import deg
 from metalens.fabrication import Bias, Spread, with_table
-from metalens.ground import config
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, ProcessError
-from metalens.ground.units import deg
 
 LayerNumber = tuple[int, int]  # layer, datatype
 
 
 @dataclass(frozen=True, slots=True)
-class Zone:
+class KeepOutZone:
     """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand.
 
     x_um, y_um: lower left corner. width_um, height_um: of the rectangle. name: in the
@@ -42,7 +42,7 @@ class Zone:
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
+class DesignRules:
     """What can be printed, and on which grid.
 
     minimum_feature_nm, minimum_gap_nm: thinnest pillar and narrowest gap, of the
@@ -72,7 +72,7 @@ class Rules:
     shape: Literal["round", "shot"] = "round"
     maximum_density: float = 0.75
     density_window_um: float = 20.0
-    exclusion: tuple[Zone, ...] = ()
+    exclusion: tuple[KeepOutZone, ...] = ()
 
     def __post_init__(self) -> None:
         _positive(
@@ -104,7 +104,7 @@ class Rules:
 
 
 @dataclass(frozen=True, slots=True)
-class Layers:
+class LayerTable:
     """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array.
 
     pillar, aperture, marks, labels, dose, witness, fields, outline: (layer, datatype)
@@ -136,7 +136,7 @@ class Layers:
 
 
 @dataclass(frozen=True, slots=True)
-class Etch:
+class EtchProfile:
     """Shape of what is made.
 
     sidewall_deg: tilt of the wall from the vertical, above 0 where the foot is wider
@@ -159,7 +159,7 @@ class Etch:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class ExposureSettings:
     """Electron exposure: base dose, point-exposure function, dose classes.
 
     base_uC_cm2: dose that just clears the edge of a wide, uniformly written area.
@@ -276,7 +276,7 @@ class WriteField:
 
 
 @dataclass(frozen=True, slots=True)
-class Die:
+class DieSettings:
     """The die around the aperture.
 
     size_um: (x, y) of the die; left out: the aperture and ``margin_um`` on each side.
@@ -344,13 +344,13 @@ class Process:
 
     name: str = "e-beam, a-Si on fused silica"
     tone: Literal["positive", "negative"] = "positive"
-    rules: Rules = field(default_factory=Rules)
-    layers: Layers = field(default_factory=Layers)
+    rules: DesignRules = field(default_factory=DesignRules)
+    layers: LayerTable = field(default_factory=LayerTable)
     bias: Bias = field(default_factory=Bias)
-    etch: Etch = field(default_factory=Etch)
-    exposure: Exposure = field(default_factory=Exposure)
+    etch: EtchProfile = field(default_factory=EtchProfile)
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
     write_field: WriteField = field(default_factory=WriteField)
-    die: Die = field(default_factory=Die)
+    die: DieSettings = field(default_factory=DieSettings)
     spread: Spread = field(default_factory=Spread)
 
     def made_diameter_nm(
@@ -361,7 +361,7 @@ class Process:
 
         Args:
             written_nm: equal-area diameter of the drawn polygon.
-            isolation: of each pillar, see :func:`layout.process.isolation.isolation`.
+            isolation: of each pillar, see :func:`layout.process.isolation.isolation_map`.
         """
         written = np.asarray(written_nm, float)
         return self.bias.made_nm(written - self._rounding_nm(written), isolation)
@@ -410,10 +410,10 @@ def load(path: str | Path) -> Process:
     """
     path = Path(path)
     process = config.load(path, Process)
-    return resolve(process, path.parent)
+    return resolve_process(process, path.parent)
 
 
-def resolve(process: Process, folder: str | Path) -> Process:
+def resolve_process(process: Process, folder: str | Path) -> Process:
     """``process`` with its CSV files found in ``folder`` and the bias table read in."""
     folder = Path(folder)
     process = dataclasses.replace(process, bias=with_table(process.bias, folder))

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from layout.shapes import convex as convex
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from layout.shapes import rectilinear as rectilinear
     from layout.shapes import region as region
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "convex": "",

@@ -4,22 +4,22 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
-def reach(points: Array) -> float:
+def farthest_vertex(points: Array) -> float:
     """Distance from the origin to the farthest vertex."""
     return float(np.sqrt((points.astype(float) ** 2).sum(1).max()))
 
 
-def hull(points: Array) -> Array:
+def convex_hull(points: Array) -> Array:
     """(m, 2) corners of the convex polygon around points (n, 2), counter-clockwise."""
     from scipy.spatial import ConvexHull
 
     return np.asarray(points[ConvexHull(points).vertices])
 
 
-def width(points: Array) -> float:
+def least_width(points: Array) -> float:
     """Least distance of two parallel lines with the polygon between them: one of them
     runs along an edge.
     """
@@ -29,7 +29,7 @@ def width(points: Array) -> float:
     return float(((spans.max(1) - spans.min(1)) / np.hypot(*normals.T)).min())
 
 
-def gap(first: Array, second: Array, dx: int, dy: int) -> float:
+def convex_gap(first: Array, second: Array, dx: int, dy: int) -> float:
     """Distance from ``first`` to ``second`` moved by (dx, dy); 0 where they touch, -1
     where they overlap.
     """

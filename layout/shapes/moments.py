@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 Contours = Sequence[Array]  # (n, 2) each
 
 
-def moments(contours: Contours) -> tuple[float, Array, float]:
+def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
     """Area, (2,) integral of x and y over it, and integral of x² + y²; of a hole alone
     the area is below 0.
     """
@@ -30,7 +30,7 @@ def perimeter(contours: Contours) -> float:
     return sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
 
 
-def along(contours: Contours, count: int) -> Array:
+def points_along_edges(contours: Contours, count: int) -> Array:
     """(count, 2) places evenly along all edges."""
     start = np.concatenate(list(contours))
     edge = np.concatenate([np.roll(c, -1, axis=0) for c in contours]) - start

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 _FREE = 1e-3  # area error below which the nearer outline is taken
 _FEWER = (48, 32, 24, 20, 16, 12, 8)  # a coarse grid suits few vertices better
@@ -63,7 +63,9 @@ class PillarShape:
         return len(np.unique(self.points[:, 1])) - 1
 
 
-def pillar(diameter: float, *, vertices: int = 32, shape: str = "round") -> PillarShape:
+def pillar_polygon(
+    diameter: float, *, vertices: int = 32, shape: str = "round"
+) -> PillarShape:
     """Polygon of the area of a circle.
 
     For diameters that differ by a grid step or more, widths along both axes and areas
@@ -103,7 +105,7 @@ def _pillar(diameter: float, vertices: int) -> PillarShape:
             break
     if best is None:
         raise ProcessError(f"no polygon for {diameter} grid steps; take a finer grid")
-    points = mirrored(best[1])
+    points = eightfold_images(best[1])
     points.setflags(write=False)
     return PillarShape(points, diameter)
 
@@ -192,7 +194,7 @@ def _sound(eighths: Array, diagonal: bool) -> Array:
     return np.asarray(~wrong)
 
 
-def mirrored(eighth: Array) -> Array:
+def eightfold_images(eighth: Array) -> Array:
     """All eight images of the vertices of one eighth: (n, 2), counter-clockwise;
     doubles and flat corners go.
     """

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 _SLICES = 64  # of a polygon, at most
 _SLICE = 5000  # units
 
 
-def rectangles(points: Array) -> Array:
+def split_rectilinear(points: Array) -> Array:
     """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by
     slab.
 
@@ -40,13 +40,13 @@ def rectangles(points: Array) -> Array:
     return np.array(found, np.int64).reshape(-1, 4)
 
 
-def covering(shape: Array) -> Array:
+def covering_rectangles(shape: Array) -> Array:
     """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of
     slices 5 um high or more.
     """
     step = np.roll(shape, -1, axis=0) - shape
     if not (step != 0).all(1).any():
-        return rectangles(shape)
+        return split_rectilinear(shape)
     low, high = int(shape[:, 1].min()), int(shape[:, 1].max())
     ends = np.linspace(low, high, min(_SLICES, max(1, (high - low) // _SLICE)) + 1)
     start = shape.astype(float)
@@ -72,7 +72,7 @@ def covering(shape: Array) -> Array:
     return np.array(made, np.int64)
 
 
-def corners(box: Array) -> Array:
+def box_corners(box: Array) -> Array:
     """(4, 2) corners of left, bottom, right, top, counter-clockwise."""
     left, bottom, right, top = np.asarray(box).tolist()
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])

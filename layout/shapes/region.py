@@ -7,22 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
-def union(polygons: Iterable[Array]) -> list[Array]:
+def union_contours(polygons: Iterable[Array]) -> list[Array]:
     """Contours of the union: outlines counter-clockwise, holes clockwise."""
     return _contours(_section(polygons))
 
 
-def difference(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
+def subtract_contours(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
     """Contours of what is left of ``contours`` (outlines counter-clockwise, holes
     clockwise) without ``taken``.
     """
     return _contours(_section(contours, filled=False) - _section(taken))
 
 
-def overlap(contours: Iterable[Array], polygons: Iterable[Array]) -> list[Array]:
+def overlap_contours(
+    contours: Iterable[Array], polygons: Iterable[Array]
+) -> list[Array]:
     """Contours (outlines and holes) of what ``contours`` share with ``polygons``."""
     return _contours(_section(contours, filled=False) ^ _section(polygons))
 
@@ -40,7 +42,7 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
     return list(_cut(_section(contours, filled=False), grid))
 
 
-def triangles(contours: Sequence[Array]) -> Array:
+def triangulate(contours: Sequence[Array]) -> Array:
     """(n, 3) corners, numbered on through all contours, of triangles that fill outlines
     (counter-clockwise) but for
     their holes (clockwise); they run counter-clockwise.

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Lens, reach
-from metalens.propagate import Case, case, paths
+from metalens.propagate import PropagationCase, make_case, paths
 
 _ON_AXIS = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Window:
+class FocusWindow:
     """Where the light is looked at.
 
     x_um, y_um: (x,), (y,) positions on the sensor; distance_um: lens to sensor.
@@ -43,7 +43,7 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Focus:
+class FocusSums:
     """Sums over the pillars of a lens, prepared for one window.
 
     case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um,
@@ -52,8 +52,8 @@ class Focus:
     curvature: 1 / depth of the reference source whose phase is taken off.
     """
 
-    window: Window
-    case: Case
+    window: FocusWindow
+    case: PropagationCase
     x_um: Array
     y_um: Array
     nodes_x_um: Array
@@ -96,7 +96,7 @@ class Focus:
         weights = weights.reshape(-1, weights.shape[-1]).T.astype(np.complex64)
         rows = []
         for y in window.y_um:
-            level, away = paths.beyond(
+            level, away = paths.ray_to_offset(
                 self.case, nodes_x, nodes_y, window.x_um[:, None, None], y
             )
             kernel = (
@@ -127,7 +127,7 @@ class Focus:
         return np.asarray(np.remainder(self.case.wavenumber * path, 2 * np.pi))
 
 
-def check(lens: Lens) -> None:
+def check_study_lens(lens: Lens) -> None:
     """Refuse a lens that no study takes, before any work: one behind a stop."""
     if lens.layers.stop is not None:
         raise PropagationError(
@@ -136,7 +136,7 @@ def check(lens: Lens) -> None:
         )
 
 
-def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
+def prepare_focus(lens: Lens, window: FocusWindow, *, margin: int = 12) -> FocusSums:
     """Basis for a lens and a window; as many nodes as the phase between them turns, and
     ``margin`` more.
 
@@ -149,12 +149,12 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
             stop, whose shadow is another at each depth where these sums are shared by
             all.
     """
-    check(lens)
+    check_study_lens(lens)
     if min(len(window.x_um), len(window.y_um), *lens.diameters.diameter_um.shape) < 2:
         raise PropagationError(
             "the window and the lens need 2 samples and sites a side or more"
         )
-    seen = case(
+    seen = make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
         wavelength_um=window.wavelength_um,
@@ -169,10 +169,12 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
     count_x = _count(seen, float(x[-1]), float(abs(window.x_um).max()), middle) + margin
     count_y = _count(seen, float(y[-1]), float(abs(window.y_um).max()), middle) + margin
     (nodes_x, onto_x), (nodes_y, onto_y) = _basis(x, count_x), _basis(y, count_y)
-    return Focus(window, seen, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
+    return FocusSums(window, seen, x, y, nodes_x, nodes_y, onto_x, onto_y, middle)
 
 
-def window(lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0) -> Window:
+def focus_window(
+    lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0
+) -> FocusWindow:
     """A window around the axis that holds the blur at all depths and ``rings``
     diffraction widths around it.
 
@@ -187,10 +189,10 @@ def window(lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0) ->
     blur = max(reach.blur_um(lens, depth) for depth in depths)
     half = int(np.ceil((blur + 2 * rings * step) / step))
     axis = np.arange(-half, half + 1) * step
-    return Window(axis, axis, lens.sensor_distance_um, lens.wavelength_um, depths)
+    return FocusWindow(axis, axis, lens.sensor_distance_um, lens.wavelength_um, depths)
 
 
-def peak(psf: Array) -> Array:
+def interpolated_peak(psf: Array) -> Array:
     """(...) largest value between the samples of (..., y, x) intensities that are
     sampled finely enough.
 
@@ -219,12 +221,14 @@ def peak(psf: Array) -> Array:
     return np.array(found).reshape(psf.shape[:-2])
 
 
-def _count(seen: Case, edge_um: float, reach_um: float, middle: float) -> int:
+def _count(
+    seen: PropagationCase, edge_um: float, reach_um: float, middle: float
+) -> int:
     """Half the turns of phase across the lens that are left, plus what Chebyshev series
     need beyond (Bessel decay).
     """
     x = np.linspace(-edge_um, edge_um, 1001)
-    away = paths.beyond(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(
+    away = paths.ray_to_offset(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(
         seen, x, 0.0, _ON_AXIS, middle
     )
     differences = [

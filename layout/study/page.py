@@ -10,18 +10,18 @@ import numpy as np
 from layout.mask import FieldPlan
 from layout.process import Process
 from layout.study import stitching, tolerance
-from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.sensitivity import LogSensitivities, compute_sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
+from metalens.core import report
+from metalens.core.arrays import Array
+from metalens.core.report import Figure, Section, Table
+from metalens.core.units import deg
 from metalens.fabrication import PairSensitivities, pair_sensitivities
-from metalens.ground import report
-from metalens.ground.arrays import Array
-from metalens.ground.report import Figure, Section, Table
-from metalens.ground.units import deg
 from metalens.lens import Lens
 
 Answers = Mapping[
-    str, Sensitivities | PairSensitivities
+    str, LogSensitivities | PairSensitivities
 ]  # of light along "x" and "y"; of pillars of one size under ""
 
 
@@ -31,10 +31,14 @@ def answers_of(lens: Lens) -> Answers:
     Raises:
         CellError, MaterialError: from the solver of the pillar.
     """
-    return {"": sensitivities(lens)} if lens.pairs is None else pair_sensitivities(lens)
+    return (
+        {"": compute_sensitivities(lens)}
+        if lens.pairs is None
+        else pair_sensitivities(lens)
+    )
 
 
-def sections(
+def study_sections(
     lens: Lens, process: Process, plan: FieldPlan, answers: Answers
 ) -> list[Section]:
     """Stitching and tolerance; half a minute for a 1 mm lens, most of it for the solver
@@ -59,13 +63,13 @@ def _of_light(
     lens: Lens,
     process: Process,
     plan: FieldPlan,
-    answers: Sensitivities | PairSensitivities,
+    answers: LogSensitivities | PairSensitivities,
 ) -> list[Section]:
-    return [_stitching(lens, plan, process), tolerances(lens, process, answers)]
+    return [_stitching(lens, plan, process), tolerance_section(lens, process, answers)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
-    found = stitching.stitching(lens, plan, process)
+    found = stitching.simulate_stitching(lens, plan, process)
     rows = [
         ["peak of the PSF", float(found.strehl.mean()), float(found.strehl.min())],
         [
@@ -103,7 +107,7 @@ def _stitched(found: StitchReport) -> bytes:
         )
         for image in (found.psf, found.worst_psf)
     )
-    figure, axes = report.canvas(1, 2, size=(7.8, 3.2))
+    figure, axes = report.make_figure(1, 2, size=(7.8, 3.2))
     edge = float(found.window.x_um[-1])
     extent = (-edge, edge, edge, -edge)
     level = 10 * np.log10(np.maximum(perfect / perfect.max(), 1e-5))
@@ -119,14 +123,14 @@ def _stitched(found: StitchReport) -> bytes:
         ax.set(title=title, xlabel="x / µm", ylabel="y / µm")
         ax.grid(visible=False)
         figure.colorbar(shown, ax=ax, label=unit)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
-def tolerances(
-    lens: Lens, process: Process, answers: Sensitivities | PairSensitivities
+def tolerance_section(
+    lens: Lens, process: Process, answers: LogSensitivities | PairSensitivities
 ) -> Section:
     """Each cause alone and all together, and what the numbers are not of."""
-    study = tolerance.analyse(lens, process, sens=answers)
+    study = tolerance.analyse_tolerance(lens, process, sens=answers)
     rows = [
         [
             e.cause,
@@ -203,7 +207,7 @@ def _beside(lens: Lens, process: Process) -> str:
 def _bands(study: ToleranceReport) -> bytes:
     from scipy.signal import resample
 
-    figure, axes = report.canvas(1, 2, size=(7.8, 3.0))
+    figure, axes = report.make_figure(1, 2, size=(7.8, 3.0))
     x = study.window.x_um
     fine = np.arange(8 * len(x)) * (x[1] - x[0]) / 8 + x[0]
     low, middle, high = (
@@ -221,7 +225,7 @@ def _bands(study: ToleranceReport) -> bytes:
     axes[1].errorbar(depth, middle, [middle - low, high - middle], fmt="o", capsize=4)
     axes[1].plot(depth, study.nominal.information[0], "k_", ms=14)
     axes[1].set(xlabel="depth / mm", ylabel="I(z) / µm⁻²", yscale="log")
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _finer(samples: Array, interpolated: Array) -> Array:

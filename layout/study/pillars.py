@@ -7,7 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from layout.study.sensitivity import Sensitivities
+from layout.study.sensitivity import LogSensitivities
+from metalens.core.arrays import Array
 from metalens.fabrication import (
     Kinds,
     PairSensitivities,
@@ -15,12 +16,11 @@ from metalens.fabrication import (
     State,
     transmission,
 )
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.pillars import Proxy
 
 
-class Pillars(Protocol):
+class PillarKindsOfLens(Protocol):
     """Kinds of pillars, of one size or of two."""
 
     def curve(self, bias_um: Array, state: State) -> Array:
@@ -36,7 +36,7 @@ class OneSize:
 
     proxy: Proxy
     wavelength_um: float
-    sens: Sensitivities
+    sens: LogSensitivities
     diameter_um: Array
 
     def curve(self, bias_um: Array, state: State) -> Array:
@@ -70,15 +70,15 @@ class TwoSizes:
         )
 
 
-def kinds(
-    lens: Lens, sens: Sensitivities | PairSensitivities
-) -> tuple[Array, Array, Pillars]:
+def classify_pillars(
+    lens: Lens, sens: LogSensitivities | PairSensitivities
+) -> tuple[Array, Array, PillarKindsOfLens]:
     """((y, x) kind of each site from 1 on, 0 none; (kinds,) how many of each; what
     their t follows from).
     """
     own = Kinds.of(lens.diameters)
     index = (own.index(lens.diameters) + 1) % (len(own.count) + 1)
-    if isinstance(sens, Sensitivities):
+    if isinstance(sens, LogSensitivities):
         return (
             index,
             own.count,

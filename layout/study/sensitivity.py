@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.core import executor
+from metalens.core.arrays import Array
 from metalens.fabrication import ResponseError, of_kind, own_rates, with_missing
-from metalens.ground import executor
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 Solver = Callable[[Cell, Array, float, bool], Array]
@@ -18,7 +18,7 @@ _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer trunc
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sensitivities:
+class LogSensitivities:
     """Logarithmic derivatives of t: the real part changes |t|, the imaginary part is a
     phase in rad.
 
@@ -53,9 +53,9 @@ class Sensitivities:
         return np.asarray(np.interp(diameter_um, self.diameter_um, self.edges))
 
 
-def sensitivities(
+def compute_sensitivities(
     lens: Lens, *, count: int = 15, solver: Solver | None = None
-) -> Sensitivities:
+) -> LogSensitivities:
     """Derivatives of ln t at ``count`` diameters (of shapes: sizes) over the proxy's
     domain, by every answering cause.
 
@@ -78,16 +78,18 @@ def sensitivities(
     return _differences(lens, diameters, solver)
 
 
-def _exact(lens: Lens, diameter_um: Array) -> Sensitivities:
+def _exact(lens: Lens, diameter_um: Array) -> LogSensitivities:
     """From the derivatives of the Jones matrices."""
     found = own_rates(lens, diameter_um)
-    return Sensitivities(diameter_um, found.rates, found.error, found.edges)
+    return LogSensitivities(diameter_um, found.rates, found.error, found.edges)
 
 
-def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
+def _differences(lens: Lens, diameters: Array, solver: Solver) -> LogSensitivities:
     """Central differences through a solver."""
     tasks = list(_tasks(lens, diameters))
-    solved = iter(executor.gather(_solved, (solver, lens.wavelength_um), tasks))
+    solved = iter(
+        executor.gather_parallel(_solved, (solver, lens.wavelength_um), tasks)
+    )
     found, worst = [], 0.0
     for acts in _answering():
         if acts.changed is None:
@@ -100,7 +102,7 @@ def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
         scale = max(float(np.linalg.norm(rates[1])), 1e-9)
         worst = max(worst, float(np.linalg.norm(rates[1] - rates[0])) / scale)
         found.append(np.interp(diameters, _some(lens, acts, diameters), rates[1]))
-    return Sensitivities(diameters, np.array(found), worst)
+    return LogSensitivities(diameters, np.array(found), worst)
 
 
 def _answering() -> list[ResponseError]:

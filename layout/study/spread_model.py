@@ -19,12 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.study.focus import Focus
-from layout.study.pillars import Pillars, kinds
-from layout.study.sensitivity import Sensitivities
+from layout.study.focus import FocusSums
+from layout.study.pillars import PillarKindsOfLens, classify_pillars
+from layout.study.sensitivity import LogSensitivities
+from metalens.core import executor, threads
+from metalens.core.arrays import Array
 from metalens.fabrication import Draw, PairSensitivities, Spread, State, draws
-from metalens.ground import executor, threads
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 _BAND, _PARTS = (
@@ -37,7 +37,7 @@ _SAMPLES = 160
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Model:
+class SpreadModel:
     """Sums over the pillars of a lens for all draws of its process.
 
     pillars: the kinds of them (sizes to 0.05 nm), and what their t answers to. count:
@@ -46,8 +46,8 @@ class Model:
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
 
-    pillars: Pillars
-    focus: Focus
+    pillars: PillarKindsOfLens
+    focus: FocusSums
     count: Array
     basis: Array
     moments: Array
@@ -82,18 +82,18 @@ class Model:
         return np.stack(found)
 
 
-def reduce(
+def reduce_spread(
     lens: Lens,
-    sens: Sensitivities | PairSensitivities,
-    focus: Focus,
+    sens: LogSensitivities | PairSensitivities,
+    focus: FocusSums,
     spread: Spread,
     *,
     seed: int,
-) -> Model:
+) -> SpreadModel:
     """Find the basis from random draws of the spread, and sum the pillars for each of
     its functions.
     """
-    index, count, pillars = kinds(lens, sens)
+    index, count, pillars = classify_pillars(lens, sens)
     states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
@@ -118,9 +118,9 @@ def reduce(
         for start, stop in itertools.pairwise(edges)
     ]
     moments = functools.reduce(
-        np.add, executor.gather(_summed, (focus, columns), parts)
+        np.add, executor.gather_parallel(_summed, (focus, columns), parts)
     )
-    return Model(pillars, focus, count, basis, moments, lens.diameters.radius_um)
+    return SpreadModel(pillars, focus, count, basis, moments, lens.diameters.radius_um)
 
 
 def _turned(lens: Lens, rows: slice) -> Array | None:
@@ -134,7 +134,9 @@ def _turned(lens: Lens, rows: slice) -> Array | None:
     )
 
 
-def _summed(about: tuple[Focus, Array], part: tuple[int, Array, Array | None]) -> Array:
+def _summed(
+    about: tuple[FocusSums, Array], part: tuple[int, Array, Array | None]
+) -> Array:
     """(rank, nodes y, nodes x) sums over rows of pillars.
 
     about: and the (rank, 1 + kinds) basis. part: first row; (rows, x) kind of each
@@ -157,7 +159,7 @@ def _summed(about: tuple[Focus, Array], part: tuple[int, Array, Array | None]) -
     return moments
 
 
-def missed(model: Model, lenses: Sequence[Draw]) -> float:
+def reduction_error(model: SpreadModel, lenses: Sequence[Draw]) -> float:
     """Largest rms relative error of t over the pillars in any draw, at the centre and
     on both sides of the edge.
     """

@@ -13,9 +13,15 @@ import numpy as np
 
 from layout.mask import FieldPlan
 from layout.process import Process
-from layout.study.focus import Focus, Window, peak, prepare, window
+from layout.study.focus import (
+    FocusSums,
+    FocusWindow,
+    focus_window,
+    interpolated_peak,
+    prepare_focus,
+)
+from metalens.core.arrays import Array
 from metalens.fabrication import designed
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 _BAND = 64
@@ -40,12 +46,12 @@ class StitchReport:
     moved_nm: Array
     psf: Array
     worst_psf: Array
-    window: Window
+    window: FocusWindow
     fields: int
     seed: int
 
 
-def stitching(
+def simulate_stitching(
     lens: Lens, plan: FieldPlan, process: Process, *, draws: int = 500, seed: int = 0
 ) -> StitchReport:
     """Draw field offsets and see the focus of the design source change.
@@ -57,7 +63,7 @@ def stitching(
         terms beyond the second order in the offset: (k NA offset)^3 / 6, below 1e-5 at
         20 nm and NA 0.25.
     """
-    focus = prepare(lens, window(lens))
+    focus = prepare_focus(lens, focus_window(lens))
     held, moments = field_moments(lens, plan, focus)
     step = max(process.write_field.stitching_nm, 1.0) * 1e-3
     still, terms = _expansion(focus, moments, step)
@@ -81,7 +87,7 @@ def stitching(
         * 1e3
     )
     worst = int(change.argmax())
-    strehl = peak(psf) / peak(perfect)
+    strehl = interpolated_peak(psf) / interpolated_peak(perfect)
     return StitchReport(
         process.write_field.stitching_nm,
         strehl,
@@ -95,7 +101,7 @@ def stitching(
     )
 
 
-def field_moments(lens: Lens, plan: FieldPlan, focus: Focus) -> tuple[int, Array]:
+def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, Array]:
     """(fields that hold pillars, (fields, nodes y, nodes x) sums of their pillars)."""
     found = []
     for rows, columns in plan.blocks():
@@ -124,7 +130,7 @@ def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
     return np.where(d > 0, t, 0)[:, columns].astype(np.complex64)
 
 
-def _expansion(focus: Focus, moments: Array, step_um: float) -> tuple[Array, Array]:
+def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array, Array]:
     """((y, x) light of all fields, (5, fields, y, x) derivatives by x, y, xx, yy, xy,
     in units of the step).
     """
@@ -145,7 +151,7 @@ def _expansion(focus: Focus, moments: Array, step_um: float) -> tuple[Array, Arr
     return still.sum(0), np.stack(terms)
 
 
-def _centroid(psf: Array, where: Window) -> Array:
+def _centroid(psf: Array, where: FocusWindow) -> Array:
     total = psf.sum((1, 2))
     return np.stack(
         [(psf.sum(1) @ where.x_um) / total, (psf.sum(2) @ where.y_um) / total]

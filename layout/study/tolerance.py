@@ -7,9 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.process import Process
-from layout.study.focus import Window, peak, prepare, window
-from layout.study.sensitivity import Sensitivities, sensitivities
-from layout.study.spread_model import Model, missed, reduce
+from layout.study.focus import (
+    FocusWindow,
+    focus_window,
+    interpolated_peak,
+    prepare_focus,
+)
+from layout.study.sensitivity import LogSensitivities, compute_sensitivities
+from layout.study.spread_model import SpreadModel, reduce_spread, reduction_error
+from metalens.core import executor, threads
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 from metalens.fabrication import (
     Draw,
     PairSensitivities,
@@ -17,9 +25,6 @@ from metalens.fabrication import (
     pair_sensitivities,
     spread,
 )
-from metalens.ground import executor, threads
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
 from metalens.lens import Lens, reach
 
 # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16
@@ -29,7 +34,7 @@ _BATCH = 25
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Outcome:
+class ToleranceOutcome:
     """What is looked at, for draws of the process; the first axis counts them.
 
     strehl: (draws,) peak at the design depth relative to the nominal lens.
@@ -50,7 +55,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Effect:
+class CauseEffect:
     """One cause at its standard deviation, both signs; the worse of the two for each
     number.
 
@@ -72,7 +77,7 @@ class Effect:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ToleranceReport:
-    """Result of :func:`analyse`.
+    """Result of :func:`analyse_tolerance`.
 
     effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte
     Carlo.
@@ -82,26 +87,26 @@ class ToleranceReport:
     the pillars in any draw.
     """
 
-    effects: tuple[Effect, ...]
-    nominal: Outcome
-    draws: Outcome
+    effects: tuple[CauseEffect, ...]
+    nominal: ToleranceOutcome
+    draws: ToleranceOutcome
     depths_um: Array
     step_um: float
-    window: Window
+    window: FocusWindow
     rank: int
     error: float
     seed: int
 
     def band(self, name: str, percent: tuple[float, ...] = (5, 50, 95)) -> Array:
-        """(percent, ...) percentiles of a quantity of :class:`Outcome` over the draws."""
+        """(percent, ...) percentiles of a quantity of :class:`ToleranceOutcome` over the draws."""
         return np.asarray(np.percentile(getattr(self.draws, name), percent, axis=0))
 
 
-def analyse(
+def analyse_tolerance(
     lens: Lens,
     process: Process,
     *,
-    sens: Sensitivities | PairSensitivities | None = None,
+    sens: LogSensitivities | PairSensitivities | None = None,
     depths_um: tuple[float, ...] = (),
     draws: int = 100,
     seed: int = 0,
@@ -128,7 +133,7 @@ def analyse(
     process.spread.check(lens.cell)
     if sens is None:
         sens = (
-            sensitivities(lens)
+            compute_sensitivities(lens)
             if lens.pairs is None
             else pair_sensitivities(lens)[lens.light]
         )
@@ -140,8 +145,8 @@ def analyse(
     every = np.array(
         [lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))]
     )
-    focus = prepare(lens, window(lens, depths_um=every))
-    model = reduce(lens, sens, focus, process.spread, seed=seed)
+    focus = prepare_focus(lens, focus_window(lens, depths_um=every))
+    model = reduce_spread(lens, sens, focus, process.spread, seed=seed)
     single = [
         Draw({name: sign * s})
         for name, s in process.spread.stated.items()
@@ -170,7 +175,7 @@ def analyse(
         )
         for n in range(len(single) // 2)
     )
-    error = missed(model, everything)
+    error = reduction_error(model, everything)
     return ToleranceReport(
         effects,
         nominal,
@@ -184,7 +189,9 @@ def analyse(
     )
 
 
-def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
+def _outcome(
+    model: SpreadModel, lenses: list[State], step_um: float
+) -> ToleranceOutcome:
     """Everything that is looked at, lens by lens; the first is the nominal one."""
     with threads.one_blas_thread():  # as workers have
         reference = np.asarray(
@@ -193,12 +200,16 @@ def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
     batches = [
         lenses[start : start + _BATCH] for start in range(0, len(lenses), _BATCH)
     ]
-    parts = executor.gather(_seen, (model, reference, step_um), batches)
-    return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    parts = executor.gather_parallel(_seen, (model, reference, step_um), batches)
+    return ToleranceOutcome(
+        *(np.concatenate(column) for column in zip(*parts, strict=True))
+    )
 
 
-def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array, ...]:
-    """Fields of :class:`Outcome` of some lenses.
+def _seen(
+    about: tuple[SpreadModel, Array, float], lenses: list[State]
+) -> tuple[Array, ...]:
+    """Fields of :class:`ToleranceOutcome` of some lenses.
 
     about: model, (y, x) intensity of the nominal lens at the design depth, step of the
     depths in um.
@@ -211,7 +222,7 @@ def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array
     unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
     steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
     return (
-        peak(design) / peak(reference),
+        interpolated_peak(design) / interpolated_peak(reference),
         design.sum((1, 2)) * view.cell_um2 / incident,
         np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
         (steps**2).sum((2, 3)),
@@ -219,7 +230,7 @@ def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array
     )
 
 
-def _part(outcome: Outcome, rows: slice) -> Outcome:
+def _part(outcome: ToleranceOutcome, rows: slice) -> ToleranceOutcome:
     every = (
         outcome.strehl,
         outcome.efficiency,
@@ -227,12 +238,15 @@ def _part(outcome: Outcome, rows: slice) -> Outcome:
         outcome.information,
         outcome.psf,
     )
-    return Outcome(*(values[rows] for values in every))
+    return ToleranceOutcome(*(values[rows] for values in every))
 
 
 def _effect(
-    model: Model, signs: tuple[Draw, ...], found: Outcome, nominal: Outcome
-) -> Effect:
+    model: SpreadModel,
+    signs: tuple[Draw, ...],
+    found: ToleranceOutcome,
+    nominal: ToleranceOutcome,
+) -> CauseEffect:
     """The worse of both signs of one cause; pillar statistics at the bias that the
     cause has at the edge.
     """
@@ -242,7 +256,7 @@ def _effect(
     def worst(values: Array, reference: Array) -> float:
         return float(abs(values / reference - 1).max())
 
-    return Effect(
+    return CauseEffect(
         cause=cause,
         deviation=deviation,
         phase_rad=max(phase for phase, _ in changes),
@@ -254,7 +268,7 @@ def _effect(
     )
 
 
-def _pillar_change(model: Model, state: State) -> tuple[float, float]:
+def _pillar_change(model: SpreadModel, state: State) -> tuple[float, float]:
     """(rms phase change about the mean, rms change of |T|) over pillars spread evenly
     over the aperture.
     """

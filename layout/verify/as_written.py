@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from layout.mask import MaskPlan
-from layout.verify.exposure import Rows
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
+from layout.verify.exposure import ExposedRows
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 from metalens.lens import Lens
 
 
@@ -19,7 +19,7 @@ class LensRows:
         lattice = plan.lattices[0]
         self._size_um: Array = np.zeros((lattice.rows, lattice.columns), np.float32)
 
-    def take(self, rows: Rows) -> None:
+    def take(self, rows: ExposedRows) -> None:
         """Take in rows; the first row of a mask is the last of the map."""
         if rows.number == 0:
             end = len(self._size_um) - rows.first

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.formats import NOTHING, MaskContent, flatten
-from layout.mask import Lattice, MaskPlan
+from layout.mask import MaskPlan, PillarLattice
 from layout.pec import (
-    Discs,
-    Drawn,
-    Outlines,
+    DrawnDiscs,
+    DrawnKinds,
+    DrawnOutlines,
     PillarArray,
     bodies,
     correct,
@@ -28,11 +28,11 @@ from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
 from layout.process import LayerNumber, Process, isolation
 from layout.shapes import polygon, region
 from layout.verify import polygon_edges
-from layout.verify.polygon_edges import Polygons
-from layout.verify.report import Edges, ExposureReport, Tally
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
-from metalens.ground.units import nm
+from layout.verify.polygon_edges import ExposedPolygons
+from layout.verify.report import EdgeErrors, ExposureReport, VerificationTally
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 
 _SAMPLES = 1000  # pillars whose exposure is summed exactly, on masks up to ...
 _PRODUCTS = 4e9  # ... so many products of samples and sites
@@ -40,7 +40,7 @@ _SPOTS = 8  # along the narrowest Gaussian of the node field, of a polygon
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Scene:
+class WrittenMask:
     """What a written mask exposes with the pillars.
 
     bodies: lattices of class numbers. kinds: what each class draws. dose, layer,
@@ -49,16 +49,16 @@ class Scene:
     """
 
     bodies: Sequence[PillarArray]
-    kinds: Drawn
+    kinds: DrawnKinds
     dose: Array
     layer: Array
     size_um: Array
-    others: Polygons
+    others: ExposedPolygons
     undosed: tuple[LayerNumber, ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rows:
+class ExposedRows:
     """What comes out in some rows of a lattice, (rows, columns) each.
 
     number: of the lattice. first: row. classes: 0 for no pillar. exposure: of the drawn
@@ -81,7 +81,7 @@ def verify_exposure(
     process: Process,
     *,
     height_um: float = 0.0,
-    keep: Callable[[Rows], None] | None = None,
+    keep: Callable[[ExposedRows], None] | None = None,
 ) -> ExposureReport:
     """Expose and etch a mask that was read back, whose pillars stand where ``plan`` has
     them.
@@ -101,7 +101,7 @@ def verify_exposure(
     point = point_exposure(process.exposure)
     scene = read_scene(content, plan, doses, process)
     field = _Field.of(scene, point)
-    total, box = Tally.empty(), _box(scene.bodies, ())
+    total, box = VerificationTally.empty(), _box(scene.bodies, ())
     judged = (scene.dose > 0) & (scene.layer != process.layers.dose[0])
     count = 0
     for rows in _develop(scene, field, plan, process):
@@ -137,7 +137,7 @@ def read_scene(
     plan: MaskPlan,
     doses: Mapping[LayerNumber, float],
     process: Process,
-) -> Scene:
+) -> WrittenMask:
     """Shapes, doses and layers of a file, on the lattices of its plan.
 
     Raises:
@@ -147,8 +147,8 @@ def read_scene(
     skipped = {layers.aperture[0], layers.outline[0], layers.fields[0]}
     undosed: set[LayerNumber] = set()
 
-    def exposed(cell: str) -> Iterator[flatten.Stack]:
-        for stack in flatten.stacks(content, cell):
+    def exposed(cell: str) -> Iterator[flatten.PolygonStack]:
+        for stack in flatten.flatten_stacks(content, cell):
             if stack.layer[0] not in skipped:
                 if stack.layer in doses:
                     yield stack
@@ -169,10 +169,10 @@ def read_scene(
         raise ProcessError(
             "the mask holds no pillar with a dose; nothing can be verified"
         )
-    kinds: Drawn = Outlines(contours)
+    kinds: DrawnKinds = DrawnOutlines(contours)
     if all(made.round for made in plan.classes):
         size = kinds.diameter_um
-        kinds = Discs(size)
+        kinds = DrawnDiscs(size)
     empty = {
         l.name: dataclasses.replace(content.cells[l.name], placed=NOTHING, sums=None)
         for l in plan.lattices
@@ -186,18 +186,18 @@ def read_scene(
         corners += list(shapes * unit)
         others += [(doses[stack.layer], stack.layer[0])] * len(shapes)
     table = np.array(others, float).reshape(-1, 2)
-    return Scene(
+    return WrittenMask(
         [_body(lattice, unit) for lattice in plan.lattices],
         kinds,
         dose,
         layer.astype(np.int64),
         size,
-        Polygons(corners, table[:, 0], table[:, 1].astype(np.int64)),
+        ExposedPolygons(corners, table[:, 0], table[:, 1].astype(np.int64)),
         tuple(sorted(undosed)),
     )
 
 
-def _one_outline(name: str, stacks: Sequence[flatten.Stack]) -> list[Array]:
+def _one_outline(name: str, stacks: Sequence[flatten.PolygonStack]) -> list[Array]:
     """Contours of what a class of pillars draws, in database units."""
     drawn = [
         outline + np.array(place)
@@ -205,7 +205,7 @@ def _one_outline(name: str, stacks: Sequence[flatten.Stack]) -> list[Array]:
         for outline in stack.outlines
         for place in zip(stack.x, stack.y, strict=True)
     ]
-    found = drawn if len(drawn) == 1 else region.union(drawn)
+    found = drawn if len(drawn) == 1 else region.union_contours(drawn)
     outer = sum(polygon.twice_area(c) > 0 for c in found)
     if outer != 1 or len({stack.layer for stack in stacks}) > 1:
         raise ProcessError(
@@ -214,7 +214,7 @@ def _one_outline(name: str, stacks: Sequence[flatten.Stack]) -> list[Array]:
     return [np.asarray(c, float) for c in found]
 
 
-def _body(lattice: Lattice, unit_um: float) -> PillarArray:
+def _body(lattice: PillarLattice, unit_um: float) -> PillarArray:
     """Sites in um."""
     return PillarArray(
         lattice.rows,
@@ -239,8 +239,8 @@ class _Field:
     masses that stand for other shapes.
     """
 
-    ranges: bodies.Ranges
-    grid: nodes.Grid
+    ranges: bodies.ScatterRanges
+    grid: nodes.NodeGrid
     far: Array
     near: Sequence[Array]
     own: Array
@@ -249,26 +249,26 @@ class _Field:
     spots: tuple[Array, Array]
 
     @classmethod
-    def of(cls, scene: Scene, point: PointExposure) -> "_Field":
+    def of(cls, scene: WrittenMask, point: PointExposure) -> "_Field":
         """The field of the doses of a scene."""
-        number = bodies.count(scene.bodies, len(scene.dose)) * (scene.dose > 0)
+        number = bodies.count_pillars(scene.bodies, len(scene.dose)) * (scene.dose > 0)
         densest = min(scene.bodies, key=lambda body: body.apart_um)
-        ranges = bodies.split(point, scene.kinds, number, densest)
+        ranges = bodies.split_ranges(point, scene.kinds, number, densest)
         own, slope = _of_themselves(scene, number > 0, point)
         far = ranges.far
         own = own - scene.kinds.area_um2 * float(far.density(np.array(0.0)))
         width = float(far.widths_um.min()) if len(far.widths_um) else 1e3
-        grid = nodes.Grid.over(_box(scene.bodies, scene.others.corners), width)
-        x, y, spots = polygon_edges.spots(scene.others, width / _SPOTS)
+        grid = nodes.NodeGrid.over(_box(scene.bodies, scene.others.corners), width)
+        x, y, spots = polygon_edges.equivalent_spots(scene.others, width / _SPOTS)
         mass = grid.deposit(x, y, spots)[None]
         carried = scene.dose * scene.kinds.area_um2
         for body in scene.bodies:
             across = grid.x.at(body.columns_um)
             for first, block in body.blocks():
                 down = grid.y.at(body.rows_um(first, len(block)))
-                nodes.gather(block, carried[None], *down, *across, mass)
+                nodes.gather_to_nodes(block, carried[None], *down, *across, mass)
         spacing = grid.y.spacing_um, grid.x.spacing_um
-        reach = nodes.convolution(grid.shape, spacing, point=far, hollow=False)
+        reach = nodes.gaussian_convolution(grid.shape, spacing, point=far, hollow=False)
         near = []
         if len(ranges.middle.widths_um):
             for body in scene.bodies:
@@ -285,11 +285,11 @@ class _Field:
             ranges, grid, reach(mass[0]), near, own, slope, close, (points, spots)
         )
 
-    def rows(self, scene: Scene, number: int, first: int, block: Array) -> Array:
+    def rows(self, scene: WrittenMask, number: int, first: int, block: Array) -> Array:
         """(rows, columns) exposure of the drawn edges of a block."""
         body = scene.bodies[number]
         out = np.empty(block.shape, np.float32)
-        nodes.spread(
+        nodes.interpolate_from_nodes(
             self.far,
             *self.grid.y.at(body.rows_um(first, len(block))),
             *self.grid.x.at(body.columns_um),
@@ -301,14 +301,14 @@ class _Field:
 
 
 def _of_themselves(
-    scene: Scene, used: Array, point: PointExposure
+    scene: WrittenMask, used: Array, point: PointExposure
 ) -> tuple[Array, Array]:
     """(classes + 1,) exposure of edges by the pillar itself and its slope; classes of
     one outline and several doses are worked out once.
     """
-    if isinstance(scene.kinds, Discs):
+    if isinstance(scene.kinds, DrawnDiscs):
         return scene.kinds.edges(used, point)
-    contours = scene.kinds.contours if isinstance(scene.kinds, Outlines) else ()
+    contours = scene.kinds.contours if isinstance(scene.kinds, DrawnOutlines) else ()
     first: dict[bytes, int] = {}
     same = np.arange(len(contours))
     for k in np.flatnonzero(used).tolist():
@@ -330,17 +330,17 @@ def _box(
 
 
 def _develop(
-    scene: Scene, field: _Field, plan: MaskPlan, process: Process
-) -> Iterator[Rows]:
+    scene: WrittenMask, field: _Field, plan: MaskPlan, process: Process
+) -> Iterator[ExposedRows]:
     """Threshold model: an edge comes out where the exposure is half of what a wide area
     receives; then the bias of the etch, for how alone each pillar stands.
     """
     steep = np.maximum(scene.dose * field.slope, 1e-9)
-    is_round = isinstance(scene.kinds, Discs)
+    is_round = isinstance(scene.kinds, DrawnDiscs)
     for number, body in enumerate(scene.bodies):
         reach = 0
         if process.bias.isolated_nm:
-            reach = isolation.halo(body.down_um, process.bias.range_um)
+            reach = isolation.isolation_halo(body.down_um, process.bias.range_um)
         for first, block in body.blocks():
             exposure = field.rows(scene, number, first, block)
             shift = 2 * (exposure - THRESHOLD) / steep[block]
@@ -349,7 +349,7 @@ def _develop(
             if reach:
                 low = max(0, first - reach)
                 end = min(body.rows, first + len(block) + reach)
-                alone = isolation.isolation(
+                alone = isolation.isolation_map(
                     body.source(low, end) > 0,
                     (body.pitch_um, body.down_um),
                     process.bias.range_um,
@@ -357,31 +357,35 @@ def _develop(
                 )[first - low : first - low + len(block)]
             etch = process.made_diameter_nm if is_round else process.bias.made_nm
             made = np.where(block > 0, etch(np.maximum(resist, 0), alone), 0)
-            yield Rows(number, first, block, exposure / THRESHOLD, resist, made)
+            yield ExposedRows(number, first, block, exposure / THRESHOLD, resist, made)
 
 
-def _edges(scene: Scene, field: _Field, point: PointExposure) -> Edges:
+def _edges(scene: WrittenMask, field: _Field, point: PointExposure) -> EdgeErrors:
     """Exposure at samples along the edges of marks and labels, and where across each
     edge it is the threshold; closed form for close Gaussians.
     """
     core = max((a for a, _ in field.close), default=0.0)
-    points = polygon_edges.samples(scene.others, core)
+    points = polygon_edges.sample_edges(scene.others, core)
     every = np.concatenate([points.at_um, *polygon_edges.slope_aside(points)])
-    close = polygon_edges.exposure(every, scene.others, field.close)
+    close = polygon_edges.exposure_at_edges(every, scene.others, field.close)
     here, outside, inside = np.split(close, 3)
     x, y = points.at_um.T
     here = here + field.grid.sample(field.far, x, y)
     slope = np.maximum(inside - outside, 1e-12) / polygon_edges.aside_um()
-    return Edges(x, y, here / THRESHOLD, (here - THRESHOLD) / slope / nm, points.layer)
+    return EdgeErrors(
+        x, y, here / THRESHOLD, (here - THRESHOLD) / slope / nm, points.layer
+    )
 
 
-def _sampled(scene: Scene, field: _Field, point: PointExposure) -> tuple[float, float]:
+def _sampled(
+    scene: WrittenMask, field: _Field, point: PointExposure
+) -> tuple[float, float]:
     """Of direct sums over the exact shapes, at sample pillars of the first lattice: the
     largest |exposure - 1|, and the largest difference of the field from them.
     """
     sites = sum(body.rows * body.columns for body in scene.bodies)
     samples = int(np.clip(_PRODUCTS / sites, 16, _SAMPLES))
-    exposed = sampled.Exposed(
+    exposed = sampled.ExposedLattices(
         scene.bodies,
         scene.kinds,
         field.own
@@ -402,7 +406,7 @@ def _sampled(scene: Scene, field: _Field, point: PointExposure) -> tuple[float, 
     return off, worst
 
 
-def _entries(scene: Scene, rows: Array, columns: Array) -> Array:
+def _entries(scene: WrittenMask, rows: Array, columns: Array) -> Array:
     """(n,) classes of pillars of the first lattice."""
     source = scene.bodies[0].source
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.shapes import region
-from metalens.ground.arrays import Array
-from metalens.ground.units import nm
+from metalens.core.arrays import Array
+from metalens.core.units import nm
 
 _STEP_UM = 1.0  # between the samples along an edge
 _FAR = 5.0  # ranges at which a polygon no longer counts: exp(-25)
@@ -28,7 +28,7 @@ _ASIDE_UM = 2 * nm  # for the slope across an edge
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Polygons:
+class ExposedPolygons:
     """Shapes that are no pillars: corners (counter-clockwise, um), relative doses and
     layer numbers, one each.
     """
@@ -39,7 +39,7 @@ class Polygons:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Samples:
+class EdgeSamples:
     """Points on the outer edges of shapes: (n, 2) places, (n, 2) outward normals, (n,)
     layer numbers.
     """
@@ -49,7 +49,7 @@ class Samples:
     layer: Array
 
 
-def samples(polygons: Polygons, range_um: float) -> Samples:
+def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
     """Every few um along the outline of what each layer number draws, two ranges and
     more away from corners.
     """
@@ -61,7 +61,7 @@ def samples(polygons: Polygons, range_um: float) -> Samples:
     for layer in np.unique(polygons.layer).tolist():
         drawn = zip(polygons.corners, polygons.layer.tolist(), strict=True)
         units = [np.rint(corners / nm) for corners, other in drawn if other == layer]
-        for contour in region.union(units):
+        for contour in region.union_contours(units):
             corners = contour[_turns(contour)]
             start, end = corners * nm, np.roll(corners, -1, axis=0) * nm
             for a, b in zip(start, end, strict=True):
@@ -76,7 +76,7 @@ def samples(polygons: Polygons, range_um: float) -> Samples:
                     np.tile([(b - a)[1] / long, -(b - a)[0] / long], (count, 1))
                 )
                 layers.append(np.full(count, layer))
-    return Samples(
+    return EdgeSamples(
         np.concatenate(places), np.concatenate(normals), np.concatenate(layers)
     )
 
@@ -90,8 +90,8 @@ def _turns(contour: Array) -> Array:
     return np.asarray(before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0])
 
 
-def exposure(
-    at_um: Array, polygons: Polygons, terms: Sequence[tuple[float, float]]
+def exposure_at_edges(
+    at_um: Array, polygons: ExposedPolygons, terms: Sequence[tuple[float, float]]
 ) -> Array:
     """(n,) exposure at points by the polygons with their doses, for (range, weight) of
     each Gaussian.
@@ -123,7 +123,7 @@ def exposure(
     return total
 
 
-def slope_aside(found: Samples) -> tuple[Array, Array]:
+def slope_aside(found: EdgeSamples) -> tuple[Array, Array]:
     """Points just outside and just inside the edges."""
     return (
         found.at_um + _ASIDE_UM * found.normal,
@@ -136,7 +136,7 @@ def aside_um() -> float:
     return 2 * _ASIDE_UM
 
 
-def _near(at_um: Array, polygons: Polygons, reach: float) -> tuple[Array, Array]:
+def _near(at_um: Array, polygons: ExposedPolygons, reach: float) -> tuple[Array, Array]:
     """Pairs (point, polygon) that can matter to each other; small polygons through a
     tree of their middles.
     """
@@ -176,7 +176,9 @@ def _edge(p: Array, q: Array, range_um: float) -> Array:
     return np.asarray(np.sign(cross) * value)
 
 
-def spots(polygons: Polygons, step_um: float) -> tuple[Array, Array, Array]:
+def equivalent_spots(
+    polygons: ExposedPolygons, step_um: float
+) -> tuple[Array, Array, Array]:
     """(x, y, area times dose) of points that stand for the polygons in a Gaussian much
     wider than ``step_um``.
     """

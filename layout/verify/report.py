@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import LayerNumber, compiled
-from metalens.ground.arrays import Array
+from layout.process import LayerNumber, compile_loop
+from metalens.core.arrays import Array
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
@@ -23,7 +23,7 @@ _WIDEST_NM, _BIN_NM = (
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Edges:
+class EdgeErrors:
     """Edges of marks, labels and other shapes that are no pillars.
 
     x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,)
@@ -39,7 +39,7 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tally:
+class VerificationTally:
     """Sums over judged pillars (the dose test is not) of a part of the mask.
 
     ends: largest |exposure - 1|, largest |resist - drawn| and least and largest made diameter, nm. total, count:
@@ -52,7 +52,7 @@ class Tally:
     bins: Array
 
     @classmethod
-    def empty(cls) -> "Tally":
+    def empty(cls) -> "VerificationTally":
         """Of nothing."""
         bins = np.zeros(2 * round(_WIDEST_NM / _BIN_NM), np.int64)
         return cls(
@@ -92,9 +92,9 @@ class ExposureReport:
     """
 
     pillars: int
-    tally: Tally
+    tally: VerificationTally
     box_um: Box
-    edges: Edges
+    edges: EdgeErrors
     lean_nm: float
     tolerance: float = 0.01
     undosed: tuple[LayerNumber, ...] = ()
@@ -173,7 +173,7 @@ class ExposureReport:
         ]
 
 
-@compiled
+@compile_loop
 def _tally(
     x: Array,
     y: Array,

@@ -4,7 +4,7 @@ illumination, MTF.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.aberrations.angles import OverField as OverField
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from metalens.aberrations.chief import ChiefRay as ChiefRay
     from metalens.aberrations.chief import chief_ray as chief_ray
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "ChiefRay": "chief",

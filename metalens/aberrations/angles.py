@@ -9,9 +9,14 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from metalens.aberrations.chief import ChiefRay, chief_ray, middle_um, source_at
-from metalens.aberrations.waves import Waves, sharpness_per_um, transfer, waves
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.aberrations.waves import (
+    PlaneWaves,
+    line_mtf,
+    plane_waves_of_source,
+    sharpness_per_um,
+)
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Lens, media, reach
 from metalens.psf import passed_um2
 
@@ -169,7 +174,7 @@ def _row(
     """One field angle; the rays are those of angle 0 and of this angle."""
     angle, chief = (math.radians(angle_deg), 0.0), rays[1]
     none = np.full(2, math.nan)
-    light = waves(lens, angle, depth_um)
+    light = plane_waves_of_source(lens, angle, depth_um)
     here = light.at(lens.sensor_distance_um)
     close = none if chief is None else chief.focus_um - lens.sensor_distance_um
     return {
@@ -182,8 +187,8 @@ def _row(
         "illumination": math.nan
         if chief is None
         else light.passed_um2 * _brightness(lens, angle_deg, depth_um, chief),
-        "vignetting": vignetting(lens, angle, depth_um),
-        "mtf": np.stack([transfer(light, here, axis, per_um) for axis in (0, 1)]),
+        "vignetting": vignetted_share(lens, angle, depth_um),
+        "mtf": np.stack([line_mtf(light, here, axis, per_um) for axis in (0, 1)]),
         "held": min(light.held, 1.0),
     }
 
@@ -224,7 +229,9 @@ def _brightness(
     return falls / abs(float(np.linalg.det(chief.moves)))
 
 
-def vignetting(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> float:
+def vignetted_share(
+    lens: Lens, angle_rad: tuple[float, float], depth_um: float
+) -> float:
     """Share of the light through the stop's hole that falls beside the pillars; 0
     without a stop.
 
@@ -258,7 +265,9 @@ def vignetting(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> f
     return max(0.0, 1 - float(lit.sum()) * d.site_um2 / hole)
 
 
-def _sharpest(lens: Lens, light: Waves, angle_rad: float, close_um: Array) -> Array:
+def _sharpest(
+    lens: Lens, light: PlaneWaves, angle_rad: float, close_um: Array
+) -> Array:
     """(2,) distance behind the pillars where the line images along x and along y are
     sharpest; NaN at an end.
     """
@@ -289,7 +298,7 @@ def _sharpest(lens: Lens, light: Waves, angle_rad: float, close_um: Array) -> Ar
 
 
 def _settled(
-    light: Waves, places: Array, sharp: Array, axis: int, deep: float
+    light: PlaneWaves, places: Array, sharp: Array, axis: int, deep: float
 ) -> float:
     """The best of a scan, settled between its neighbours."""
     best = int(np.argmax(sharp))

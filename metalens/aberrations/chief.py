@@ -25,11 +25,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Lens, media
 from metalens.lens.media import Media
-from metalens.psf import incidence
+from metalens.psf import library_incidence
 
 ZONES = 2.0  # radius of the pillars that are looked at, in √(wavelength focal length)
 LEAST = 60  # pillars, for 15 terms
@@ -231,7 +231,7 @@ def _wave_front(
         ZONES * math.sqrt(lens.wavelength_um * focal),
         math.sqrt(2 * LEAST * site / math.pi),
     )
-    x, y, phase, near = _about(lens, at, radius, incidence(lens, angle_rad))
+    x, y, phase, near = _about(lens, at, radius, library_incidence(lens, angle_rad))
     wanted = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
     if np.count_nonzero(near) < max(wanted, LEAST):
         raise PropagationError(

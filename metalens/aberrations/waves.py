@@ -24,11 +24,11 @@ import scipy.fft
 import torch
 
 from metalens import propagate
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import Lens, media
 from metalens.lens.media import Media
 from metalens.propagate import paths
-from metalens.psf import Nodes, all_maps
+from metalens.psf import SpectralNodes, all_maps
 
 BAND = 1.05  # of the directions of the rays, with FRINGES of diffraction on either side
 FRINGES = 14
@@ -47,7 +47,7 @@ STEEPEST = 0.999
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Waves:
+class PlaneWaves:
     """Plane waves of one field angle at the design wavelength.
 
     amplitude: (y, x) complex128, √T A. p_x, p_y: (x,), (y,) n sin θ along each axis.
@@ -92,7 +92,9 @@ class Waves:
         )
 
 
-def waves(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Waves:
+def plane_waves_of_source(
+    lens: Lens, angle_rad: tuple[float, float], depth_um: float
+) -> PlaneWaves:
     """Plane waves of a source's light at the design wavelength.
 
     Args:
@@ -141,7 +143,7 @@ def waves(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Waves:
     )
     light = nx * ny * power * faces, d.site_um2 * power * faces
     aperture = float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2
-    return Waves(amplitude, p_x, p_y, (dx, dy), *light, aperture, wave, after)
+    return PlaneWaves(amplitude, p_x, p_y, (dx, dy), *light, aperture, wave, after)
 
 
 def _lighting(
@@ -155,9 +157,9 @@ def _lighting(
         lens.wavelength_um,
         (math.tan(angle_rad[0]), math.tan(angle_rad[1])),
     )
-    nodes = Nodes(np.array([wave]), np.ones(1), 0.0)
+    nodes = SpectralNodes(np.array([wave]), np.ones(1), 0.0)
     (phase, level), _ = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)
-    case = propagate.case(
+    case = propagate.make_case(
         d.diameter_um.shape, **d.grid._asdict(), wavelength_um=wave, sensor_distance_um=lens.sensor_distance_um,
         depths_um=depth_um, angle_rad=angle_rad, window_um=1.0, samples=1, layers=lens.layers.open,
     )  # fmt: skip
@@ -219,7 +221,7 @@ def _rows(
     return out, power
 
 
-def line_image(waves: Waves, field: Array, axis: int) -> tuple[Array, float]:
+def line_image(waves: PlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
     """Line image along x (0) or y (1) of waves on a plane (:meth:`Waves.at`), of sum 1
     where all light is in it, and
     the step of its samples in um; it repeats beyond its ends."""
@@ -231,7 +233,7 @@ def line_image(waves: Waves, field: Array, axis: int) -> tuple[Array, float]:
     return np.asarray(line), waves.wavelength_um / (count * waves.spacing[axis])
 
 
-def sharpness_per_um(waves: Waves, field: Array, axis: int) -> float:
+def sharpness_per_um(waves: PlaneWaves, field: Array, axis: int) -> float:
     """∫ L² over (∫ L)² of the line image along an axis: one over how wide it is; a bar
     of width b gives 1 / b.
     """
@@ -239,7 +241,9 @@ def sharpness_per_um(waves: Waves, field: Array, axis: int) -> float:
     return float((line**2).sum() / line.sum() ** 2 / step)
 
 
-def transfer(waves: Waves, field: Array, axis: int, frequencies_per_um: Array) -> Array:
+def line_mtf(
+    waves: PlaneWaves, field: Array, axis: int, frequencies_per_um: Array
+) -> Array:
     """(frequencies,) modulation transfer along an axis, of all light through the lens:
     its value just above frequency 0
     is :attr:`Waves.held`."""

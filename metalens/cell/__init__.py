@@ -4,19 +4,19 @@ solver.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.cell import materials as materials
     from metalens.cell import shapes as shapes
     from metalens.cell.lattice import Lattice as Lattice
-    from metalens.cell.light import Light as Light
+    from metalens.cell.light import Incidence as Incidence
     from metalens.cell.light import Polarization as Polarization
     from metalens.cell.light import check_direction as check_direction
     from metalens.cell.light import check_tolerance as check_tolerance
     from metalens.cell.materials import index as index
-    from metalens.cell.materials import slope as slope
-    from metalens.cell.orders import Order as Order
+    from metalens.cell.materials import index_dispersion as index_dispersion
+    from metalens.cell.orders import DiffractionOrder as DiffractionOrder
     from metalens.cell.orders import check_subwavelength as check_subwavelength
     from metalens.cell.orders import describe_order_loss as describe_order_loss
     from metalens.cell.orders import named_orders as named_orders
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from metalens.cell.record import Material as Material
     from metalens.cell.response import Response as Response
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Blend": "record",
@@ -39,9 +39,9 @@ __getattr__, __dir__, __all__ = attach(
         "Index": "record",
         "Lattice": "lattice",
         "Layer": "record",
-        "Light": "light",
+        "Incidence": "light",
         "Material": "record",
-        "Order": "orders",
+        "DiffractionOrder": "orders",
         "Polarization": "light",
         "Response": "response",
         "check_direction": "light",
@@ -54,6 +54,6 @@ __getattr__, __dir__, __all__ = attach(
         "index": "materials",
         "materials": "",
         "shapes": "",
-        "slope": "materials",
+        "index_dispersion": "materials",
     },
 )

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DAMAGE, MaterialError
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import DAMAGE, MaterialError
 
 LEAST = {
     1: 3,
@@ -39,7 +39,7 @@ _NOISE = 1e-3  # by how far k of a measured table may lie below 0: it is 0 there
 
 
 @dataclass(frozen=True, slots=True)
-class Formula:
+class DispersionFormula:
     """n of a wavelength by one of the nine formulas; it holds from range_um[0] to
     range_um[1].
 
@@ -125,7 +125,7 @@ class Formula:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Table:
+class TabulatedIndex:
     """Linear interpolation between the rows of a tabulated n or k.
 
     rows: (2, rows) wavelength_um, rising, and value. Two rows at one wavelength are a
@@ -164,10 +164,10 @@ class Table:
         return complex(y[i] + rate * (wavelength_um - x[i])), complex(rate)
 
 
-Part = Formula | Table
+Part = DispersionFormula | TabulatedIndex
 
 
-def read(text: str, where: str) -> tuple[Part, Part | None, str]:
+def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
     """n, k (None: transparent) and the source in words of a page.
 
     Raises:
@@ -230,7 +230,7 @@ def _words(block: dict[str, Any], key: str) -> str:
     return str(value) if isinstance(value, str | int | float) else ""
 
 
-def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
+def _formula(block: dict[str, Any], kind: str, where: str) -> DispersionFormula:
     numbers = _words(block, "coefficients").split()
     span = (_words(block, "wavelength_range") or _words(block, "range")).split()
     try:
@@ -249,7 +249,7 @@ def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
             "two ends of wavelength_range"
         )
     _complete(number, len(values), f"{where}, {kind}")
-    return Formula(number, values, (min(ends), max(ends)), f"{where}, {kind}")
+    return DispersionFormula(number, values, (min(ends), max(ends)), f"{where}, {kind}")
 
 
 def _complete(number: int, count: int, where: str) -> None:
@@ -267,7 +267,7 @@ def _complete(number: int, count: int, where: str) -> None:
         )
 
 
-def _tables(text: str, columns: str, where: str) -> dict[str, Table]:
+def _tables(text: str, columns: str, where: str) -> dict[str, TabulatedIndex]:
     """Tables of n and k. A bad row spoils the wavelengths up to its neighbours only.
 
     Raises:
@@ -310,7 +310,7 @@ def _tables(text: str, columns: str, where: str) -> dict[str, Table]:
     rows, steps = _joined(rows, where)
     table = np.array(rows).T
     return {
-        name: Table(table[[0, 1 + columns.index(name)]], (*faults, *steps))
+        name: TabulatedIndex(table[[0, 1 + columns.index(name)]], (*faults, *steps))
         for name in columns
     }
 
@@ -352,14 +352,14 @@ def _source(page: dict[str, Any]) -> str:
     return " ".join(plain.split()) or "a page of refractiveindex.info"
 
 
-def load(path: Path, where: str) -> tuple[Part, Part | None, str]:
-    """:func:`read` of a file.
+def load_page(path: Path, where: str) -> tuple[Part, Part | None, str]:
+    """:func:`parse_page` of a file.
 
     Raises:
         MaterialError: also where the file is missing or no text.
     """
     try:
-        return read(reading.read_text(path), where)
+        return parse_page(reading.read_text(path), where)
     except (OSError, UnicodeDecodeError) as error:
         raise MaterialError(
             f"{where}: not a readable text file ({error}); need a YAML page"

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 
 @dataclass(frozen=True, slots=True)

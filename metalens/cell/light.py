@@ -4,13 +4,13 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 Polarization = Literal["x", "y", "s", "p"]
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class Incidence:
     """One plane wave from the substrate.
 
     wavelength_um: in vacuum.

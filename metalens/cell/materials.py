@@ -17,9 +17,9 @@ import numpy as np
 from metalens import cell
 from metalens.cell import database, tables
 from metalens.cell.database import Part
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaterialError, nearest
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import MaterialError, nearest_name_hint
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -138,14 +138,16 @@ def index(material: cell.Material | Material, wavelength_um: float) -> complex:
     return _index_and_slope(material, wavelength_um)[0]
 
 
-def slope(material: cell.Material | Material, wavelength_um: float) -> complex:
+def index_dispersion(
+    material: cell.Material | Material, wavelength_um: float
+) -> complex:
     """Dispersion d(n + ik)/d(wavelength_um), with the arguments and errors of
     :func:`index`.
     """
     return _index_and_slope(material, wavelength_um)[1]
 
 
-def material(name: str) -> Material:
+def find_material(name: str) -> Material:
     """The record behind a name of ``NAMES`` or behind the path of a CSV file.
 
     Raises:
@@ -170,7 +172,7 @@ def _hint(name: str) -> str:
     lower = name.lower().strip().replace("_", "-")
     same = [known for known in NAMES if known.lower() == lower.replace(" ", "")]
     meant = next(iter(same), SPOKEN.get("-".join(lower.split())))
-    return f"; did you mean {meant!r}?" if meant else nearest(name, NAMES)
+    return f"; did you mean {meant!r}?" if meant else nearest_name_hint(name, NAMES)
 
 
 def _kin(name: str, wavelength_um: float) -> str:
@@ -182,7 +184,7 @@ def _kin(name: str, wavelength_um: float) -> str:
         for known in NAMES
         if known != name and _substance(known) == _substance(name)
     ]
-    ranges = {known: material(known).range_um for known in alike}
+    ranges = {known: find_material(known).range_um for known in alike}
     held = [
         repr(known)
         for known, (low, high) in ranges.items()
@@ -216,7 +218,7 @@ def read_yaml(path: str | Path) -> Material:
 
 @lru_cache(maxsize=64)
 def _read_yaml(path: Path, stamp: tuple[int, int]) -> Material:
-    return _of_page(database.load(path, str(path)), str(path))
+    return _of_page(database.load_page(path, str(path)), str(path))
 
 
 def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
@@ -270,7 +272,7 @@ def _shipped(name: str) -> Material:
             / f"{_PAGES[name]}.yml"
         )
         return _of_page(
-            database.read(file.read_text(encoding="utf-8"), file.name), name
+            database.parse_page(file.read_text(encoding="utf-8"), file.name), name
         )
     text = (importlib.resources.files("metalens") / "data" / _TABLES[name]).read_text(
         encoding="utf-8"
@@ -279,7 +281,7 @@ def _shipped(name: str) -> Material:
 
 
 def _parse(text: str, *, name: str, where: str) -> Material:
-    table, comments = tables.read(text, where)
+    table, comments = tables.parse_table(text, where)
     return Material(
         name, comments or f"the file {where}", (table[0, 0], table[0, -1]), table
     )
@@ -296,7 +298,7 @@ def _index_and_slope(
         return complex(wanted.n, wanted.k), 0j
     if isinstance(wanted, cell.Blend):
         return _blended(wanted, wavelength_um)
-    record = material(wanted) if isinstance(wanted, str) else wanted
+    record = find_material(wanted) if isinstance(wanted, str) else wanted
     low, high = record.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(

@@ -10,11 +10,11 @@ from typing import Literal
 from metalens.cell import materials
 from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class DiffractionOrder:
     """A propagating diffraction order (m, n) along x and y, in the substrate or in the
     cover.
 
@@ -27,13 +27,13 @@ class Order:
     n: int
 
 
-def propagating(
+def propagating_orders(
     cell: Cell,
     wavelength_um: float,
     *,
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
-) -> tuple[Order, ...]:
+) -> tuple[DiffractionOrder, ...]:
     """All orders with |k| <= n k0, grazing ones included, the zero order first on each
     side.
 
@@ -65,7 +65,7 @@ def propagating(
                 if math.hypot(kx + m * across[0], ky + n * across[1]) <= n_side
             ]
             found += [
-                Order(side, m, n)
+                DiffractionOrder(side, m, n)
                 for n in reached
                 if not (cell.lattice.centred and (m + n) % 2)
             ]
@@ -103,12 +103,12 @@ def substrate_orders(
     *,
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
-) -> tuple[Order, ...]:
+) -> tuple[DiffractionOrder, ...]:
     """Orders other than zero that propagate in the substrate: what they carry is lost.
 
-    Arguments and errors as for :func:`propagating`.
+    Arguments and errors as for :func:`propagating_orders`.
     """
-    orders = propagating(
+    orders = propagating_orders(
         cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad
     )
     return tuple(
@@ -116,7 +116,7 @@ def substrate_orders(
     )
 
 
-def named_orders(orders: Sequence[Order], most: int = 8) -> str:
+def named_orders(orders: Sequence[DiffractionOrder], most: int = 8) -> str:
     """Orders in words: "(1, 0), (0, -1) and 3 more"."""
     named = ", ".join(f"({order.m}, {order.n})" for order in orders[:most])
     more = f" and {len(orders) - most} more" if len(orders) > most else ""
@@ -157,7 +157,7 @@ def check_subwavelength(
         CellError: names the orders, and the pitch below which none propagates.
         MaterialError: a wavelength outside the range of a material.
     """
-    orders = propagating(
+    orders = propagating_orders(
         cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad
     )
     stray = [

@@ -9,7 +9,7 @@ from metalens.cell.lattice import Lattice
 from metalens.cell.shapes import Outline
 from metalens.cell.shapes.every import Shape
 from metalens.cell.shapes.round import Circle
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 # of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
 _APART = 0.02

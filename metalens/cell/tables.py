@@ -13,14 +13,14 @@ import re
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaterialError
+from metalens.core.arrays import Array
+from metalens.core.errors import MaterialError
 
 COLUMNS = "wavelength_um (or wavelength_nm), n and, where it absorbs, k"
 _SCALES = {"wavelength_um": 1.0, "wl": 1.0, "wavelength_nm": 1e-3}
 
 
-def read(text: str, where: str) -> tuple[Array, str]:
+def parse_table(text: str, where: str) -> tuple[Array, str]:
     """(3, rows) wavelength_um, n, k, rising; and the comments.
 
     Raises:

@@ -7,12 +7,12 @@ import math
 from importlib import resources
 from typing import Any
 
-from metalens.ground.report import Markup
+from metalens.core.report import Markup
 
 Box = dict[str, Any]
 
 
-def view(*, aperture_mm: float, sensor_distance_mm: float) -> Markup:
+def draw_module(*, aperture_mm: float, sensor_distance_mm: float) -> Markup:
     """The stack of the paper's Sec. 6: 0.5 mm filter, 0.3 mm substrate, air to the 0.5
     mm sensor, 0.2 mm flex.
 

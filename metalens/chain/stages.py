@@ -8,8 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import config, reading, store
-from metalens.ground.errors import ConfigError
+from metalens.core import config, reading, store
+from metalens.core.errors import ConfigError
 
 MADE = ("library.h5", "lens.h5", "bench_lens.h5", "asbuilt.h5")  # by the chain itself
 SHIPPED = ("cell", "design", "process", "run", "bench_truth", "bench_metrology")
@@ -59,7 +59,7 @@ class ChainFiles:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class ChainStage:
     """One verb of the chain.
 
     words: of the command line, relative to the chain's folder. error: entry of the
@@ -75,7 +75,7 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Laid:
+class ChainInputs:
     """What a chain's folder holds before its first stage.
 
     files: the settings, by name in the folder. contents: {path in the folder: bytes} of
@@ -104,18 +104,18 @@ class Laid:
         )
 
 
-def shipped() -> ChainFiles:
-    """The demo's own settings, as names of files that :func:`laid` gives."""
+def shipped_settings() -> ChainFiles:
+    """The demo's own settings, as names of files that :func:`lay_out_inputs` gives."""
     return _named(
         SHIPPED, budget=False
     )  # a minute more: asked for with a CHAIN.toml, or metalens budget
 
 
-def load(path: Path) -> ChainFiles:
+def load_chain(path: Path) -> ChainFiles:
     """Read CHAIN.toml.
 
     Raises:
-        ConfigError: see :func:`metalens.ground.config.load`; a settings file that is
+        ConfigError: see :func:`metalens.core.config.load`; a settings file that is
             not there.
     """
     found = config.load(path, ChainFiles)
@@ -127,7 +127,9 @@ def load(path: Path) -> ChainFiles:
     return found
 
 
-def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -> Laid:
+def lay_out_inputs(
+    files: ChainFiles, source: Path | None, *, aperture_mm: float | None
+) -> ChainInputs:
     """The settings under plain names, and the tables and maps that they name.
 
     Args:
@@ -155,7 +157,7 @@ def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -
             ]
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
         contents[f"{name}.toml"] = text.encode()
-    return Laid(
+    return ChainInputs(
         _named(tuple(name for name, _ in _given(files)), budget=files.budget), contents
     )
 
@@ -209,7 +211,7 @@ def _given(files: ChainFiles) -> Iterator[tuple[str, Path]]:
             yield field.name, value
 
 
-def stages(files: ChainFiles) -> Iterator[Stage]:
+def chain_stages(files: ChainFiles) -> Iterator[ChainStage]:
     """The chain, in order."""
     yield from _making(files)
     if files.run:
@@ -222,8 +224,8 @@ def stages(files: ChainFiles) -> Iterator[Stage]:
             yield _retrain()
 
 
-def _making(files: ChainFiles) -> Iterator[Stage]:
-    yield Stage(
+def _making(files: ChainFiles) -> Iterator[ChainStage]:
+    yield ChainStage(
         "Pillar library",
         "Rigorous solves of one pillar cell over the diameter, joined by a rational function, with an error bar on "
         "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
@@ -236,7 +238,7 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
             ),
         ),
     )
-    yield Stage(
+    yield ChainStage(
         "Lens",
         "Every site takes the printable diameter whose phase is the wanted one. A direct Rayleigh-Sommerfeld sum "
         "over all pillars then shows where the light really meets.",
@@ -249,7 +251,7 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
             ),
         ),
     )
-    yield Stage(
+    yield ChainStage(
         "Point spread functions",
         "Images of point sources over the depths of an eye, computed on the sensor window only, to a stated error.",
         (
@@ -273,8 +275,8 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
     yield _mask()
 
 
-def _mask() -> Stage:
-    return Stage(
+def _mask() -> ChainStage:
+    return ChainStage(
         "Mask",
         "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
         "witness cells; checked against the design rules, written, read back and compared.",
@@ -298,13 +300,13 @@ def _mask() -> Stage:
     )
 
 
-def _budget(files: ChainFiles) -> Stage:
+def _budget(files: ChainFiles) -> ChainStage:
     lens = (
         ("run/lens.h5", "--run", "run")
         if files.run
         else ("lens.h5", "--library", "library.h5")
     )
-    return Stage(
+    return ChainStage(
         "Error budget",
         "Every link from pillar to answered gaze, each changed or switched off alone on the frames of the virtual "
         "experiment, and their sum beside the error that the experiment measures there. Without a network the gaze is "
@@ -315,24 +317,24 @@ def _budget(files: ChainFiles) -> Stage:
     )
 
 
-def _bench(files: ChainFiles) -> Iterator[Stage]:
+def _bench(files: ChainFiles) -> Iterator[ChainStage]:
     metrology = ("--metrology", "bench_metrology.toml") if files.bench_metrology else ()
     if files.bench_design:
-        yield Stage(
+        yield ChainStage(
             "A lens for the bench",
             "A small sister of the lens, of the same pillars, to be made wrong in hidden ways and measured.",
             ("design", "bench_design.toml", "-o", "bench_lens.h5"),
             ("max_phase_error_rad", "rad between wanted and made phase"),
         )
     measured = "bench_lens.h5" if files.bench_design else "run/lens.h5"
-    yield Stage(
+    yield ChainStage(
         "Captures",
         "A virtual bench: the lens is made with errors that the fit never sees, and shot through focus with the noise "
         "of a real sensor.",
         ("capture", measured, "--truth", "bench_truth.toml", "-o", "captures"),
         ("peak_e", "electrons in the brightest pixel"),
     )
-    yield Stage(
+    yield ChainStage(
         "The lens as built",
         "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
         (
@@ -364,8 +366,8 @@ def _bench(files: ChainFiles) -> Iterator[Stage]:
     )
 
 
-def _codesign() -> Stage:
-    return Stage(
+def _codesign() -> ChainStage:
+    return ChainStage(
         "Co-design",
         "A small network trained through the lens on rendered eyes: pupil, depth of every part of the image from its "
         "blur, slippage from both with its uncertainty; then searched under compute budgets. Two minutes on two cores.",
@@ -375,7 +377,7 @@ def _codesign() -> Stage:
     )
 
 
-def _retrain() -> Stage:
+def _retrain() -> ChainStage:
     words = (
         "retrain",
         "run",
@@ -386,7 +388,7 @@ def _retrain() -> Stage:
         "--process",
         "process.toml",
     )
-    return Stage(
+    return ChainStage(
         "Before and after retraining",
         "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
         "made. In a study of a hundred hidden lenses of 1 mm before a larger network (docs/loop.md) the slippage error "

@@ -2,20 +2,20 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.commands.common import MASKS as MASKS
-    from metalens.commands.common import Common as Common
-    from metalens.commands.common import Distributed as Distributed
+    from metalens.commands.common import CommonOptions as CommonOptions
+    from metalens.commands.common import DistributedOptions as DistributedOptions
     from metalens.commands.common import MaybeOutput as MaybeOutput
     from metalens.commands.common import Output as Output
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Common": "common",
-        "Distributed": "common",
+        "CommonOptions": "common",
+        "DistributedOptions": "common",
         "MASKS": "common",
         "MaybeOutput": "common",
         "Output": "common",

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.commands.common import Distributed
-from metalens.ground import store
+from metalens.commands.common import DistributedOptions
+from metalens.core import store
 from metalens.pillars import Sweep, axes
 from metalens.pillars.axes import AxesLibrary
 
@@ -20,7 +20,7 @@ NM = 1e3
 
 
 def run(
-    options: Distributed,
+    options: DistributedOptions,
     target: Path,
     cell: Cell,
     sweep: Sweep,
@@ -32,17 +32,19 @@ def run(
     with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
-        made = axes.sweep(cell, sweep, console=options.console, checkpoint=journal)
+        made = axes.sweep_two_sizes(
+            cell, sweep, console=options.console, checkpoint=journal
+        )
         seconds = time.perf_counter() - start
         made = dataclasses.replace(made, provenance=about)
         axes.save(draft.path, made)
-        axes.figure(draft.path.with_suffix(".png"), made)
+        axes.axes_library_figure(draft.path.with_suffix(".png"), made)
     return options.console.judged(
-        _values(made, seconds), _text(target, made, seconds), failures(made)
+        _values(made, seconds), _text(target, made, seconds), library_failures(made)
     )
 
 
-def failures(made: AxesLibrary) -> list[str]:
+def library_failures(made: AxesLibrary) -> list[str]:
     """What is wrong with a library, in words; nothing where it serves."""
     found, share = [], float(made.usable.mean())
     if share < LEAST_USABLE:

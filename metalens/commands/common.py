@@ -9,9 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from metalens.ground import executor, transaction
-from metalens.ground.console import Console
-from metalens.ground.transaction import Draft, Terms
+from metalens.core import executor, transaction
+from metalens.core.console import Console
+from metalens.core.transaction import ClaimTerms, OutputDraft
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 MASKS = (
@@ -24,7 +24,7 @@ MaybeOutput = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Common:
+class CommonOptions:
     """Options of every verb.
 
     Attributes:
@@ -49,7 +49,7 @@ class Common:
         beside: Sequence[str] = (),
         inputs: Sequence[Path] = (),
         room: int = transaction.ROOM,
-    ) -> contextlib.AbstractContextManager[Draft]:
+    ) -> contextlib.AbstractContextManager[OutputDraft]:
         """Claim a file and its companions before the work; they appear together at the
         end of the block, or not at all.
 
@@ -59,20 +59,22 @@ class Common:
             room: bytes that the output needs.
 
         Raises:
-            OutputError: see :func:`metalens.ground.transaction.file`.
+            OutputError: see :func:`metalens.core.transaction.claim_file`.
         """
-        return transaction.file(target, beside=beside, terms=self._terms(inputs, room))
+        return transaction.claim_file(
+            target, beside=beside, terms=self._terms(inputs, room)
+        )
 
     def claim_folder(
         self, target: Path, *, inputs: Sequence[Path] = (), room: int = transaction.ROOM
-    ) -> contextlib.AbstractContextManager[Draft]:
+    ) -> contextlib.AbstractContextManager[OutputDraft]:
         """Claim a folder before the work; it appears whole with its manifest at the end
         of the block, or not at all.
 
         Raises:
-            OutputError: see :func:`metalens.ground.transaction.folder`.
+            OutputError: see :func:`metalens.core.transaction.claim_folder`.
         """
-        return transaction.folder(target, terms=self._terms(inputs, room))
+        return transaction.claim_folder(target, terms=self._terms(inputs, room))
 
     def claim_work(
         self,
@@ -81,19 +83,19 @@ class Common:
         keep: Sequence[str],
         resume: bool = False,
         grow: bool = False,
-    ) -> contextlib.AbstractContextManager[Draft]:
+    ) -> contextlib.AbstractContextManager[OutputDraft]:
         """Claim a folder for long work that an interruption leaves resumable.
 
         Raises:
-            OutputError: see :func:`metalens.ground.transaction.long_work`.
+            OutputError: see :func:`metalens.core.transaction.claim_long_work`.
         """
         terms = dataclasses.replace(self._terms((), transaction.ROOM), parents=True)
-        return transaction.long_work(
+        return transaction.claim_long_work(
             target, keep=keep, resume=resume, grow=grow, terms=terms
         )
 
-    def _terms(self, inputs: Sequence[Path], room: int) -> Terms:
-        return Terms(force=self.force, inputs=(*self._paths(), *inputs), room=room)
+    def _terms(self, inputs: Sequence[Path], room: int) -> ClaimTerms:
+        return ClaimTerms(force=self.force, inputs=(*self._paths(), *inputs), room=room)
 
     def _paths(self) -> Iterator[Path]:
         """Every path among the options that is read."""
@@ -108,7 +110,7 @@ class Common:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distributed(Common):
+class DistributedOptions(CommonOptions):
     """Options of verbs whose work is spread over processes; the result is the same for
     any number of them.
 
@@ -128,6 +130,6 @@ class Distributed(Common):
         """Where the work of the block is done.
 
         Raises:
-            ConfigError, WorkerError: see :func:`metalens.ground.executor.on`.
+            ConfigError, WorkerError: see :func:`metalens.core.executor.run_on`.
         """
-        return executor.on(self.workers)
+        return executor.run_on(self.workers)

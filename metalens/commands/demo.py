@@ -13,28 +13,28 @@ from typing import Any
 
 import tyro
 
-from metalens.chain import ChainFiles, Stage, module_view
+from metalens.chain import ChainFiles, ChainStage, module_view
 from metalens.chain import stages as chain
 from metalens.cli import main as run_verb
-from metalens.commands.common import Common
-from metalens.ground import manifest, report, store
-from metalens.ground.errors import ConfigError, MetalensError
+from metalens.commands.common import CommonOptions
+from metalens.core import manifest, report, store
+from metalens.core.errors import ConfigError, MetalensError
 
 OUTCOMES = "outcomes.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StageOutcome:
     """What a verb did: its exit status, its --json result, and its wall time."""
 
-    stage: Stage
+    stage: ChainStage
     status: int
     values: dict[str, Any]
     seconds: float
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens demo``.
 
     Attributes:
@@ -58,9 +58,13 @@ def run(options: Options) -> int:
     """
     if options.aperture_mm is not None and not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
-    wanted = chain.shipped() if options.config is None else chain.load(options.config)
+    wanted = (
+        chain.shipped_settings()
+        if options.config is None
+        else chain.load_chain(options.config)
+    )
     source = None if options.config is None else options.config.parent
-    laid = chain.laid(wanted, source, aperture_mm=options.aperture_mm)
+    laid = chain.lay_out_inputs(wanted, source, aperture_mm=options.aperture_mm)
     whole = (
         options.output.absolute()
     )  # stages run in another folder, also as an interrupt finds them
@@ -71,9 +75,9 @@ def run(options: Options) -> int:
                 raise ConfigError(
                     f"{options.output} was begun with other settings; start over with --force"
                 )
-            manifest.empty(folder)
+            manifest.empty_folder(folder)
             laid.write(folder)
-        outcomes: list[Outcome] = []
+        outcomes: list[StageOutcome] = []
         for outcome in _chain(folder, laid.files):
             outcomes.append(outcome)
             words, verdict = (
@@ -93,7 +97,7 @@ def run(options: Options) -> int:
     return next((o.status for o in outcomes if o.status), 0)
 
 
-def _name(stage: Stage) -> str:
+def _name(stage: ChainStage) -> str:
     """The verb, and what it works on where the chain has it twice."""
     return (
         "bench_design"
@@ -102,15 +106,15 @@ def _name(stage: Stage) -> str:
     )
 
 
-def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
+def _chain(folder: Path, files: ChainFiles) -> Iterator[StageOutcome]:
     """Run the verbs in the chain's folder until one refuses its input; what an earlier
     run did is not done again.
     """
     done = dict(_done(folder / OUTCOMES))
     with contextlib.chdir(folder):
-        for stage in chain.stages(files):
+        for stage in chain.chain_stages(files):
             if stage.words in done:
-                yield Outcome(stage, *done[stage.words])
+                yield StageOutcome(stage, *done[stage.words])
                 continue
             start, shown = time.perf_counter(), io.StringIO()
             with contextlib.redirect_stdout(shown):
@@ -121,7 +125,7 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
                 store.append_line(
                     Path(OUTCOMES), json.dumps([stage.words, status, values, seconds])
                 )
-            yield Outcome(stage, status, values, seconds)
+            yield StageOutcome(stage, status, values, seconds)
             if status == 130:
                 raise KeyboardInterrupt
             if status not in (0, 1):
@@ -148,7 +152,7 @@ def _share(design: dict[str, Any]) -> str:
     return "not known" if found is None else f"{found:.1%}"
 
 
-def _write(folder: Path, outcomes: list[Outcome]) -> None:
+def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
     total = sum(o.seconds for o in outcomes)
     made = {_name(o.stage): o.values for o in outcomes}
     keys = [
@@ -194,7 +198,7 @@ def _write(folder: Path, outcomes: list[Outcome]) -> None:
         *(_section(folder, outcome) for outcome in outcomes),
         _module(folder),
     ]
-    report.write(
+    report.write_report(
         folder / "report.html",
         "From pillar cell to the lens as built",
         sections,
@@ -207,7 +211,7 @@ def _module(folder: Path) -> report.Section:
     from metalens import lens
 
     made = lens.load(folder / "lens.h5")
-    drawn = module_view.view(
+    drawn = module_view.draw_module(
         aperture_mm=2e-3 * (made.diameters.radius_um + made.diameters.pitch_um / 2),
         sensor_distance_mm=made.sensor_distance_um * 1e-3,
     )
@@ -215,7 +219,7 @@ def _module(folder: Path) -> report.Section:
     return report.Section("The module", words, (drawn,))
 
 
-def _section(folder: Path, outcome: Outcome) -> report.Section:
+def _section(folder: Path, outcome: StageOutcome) -> report.Section:
     stage = outcome.stage
     pictures = [
         report.Figure((folder / name).read_bytes(), caption, wide=True)
@@ -225,7 +229,7 @@ def _section(folder: Path, outcome: Outcome) -> report.Section:
     return report.Section(stage.title, stage.text, (*pictures, *_tables(outcome)))
 
 
-def _tables(outcome: Outcome) -> Iterator[report.Table]:
+def _tables(outcome: StageOutcome) -> Iterator[report.Table]:
     """Rows and parameters of a result as tables of their own, its plain numbers as the
     last.
     """
@@ -259,7 +263,7 @@ def _tables(outcome: Outcome) -> Iterator[report.Table]:
     )
 
 
-def _error(outcome: Outcome) -> str:
+def _error(outcome: StageOutcome) -> str:
     key, meaning = outcome.stage.error
     found = outcome.values.get(key)
     if isinstance(found, dict):
@@ -271,5 +275,5 @@ def _error(outcome: Outcome) -> str:
     )
 
 
-def _verdict(outcomes: list[Outcome]) -> str:
+def _verdict(outcomes: list[StageOutcome]) -> str:
     return "yes" if not any(o.status for o in outcomes) else "no"

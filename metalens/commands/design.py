@@ -15,11 +15,15 @@ from metalens import design, lens, library
 from metalens.cell import Cell, describe_order_loss
 from metalens.commands import design_words as words
 from metalens.commands import paired, several
-from metalens.commands.common import Common, Output
-from metalens.commands.paired import Target
-from metalens.commands.several import Beside
+from metalens.commands.common import CommonOptions, Output
+from metalens.commands.paired import YPolarizationTarget
+from metalens.commands.several import AdditionalWavelength
+from metalens.core import config, reading, store, transaction
+from metalens.core.console import Console
+from metalens.core.errors import ConfigError
+from metalens.core.store import write_bytes
 from metalens.design import (
-    Conversion,
+    ConversionMetrics,
     Cubic,
     DoubleHelix,
     Focus,
@@ -30,11 +34,7 @@ from metalens.design import (
     Quality,
     check_focus,
 )
-from metalens.design.free_form import Asked, Fisher
-from metalens.ground import config, reading, store, transaction
-from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError
-from metalens.ground.store import write_bytes
+from metalens.design.free_form import FisherSettings, ResolvedFisherSettings
 from metalens.lens import Layers, Lens, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
@@ -49,7 +49,7 @@ Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
 
 @dataclass(frozen=True, slots=True)
-class Design:
+class DesignSettings:
     """The content of DESIGN.toml.
 
     profile: which phase.
@@ -92,12 +92,12 @@ class Design:
     limits: Limits = field(default_factory=Limits)
     double_helix: DoubleHelix = field(default_factory=DoubleHelix)
     cubic: Cubic = field(default_factory=Cubic)
-    fisher: Fisher = field(default_factory=Fisher)
+    fisher: FisherSettings = field(default_factory=FisherSettings)
     map: PhaseMap | None = None
     layers: Layers = field(default_factory=Layers)
     hand: Literal["right", "left"] = "right"
-    along_y: Target | None = None
-    wavelengths: tuple[Beside, ...] = ()
+    along_y: YPolarizationTarget | None = None
+    wavelengths: tuple[AdditionalWavelength, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.aperture_mm <= 10:
@@ -112,7 +112,7 @@ class Design:
             raise ConfigError(
                 "library and cell are both given; a library holds its cell: give one of them"
             )
-        several.check(self.wavelengths, self.profile)
+        several.check_single_wavelength_profile(self.wavelengths, self.profile)
         check_gaps(
             self.layers, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3
         )
@@ -125,7 +125,7 @@ class Design:
             (self.wavelength_nm or _WAVELENGTH_NM) * 1e-3, *distances, self.layers
         )
 
-    def at(self, held_um: Iterable[float]) -> "Design":
+    def at(self, held_um: Iterable[float]) -> "DesignSettings":
         """The same, its wavelength filled in from those that the library holds."""
         told, only = self.wavelength_nm, {round(1e3 * wave, 6) for wave in held_um}
         return replace(
@@ -135,7 +135,7 @@ class Design:
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens design``.
 
     Attributes:
@@ -162,9 +162,9 @@ def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where light does not focus as
     it should or pillars are hardly
     known."""
-    wanted = config.load(options.config, Design, empty=False)
+    wanted = config.load(options.config, DesignSettings, empty=False)
     target, read = options.output, _read(wanted, options.config)
-    if wanted.library is not None and paired.holds(
+    if wanted.library is not None and paired.is_two_size_library(
         options.config.parent / wanted.library
     ):
         return _paired(wanted, options, read)
@@ -177,36 +177,38 @@ def run(options: Options) -> int:
     focus = made.wanted.focus
     lost = describe_order_loss(made.lens.cell, focus.wavelength_um, made.loss)
     head, layers = (
-        _head(made.wanted, target, made.quality) + words.held(made.lens) + lost,
+        _head(made.wanted, target, made.quality)
+        + words.pillar_accuracy_text(made.lens)
+        + lost,
         made.wanted.layers,
     )
     about_focus = made.quality, made.check, made.unlike, made.figures
-    values = words.values(*about_focus) | several.numbers(made.beside)
-    values |= words.curve(made.lens.proxy) | {"loss": made.loss}
-    text = words.text(head, layers, *about_focus, several=bool(made.beside))
-    text += several.lines(made.beside, layers)
+    values = words.design_values(*about_focus) | several.wavelength_values(made.beside)
+    values |= words.proxy_error(made.lens.proxy) | {"loss": made.loss}
+    text = words.design_text(head, layers, *about_focus, several=bool(made.beside))
+    text += several.wavelength_text(made.beside, layers)
     if made.quality.turns < 1 and not made.beside:
         about = made.lens.proxy, made.lens.cell, made.wanted.limits
-        text += f"\n  for a whole turn: {design.cure(*about, made.quality.turns)}"
+        text += f"\n  for a whole turn: {design.phase_coverage_hint(*about, made.quality.turns)}"
     if made.conversion is not None:
         values["circular"] = {"hand": made.wanted.hand, **asdict(made.conversion)}
-        text = f"{text}\n{words.converted(made.conversion, made.quality, made.wanted.hand)}"
+        text = f"{text}\n{words.conversion_text(made.conversion, made.quality, made.wanted.hand)}"
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     checks = (made.check, *(one.check for one in made.beside))
     return options.console.judged(
-        values, text, [*words.unfocused(checks), made.lens.proxy.doubt]
+        values, text, [*words.focus_failures(checks), made.lens.proxy.doubt]
     )
 
 
-def _head(wanted: Design, target: Path, quality: Quality) -> str:
+def _head(wanted: DesignSettings, target: Path, quality: Quality) -> str:
     return (
         f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
         f"{1e3 * wanted.focus.wavelength_um:g} nm"
     )
 
 
-def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
+def _paired(wanted: DesignSettings, options: Options, read: list[Path]) -> int:
     """A lens of pillars of two sizes, for light along x and along y."""
     if options.own_cell:
         raise ConfigError(
@@ -235,11 +237,11 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         if wanted.along_y is None:
             other: tuple[PhaseOf | None, Focus] = None, focus
         else:
-            other = paired.phase(
+            other = paired.y_polarization_phase(
                 wanted.along_y, focus, options.config, radius_um=radius_um
             )
         about = store.Provenance(config=config.dumps(wanted), inputs=inputs)
-        made, split = design.make_paired(
+        made, split = design.assign_polarization_multiplexed(
             (phase, other[0]),
             (focus, other[1]),
             aperture_um=2 * radius_um,
@@ -249,18 +251,18 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
             provenance=about,
         )
         profiles = wanted.profile, (wanted.along_y or wanted).profile
-        checks = paired.checks(made, profiles, skip=options.skip_focus_check)
+        checks = paired.check_both_foci(made, profiles, skip=options.skip_focus_check)
         figures = paired.figures(made, split)
         lens.save(draft.path, made)
-        write_bytes(draft.path.with_suffix(".png"), lens_plot.picture(made))
+        write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(made))
     head = _head(wanted, options.output, split.x)
     head += describe_order_loss(made_of.cell, wanted.focus.wavelength_um)
-    values = paired.values(split, checks, figures)
-    text = paired.text(head, wanted.layers, split, checks, figures)
-    return options.console.judged(values, text, words.unfocused(checks))
+    values = paired.polarization_values(split, checks, figures)
+    text = paired.polarization_text(head, wanted.layers, split, checks, figures)
+    return options.console.judged(values, text, words.focus_failures(checks))
 
 
-def _read(wanted: Design, where: Path) -> list[Path]:
+def _read(wanted: DesignSettings, where: Path) -> list[Path]:
     """The files that the config names."""
     maps = [
         one
@@ -272,7 +274,7 @@ def _read(wanted: Design, where: Path) -> list[Path]:
     ]
 
 
-def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
+def _make(wanted: DesignSettings, options: Options, path: Path) -> "DesignOutcome":
     """Design, check and write the lens with its pictures."""
     made_of, inputs = _pillars(wanted, options.config, options.console)
     cell, proxy = made_of.cell, library.proxy_of(made_of)
@@ -301,18 +303,18 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         "profile": wanted.profile,
     }
     about["provenance"] = store.Provenance(config=config.dumps(wanted), inputs=inputs)
-    conversion: Conversion | None = None
+    conversion: ConversionMetrics | None = None
     others: list[Quality] = []
     lights = [
-        design.Wanted(*_phase(one, options, radius_um)[:2], w)
-        for one, w in several.each(wanted, made_of)
+        design.WavelengthTarget(*_phase(one, options, radius_um)[:2], w)
+        for one, w in several.designs_by_wavelength(wanted, made_of)
     ]
     if lights:
-        made, (quality, *others) = design.make_several(
+        made, (quality, *others) = design.assign_multi_wavelength(
             lights, cell=cell, proxy=proxy, **about
         )
     elif made_of.turned is not None:
-        made, quality, conversion = design.make_turned(
+        made, quality, conversion = design.assign_geometric_phase(
             phase, focus, library=made_of, hand=wanted.hand, **about
         )
     else:
@@ -320,11 +322,11 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         made, quality = design.make(
             phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about
         )
-    meets = wanted.profile != "map" or words.meets(
+    meets = wanted.profile != "map" or words.focus_problem(
         phase, focus, radius_um, cell, options.console
     )
     quality = replace(quality, focuses=meets)
-    made, found = words.neighbours(
+    made, found = words.solve_coupling(
         made, quality, conversion, radius_um, solve=options.own_cell
     )
     checked = _checkable(wanted, options, quality)
@@ -333,14 +335,16 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         if checked
         else None
     )
-    beside = several.judged(made, wanted.wavelengths, lights[1:], others, check=checked)
+    beside = several.judge_wavelengths(
+        made, wanted.wavelengths, lights[1:], others, check=checked
+    )
     figures = words.focus_figures(made, quality)
     lens.save(path, made)
-    write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
+    write_bytes(path.with_suffix(".png"), lens_plot.lens_picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
     lost = made_of.mean_loss(made.diameters.diameter_um, wanted.focus.wavelength_um)
-    return Outcome(
+    return DesignOutcome(
         wanted,
         quality,
         check,
@@ -355,25 +359,25 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DesignOutcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; figures:
     of its PSF; judged: of a free form; conversion: of
     circular light; unlike: what neighbours leave of the efficiency; beside: of the
     other wavelengths; loss: mean share that is absorbed or in other orders."""
 
-    wanted: Design
+    wanted: DesignSettings
     quality: Quality
     check: FocusCheck | None
     figures: FocusMetrics | None
     judged: "_Judged | None"
-    conversion: Conversion | None
-    unlike: design.Unlike | None
+    conversion: ConversionMetrics | None
+    unlike: design.NeighbourCouplingLoss | None
     lens: Lens
-    beside: tuple[several.Judged, ...]
+    beside: tuple[several.WavelengthMetrics, ...]
     loss: float
 
 
-def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
+def _checkable(wanted: DesignSettings, options: Options, quality: Quality) -> bool:
     """Whether the exact sum makes sense: a lens with one focus, small enough to hold
     every pillar's phase at once.
     """
@@ -396,7 +400,7 @@ class _Judged:
 
 
 def _phase(
-    wanted: Design, options: Options, radius_um: float
+    wanted: DesignSettings, options: Options, radius_um: float
 ) -> tuple[PhaseOf, Focus, _Judged | None]:
     """The phase of the profile, what it images onto what, and for a free form how it
     compares.
@@ -416,7 +420,7 @@ def _phase(
 
 
 def _free_form(
-    wanted: Design, options: Options, radius_um: float
+    wanted: DesignSettings, options: Options, radius_um: float
 ) -> tuple[PhaseOf, Focus, _Judged | None]:
     """A designed phase; where it was made for axial information, beside simple lenses
     tuned as hard.
@@ -451,18 +455,20 @@ def _free_form(
     console.say(
         "tuning a hyperbolic lens and a double helix for the same pixels, depths and angles"
     )
-    lenses = reports.judged(found, pupil, settings)
-    picture = reports.picture(lenses, pupil, settings)
+    lenses = reports.judge_designs(found, pupil, settings)
+    picture = reports.report_picture(lenses, pupil, settings)
     return (
         phase,
         focus,
         _Judged(
-            reports.values(lenses, settings), reports.text(lenses, settings), picture
+            reports.report_values(lenses, settings),
+            reports.report_text(lenses, settings),
+            picture,
         ),
     )
 
 
-def _scene_objective(settings: Asked, pupil: "Pupil") -> Any:
+def _scene_objective(settings: ResolvedFisherSettings, pupil: "Pupil") -> Any:
     """Eq. 6 on rendered eyes, of a package above this one: named by the command line,
     loaded only when asked for.
     """
@@ -470,7 +476,7 @@ def _scene_objective(settings: Asked, pupil: "Pupil") -> Any:
 
 
 def _pillars(
-    wanted: Design, where: Path, console: Console
+    wanted: DesignSettings, where: Path, console: Console
 ) -> tuple[PillarLibrary, dict[str, str]]:
     """The library of the pillars, and the hash of its file if there is one."""
     if wanted.library is not None:
@@ -495,7 +501,7 @@ def _printable(path: Path, cell: Cell, limits: Limits) -> Limits:
     return replace(limits, min_diameter_nm=thinnest, min_gap_nm=gap)
 
 
-def _located(wanted: Design, where: Path) -> PhaseMap | None:
+def _located(wanted: DesignSettings, where: Path) -> PhaseMap | None:
     """The phase map with its file relative to the config."""
     if wanted.map is None:
         return None

@@ -6,15 +6,22 @@ from dataclasses import asdict, replace
 
 from metalens import design
 from metalens.cell import Cell
-from metalens.design import Conversion, Focus, FocusCheck, PhaseOf, Quality, Unlike
-from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError
+from metalens.core.console import Console
+from metalens.core.errors import ConfigError
+from metalens.design import (
+    ConversionMetrics,
+    Focus,
+    FocusCheck,
+    NeighbourCouplingLoss,
+    PhaseOf,
+    Quality,
+)
 from metalens.lens import Layers, Lens
 from metalens.pillars import Proxy
 from metalens.psf import FocusMetrics
 
 
-def meets(
+def focus_problem(
     phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console
 ) -> bool:
     """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
@@ -36,14 +43,14 @@ def place(at_um: tuple[float, float, float]) -> str:
     return f"at ({x:+.4g}, {y:+.4g}) um, {z * 1e-3:.4g} mm behind the lens"
 
 
-def neighbours(
+def solve_coupling(
     made: Lens,
     quality: Quality,
-    conversion: Conversion | None,
+    conversion: ConversionMetrics | None,
     radius_um: float,
     *,
     solve: bool,
-) -> tuple[Lens, Unlike | None]:
+) -> tuple[Lens, NeighbourCouplingLoss | None]:
     """The lens, holding its rows where they are to be solved, and what unlike
     neighbours leave of the light in the
     focus, by those or rough; None where there is no such number.
@@ -63,9 +70,11 @@ def neighbours(
             )
         return made, None
     if not solve:
-        return made, design.rough_unlike(made, radius_um=radius_um)
-    made = replace(made, neighbours=design.rows(made, radius_um=radius_um))
-    return made, design.unlike(made, radius_um=radius_um)
+        return made, design.estimate_neighbour_coupling_loss(made, radius_um=radius_um)
+    made = replace(
+        made, neighbours=design.solve_coupling_rows(made, radius_um=radius_um)
+    )
+    return made, design.neighbour_coupling_loss(made, radius_um=radius_um)
 
 
 # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
@@ -86,10 +95,10 @@ def focus_figures(made: Lens, quality: Quality) -> FocusMetrics | None:
         return None
 
 
-def values(
+def design_values(
     quality: Quality,
     check: FocusCheck | None,
-    unlike: Unlike | None = None,
+    unlike: NeighbourCouplingLoss | None = None,
     figures: FocusMetrics | None = None,
 ) -> dict[str, object]:
     """Numbers of a lens, of the check of its focus, of its neighbours and of its PSF;
@@ -141,7 +150,7 @@ def _of_psf(figures: FocusMetrics | None) -> dict[str, object]:
     return found | {"diffraction_limit": asdict(figures.limit)}
 
 
-def unfocused(checks: Sequence[FocusCheck | None]) -> list[str]:
+def focus_failures(checks: Sequence[FocusCheck | None]) -> list[str]:
     """Of every focus that is not as it should be, what is wrong with it."""
     return [
         f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a Strehl ratio of "
@@ -163,7 +172,7 @@ def _cone(quality: Quality) -> list[str]:
     ]
 
 
-def converted(found: Conversion, quality: Quality, hand: str) -> str:
+def conversion_text(found: ConversionMetrics, quality: Quality, hand: str) -> str:
     """What becomes of circular light, in words."""
     whole = quality.strehl * found.converted
     return (
@@ -174,7 +183,7 @@ def converted(found: Conversion, quality: Quality, hand: str) -> str:
     )
 
 
-def _neighbours(found: Unlike) -> str:
+def _neighbours(found: NeighbourCouplingLoss) -> str:
     """What neighbours leave of the power in the focus, in words."""
     if found.pillars:
         rows = ", ".join(map(str, found.pillars))
@@ -223,7 +232,7 @@ def _films(layers: Layers) -> list[str]:
     return found
 
 
-def curve(proxy: Proxy) -> dict[str, object]:
+def proxy_error(proxy: Proxy) -> dict[str, object]:
     """How far the curve that stands for the pillars is from the solved ones, at the
     most.
     """
@@ -234,7 +243,7 @@ def curve(proxy: Proxy) -> dict[str, object]:
     }
 
 
-def held(made: Lens) -> str:
+def pillar_accuracy_text(made: Lens) -> str:
     """What is known of its pillars, in words: how close to solved ones; for which
     light, where pillars of one
     size answer x and y apart."""
@@ -251,12 +260,12 @@ def held(made: Lens) -> str:
     )
 
 
-def text(
+def design_text(
     head: str,
     layers: Layers,
     quality: Quality,
     check: FocusCheck | None,
-    unlike: Unlike | None = None,
+    unlike: NeighbourCouplingLoss | None = None,
     figures: FocusMetrics | None = None,
     *,
     several: bool = False,

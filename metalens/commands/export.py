@@ -8,14 +8,14 @@ from pathlib import Path
 import tyro
 
 from metalens import lens
-from metalens.commands.common import Common, Output
-from metalens.ground import transaction
-from metalens.ground.errors import LensError
+from metalens.commands.common import CommonOptions, Output
+from metalens.core import transaction
+from metalens.core.errors import LensError
 from metalens.lens import export
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens export``.
 
     Attributes:
@@ -34,7 +34,7 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Write the file; exit 0."""
-    export.check(options.output)
+    export.check_export_format(options.output)
     if (
         options.samples != Options.samples
         and options.output.suffix.lower() in export.ARRAYS
@@ -49,7 +49,7 @@ def run(options: Options) -> int:
         transaction.check_room(
             options.output, 12 * options.samples**2 if grid else 4 * rows * columns
         )
-        error = export.write(draft.path, made, samples=options.samples)
+        error = export.export_lens(draft.path, made, samples=options.samples)
     how = ""
     if grid:
         how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"

@@ -10,10 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from metalens import lens, psf
-from metalens.ground import config, store
-from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError
-from metalens.ground.report import Figure, KeyFigure, Section, Table, canvas, png, write
+from metalens.core import config, store
+from metalens.core.console import Console
+from metalens.core.errors import ConfigError
+from metalens.core.report import (
+    Figure,
+    KeyFigure,
+    Section,
+    Table,
+    figure_png,
+    make_figure,
+    write_report,
+)
 
 if TYPE_CHECKING:
     from metalens.psf import FarField
@@ -36,7 +44,7 @@ Directions = list[tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Asked:
+class FarFieldRequest:
     """What a far field is computed for, kept in the file.
 
     angles_deg: (x, y) of every direction of incidence. source_mm: inf for plane waves.
@@ -49,7 +57,7 @@ class Asked:
     samples: int
 
 
-def asked(options: Any, made: lens.Lens) -> Asked:
+def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
     """Of the options of ``metalens psf``.
 
     Raises:
@@ -87,12 +95,14 @@ def asked(options: Any, made: lens.Lens) -> Asked:
     samples = SAMPLES if options.samples is None else options.samples
     if not 3 <= samples <= 4001:
         raise ConfigError(f"samples = {samples}: need 3 to 4001 across a far field")
-    return Asked(
+    return FarFieldRequest(
         tuple(zip(along_x, along_y, strict=True)), sources[0], waves[0], samples
     )
 
 
-def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"]:
+def compute_far_fields(
+    made: lens.Lens, wanted: FarFieldRequest, console: Console
+) -> list["FarField"]:
     """One far field a direction of incidence; of pillars of two sizes the light along x
     that the lens is for.
     """
@@ -111,9 +121,9 @@ def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"
     ]
 
 
-def save(
+def save_far_fields(
     path: Path,
-    wanted: Asked,
+    wanted: FarFieldRequest,
     found: list["FarField"],
     *,
     inputs: dict[str, str],
@@ -151,13 +161,15 @@ def save(
         attributes=about | {"beam_sine": found[0].beam_sine},
         provenance=provenance,
     )
-    image = picture(wanted, found)
+    image = far_field_picture(wanted, found)
     store.write_bytes(path.with_name(f"{path.stem}_far.png"), image)
     if page:
         _report(path.with_suffix(".html"), wanted, found, image)
 
 
-def values(wanted: Asked, found: list["FarField"]) -> dict[str, Any]:
+def far_field_values(
+    wanted: FarFieldRequest, found: list["FarField"]
+) -> dict[str, Any]:
     """Numbers for programs."""
     fields = []
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
@@ -186,7 +198,9 @@ def values(wanted: Asked, found: list["FarField"]) -> dict[str, Any]:
     }
 
 
-def text(target: Path, wanted: Asked, found: list["FarField"]) -> str:
+def far_field_text(
+    target: Path, wanted: FarFieldRequest, found: list["FarField"]
+) -> str:
     """Lines for people."""
     source = (
         "plane waves"
@@ -241,14 +255,14 @@ def _cone(one: "FarField", part: float) -> float | None:
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
-def picture(wanted: Asked, found: list["FarField"]) -> bytes:
+def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes:
     """Light over direction cosines on a logarithmic scale (above), and within cones
     about the axis (below).
     """
     from matplotlib.colors import LogNorm
 
     width = max(4.6, 3.6 * len(found))
-    figure, panels = canvas(
+    figure, panels = make_figure(
         2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
     )
     for column, ((x, y), one) in enumerate(zip(wanted.angles_deg, found, strict=True)):
@@ -282,10 +296,12 @@ def picture(wanted: Asked, found: list["FarField"]) -> bytes:
             ylim=(0, 1.02),
             xlim=(0, None),
         )
-    return png(figure)
+    return figure_png(figure)
 
 
-def _report(path: Path, wanted: Asked, found: list["FarField"], image: bytes) -> None:
+def _report(
+    path: Path, wanted: FarFieldRequest, found: list["FarField"], image: bytes
+) -> None:
     rows = [
         [f"({x:g}, {y:g})", b.share, b.angle_deg, b.azimuth_deg, b.sine_x, b.sine_y]
         for (x, y), one in zip(wanted.angles_deg, found, strict=True)
@@ -305,4 +321,4 @@ def _report(path: Path, wanted: Asked, found: list["FarField"], image: bytes) ->
             text="" if rows else caption,
         )
     )
-    write(path, "Far field", sections, key_figures=keys)
+    write_report(path, "Far field", sections, key_figures=keys)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from metalens.cell import Cell, Light, Polarization
-from metalens.commands.common import Common, Output
+from metalens.cell import Cell, Incidence, Polarization
+from metalens.commands.common import CommonOptions, Output
 from metalens.commands.library import CellFile
-from metalens.ground import config, reading, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
-from metalens.ground.report import canvas, png
+from metalens.core import config, reading, store
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
+from metalens.core.report import figure_png, make_figure
 from metalens.pillars import workers
-from metalens.rcwa import Grid, NearField, near_fields
+from metalens.rcwa import FieldGrid, NearField, near_fields
 
 CUTS = {"xz": "y = 0", "yz": "x = 0"}
 SOUGHT = 0.1  # of the error of a field, where no tolerance is stated
@@ -28,7 +28,7 @@ NM = 1e3
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens field``.
 
     Attributes:
@@ -66,7 +66,7 @@ class Options(Common):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class NearFieldRequest:
     """What a field is computed for, kept in the file; see ``Options``."""
 
     cell: Cell
@@ -81,17 +81,17 @@ class Asked:
     tolerance: float
 
     @property
-    def light(self) -> Light:
+    def light(self) -> Incidence:
         """The plane wave."""
         turns = math.radians(self.angle_deg), math.radians(self.azimuth_deg)
-        return Light(self.wavelength_um, turns[0], self.polarization, turns[1])
+        return Incidence(self.wavelength_um, turns[0], self.polarization, turns[1])
 
     @property
     def step_um(self) -> float:
         """Between points."""
         return self.cell.pitch_um / self.samples
 
-    def grids(self) -> list[Grid]:
+    def grids(self) -> list[FieldGrid]:
         """Cuts along x and z, along y and z, and maps along x and y: middles of square
         pixels over a period.
         """
@@ -110,10 +110,14 @@ class Asked:
             low
             + (np.arange(math.ceil((high - low) / self.step_um)) + 0.5) * self.step_um
         )
-        return [Grid(x, [0.0], z), Grid([0.0], y, z), Grid(x, y, self.heights_um)]
+        return [
+            FieldGrid(x, [0.0], z),
+            FieldGrid([0.0], y, z),
+            FieldGrid(x, y, self.heights_um),
+        ]
 
 
-def asked(options: Options) -> Asked:
+def near_field_request(options: Options) -> NearFieldRequest:
     """Of the options, and of CELL.toml where they leave something out.
 
     Raises:
@@ -145,7 +149,7 @@ def asked(options: Options) -> Asked:
         raise ConfigError(
             f"tolerance = {options.tolerance:g}: need an error above 0 and up to {UNKNOWN:g}"
         )
-    return Asked(
+    return NearFieldRequest(
         cell,
         options.diameter_um,
         wavelength,
@@ -163,7 +167,7 @@ def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where an error estimate stays above the tolerance
     that is stated, or above 0.5.
     """
-    wanted = asked(options)
+    wanted = near_field_request(options)
     with options.claim(options.output, beside=(".png",)) as draft:
         found = near_fields(
             wanted.cell,
@@ -173,13 +177,15 @@ def run(options: Options) -> int:
             tolerance=wanted.tolerance,
         )
         files = (options.config, *workers.material_files(wanted.cell))
-        save(
+        save_near_field(
             draft.path,
             wanted,
             found,
             {file.name: reading.sha256(file) for file in files},
         )
-        store.write_bytes(draft.path.with_suffix(".png"), picture(wanted, found))
+        store.write_bytes(
+            draft.path.with_suffix(".png"), near_field_picture(wanted, found)
+        )
     names = (*CUTS, "xy")
     values: dict[str, Any] = {
         name: {"error": one.error, "largest_e": _largest(one)}
@@ -210,16 +216,16 @@ def run(options: Options) -> int:
 
 
 def _largest(one: NearField) -> float:
-    return float(magnitude(one.e).max())
+    return float(field_magnitude(one.e).max())
 
 
-def magnitude(field: Array) -> Array:
+def field_magnitude(field: Array) -> Array:
     """(…) |E| = sqrt(|Ex|² + |Ey|² + |Ez|²) of (3, …)."""
     return np.asarray(np.sqrt((np.abs(field) ** 2).sum(axis=0)))
 
 
-def save(
-    path: Path, wanted: Asked, found: list[NearField], inputs: dict[str, str]
+def save_near_field(
+    path: Path, wanted: NearFieldRequest, found: list[NearField], inputs: dict[str, str]
 ) -> None:
     """The file of kind ``near-field``: E and H (3, rows, columns) of the cuts, (3,
     height, y, x) of the maps.
@@ -248,25 +254,27 @@ def save(
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
 
 
-def picture(wanted: Asked, found: list[NearField]) -> bytes:
+def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> bytes:
     """|E| on both cuts (light goes upwards) and on the maps, with the boundaries of the
     materials.
     """
     cuts, maps = found[:2], found[2]
     columns = max(2, len(wanted.heights_um))
-    figure, panels = canvas(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
+    figure, panels = make_figure(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
     top = max(_largest(one) for one in found)
     shown = None
     for panel, one, name in zip(panels[0], cuts, CUTS, strict=False):
         across = np.asarray(one.grid.x_um if name == "xz" else one.grid.y_um)
-        e, index = magnitude(one.e).squeeze(), one.index.squeeze().real
+        e, index = field_magnitude(one.e).squeeze(), one.index.squeeze().real
         shown = _map(panel, across, np.asarray(one.grid.z_um), e, index, top)
         panel.set(
             title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
         )
     for i, height in enumerate(wanted.heights_um):
         x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
-        shown = _map(panels[1, i], x, y, magnitude(maps.e)[i], maps.index[i].real, top)
+        shown = _map(
+            panels[1, i], x, y, field_magnitude(maps.e)[i], maps.index[i].real, top
+        )
         panels[1, i].invert_yaxis()
         panels[1, i].set(
             title=f"|E| at z = {height:.4g} µm", xlabel="x / µm", ylabel="y / µm"
@@ -274,7 +282,7 @@ def picture(wanted: Asked, found: list[NearField]) -> bytes:
     for panel in (*panels[0, 2:], *panels[1, len(wanted.heights_um) :]):
         panel.set_axis_off()
     figure.colorbar(shown, ax=panels, label="|E| of the light that comes", shrink=0.6)
-    return png(figure)
+    return figure_png(figure)
 
 
 def _map(panel: Any, x: Array, y: Array, e: Array, index: Array, top: float) -> Any:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from metalens.commands.common import MASKS, Common
-from metalens.ground import manifest, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import StoreError
+from metalens.commands.common import MASKS, CommonOptions
+from metalens.core import manifest, store
+from metalens.core.arrays import Array
+from metalens.core.errors import StoreError
 
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
@@ -26,7 +26,7 @@ TOLD: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens info``.
 
     Attributes:
@@ -43,11 +43,11 @@ class Options(Common):
 def run(options: Options) -> int:
     """Print what the file holds; exit 0."""
     if options.file.is_dir():
-        told = folder(options.file)
+        told = folder_manifest(options.file)
         options.console.result(told, _folder_text(told))
         return 0
     if options.file.suffix == NETWORK:
-        told = network(options.file)
+        told = safetensors_head(options.file)
         options.console.result(told, _network_text(told))
         return 0
     if _is_drawing(options.file) and "mask" in TOLD:
@@ -55,7 +55,7 @@ def run(options: Options) -> int:
         told = module.told(options.file, options.top)
         options.console.result(told, module.text(told))
         return 0
-    if (listed := member(options.file)) is not None:
+    if (listed := manifest_entry(options.file)) is not None:
         options.console.result(listed, _member_text(listed))
         return 0
     stored = store.load(options.file)
@@ -69,7 +69,7 @@ def _is_drawing(path: Path) -> bool:
     return not _DRAWINGS.isdisjoint(suffix.lower() for suffix in path.suffixes)
 
 
-def _about(name: str, stored: store.Stored) -> dict[str, Any]:
+def _about(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
     arrays = {name: f"{a.dtype} {tuple(a.shape)}" for name, a in stored.arrays.items()}
     return {
         "file": name,
@@ -86,14 +86,14 @@ def _about(name: str, stored: store.Stored) -> dict[str, Any]:
     }
 
 
-def member(path: Path) -> dict[str, Any] | None:
+def manifest_entry(path: Path) -> dict[str, Any] | None:
     """A file that is no HDF5, as the manifest of its folder lists it: command and
     versions; None where none does.
 
     Raises:
         StoreError: it is not as it was written.
     """
-    found = manifest.read(path.parent) if path.is_file() else None
+    found = manifest.read_manifest(path.parent) if path.is_file() else None
     listed = (found or {}).get("files", {}).get(path.name)
     if found is None or listed is None:
         return None
@@ -118,18 +118,18 @@ def _member_text(told: dict[str, Any]) -> str:
     return f"{first}\nmade with {versions}"
 
 
-def folder(path: Path) -> dict[str, Any]:
+def folder_manifest(path: Path) -> dict[str, Any]:
     """The manifest of a folder, after its files were compared with it.
 
     Raises:
         StoreError: no manifest, unfinished, or a file that is missing or differs.
     """
-    found = manifest.read(path)
+    found = manifest.read_manifest(path)
     if found is None:
         raise StoreError(
             f"{path}: no {manifest.NAME} in it, not made by this toolchain; give a file, or a folder of ours"
         )
-    manifest.check(path)
+    manifest.check_manifest(path)
     return {"folder": str(path), **found}
 
 
@@ -150,7 +150,7 @@ def _folder_text(told: dict[str, Any]) -> str:
     )
 
 
-def network(path: Path) -> dict[str, Any]:
+def safetensors_head(path: Path) -> dict[str, Any]:
     """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of
     its length, then JSON).
 
@@ -213,7 +213,7 @@ def _network_text(told: dict[str, Any]) -> str:
     )
 
 
-def _text(stored: store.Stored, arrays: dict[str, str]) -> str:
+def _text(stored: store.StoredArtefact, arrays: dict[str, str]) -> str:
     made = stored.provenance
     lines = [f"{stored.kind} version {stored.version}"]
     lines += [
@@ -230,7 +230,7 @@ def _text(stored: store.Stored, arrays: dict[str, str]) -> str:
         stored.arrays.values(), key=lambda a: a.size if a.ndim >= 2 else 0, default=None
     )
     if picture is not None and picture.ndim >= 2 and picture.dtype.kind in "fiu":
-        lines += sketch(picture)
+        lines += text_sketch(picture)
     return "\n".join(lines)
 
 
@@ -246,7 +246,7 @@ def _short(value: object) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-def sketch(array: Array, *, columns: int = 48) -> list[str]:
+def text_sketch(array: Array, *, columns: int = 48) -> list[str]:
     """Lines of characters that show a (…, y, x) array, its first image, darkest for the
     largest value.
     """

@@ -15,29 +15,29 @@ import tyro
 from metalens import library
 from metalens.cell import (
     Cell,
-    Order,
+    DiffractionOrder,
     named_orders,
     no_resonance_um,
     substrate_orders,
 )
 from metalens.commands import axes_library
-from metalens.commands.common import Distributed, Output
-from metalens.ground import config, reading, store
-from metalens.ground.errors import DomainError
+from metalens.commands.common import DistributedOptions, Output
+from metalens.core import config, reading, store
+from metalens.core.errors import DomainError
 from metalens.pillars import (
     DEFAULT_CELL,
     MOST_ERROR,
     PillarLibrary,
     ProxyFit,
+    ProxyTolerances,
     Sweep,
-    Wanted,
     axes,
     converted,
-    taller,
+    height_hint,
     workers,
 )
 from metalens.pillars import fit as proxy_fit
-from metalens.pillars.circular import Turned
+from metalens.pillars.circular import GeometricPhase
 
 MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
@@ -52,11 +52,11 @@ class CellFile:
 
     cell: Cell = DEFAULT_CELL
     sweep: Sweep = field(default_factory=Sweep)
-    proxy: Wanted = field(default_factory=Wanted)
+    proxy: ProxyTolerances = field(default_factory=ProxyTolerances)
 
 
 @dataclass(frozen=True)
-class Options(Distributed):
+class Options(DistributedOptions):
     """Options of ``metalens library``.
 
     Attributes:
@@ -78,14 +78,14 @@ def run(options: Options) -> int:
     """
     wanted = config.load(options.config, CellFile, empty=False)
     if wanted.sweep.lengths_um is not None:
-        axes.check(wanted.cell, wanted.sweep)
+        axes.check_axes_sweep(wanted.cell, wanted.sweep)
         about = store.Provenance(
             config.dumps(wanted), _inputs(options.config, wanted.cell)
         )
         return axes_library.run(
             options, options.output, wanted.cell, wanted.sweep, about
         )
-    library.check(wanted.cell, wanted.sweep)
+    library.check_sweep(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
     with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
@@ -95,7 +95,7 @@ def run(options: Options) -> int:
         )
         seconds = time.perf_counter() - start
         if wanted.sweep.light == "circular":
-            made = converted.with_turns(made)
+            made = converted.with_rotations(made)
         fitted, refusal = _fit(made, wanted.proxy)
         notes = (
             (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
@@ -129,11 +129,11 @@ def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     }
 
 
-def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:
+def _fit(made: PillarLibrary, wanted: ProxyTolerances) -> tuple[ProxyFit | None, str]:
     try:
-        return (converted.fit if made.sweep.light == "circular" else proxy_fit.fit)(
-            made, wanted
-        ), ""
+        return (
+            converted.fit_converted if made.sweep.light == "circular" else proxy_fit.fit
+        )(made, wanted), ""
     except DomainError as refused:
         return None, str(refused)
 
@@ -160,7 +160,7 @@ def _failures(
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
     elif fitted.turns < 1 and not accept_partial_turn:
-        cure = taller(made.cell.height_um, fitted.turns)
+        cure = height_hint(made.cell.height_um, fitted.turns)
         if fitted.notes:
             least = no_resonance_um(made.cell, made.sweep.wavelengths_um[0])
             cure = (
@@ -279,7 +279,7 @@ def _text(
     return "\n".join(lines)
 
 
-def _orders(made: PillarLibrary) -> tuple[Order, ...]:
+def _orders(made: PillarLibrary) -> tuple[DiffractionOrder, ...]:
     """Orders of the substrate, at the shortest wavelength and the widest angle."""
     return substrate_orders(
         made.cell,
@@ -314,7 +314,7 @@ def _elsewhere(made: PillarLibrary) -> list[str]:
     ]
 
 
-def _circular(turned: Turned) -> dict[str, Any]:
+def _circular(turned: GeometricPhase) -> dict[str, Any]:
     """What the turned pillar does to circular light, the lesser hand."""
     share, bar = min(turned.efficiency(1.0), turned.efficiency(-1.0))
     kept, kept_bar = max(turned.unconverted(1.0), turned.unconverted(-1.0))
@@ -330,7 +330,7 @@ def _circular(turned: Turned) -> dict[str, Any]:
     }
 
 
-def _turned_lines(turned: Turned) -> list[str]:
+def _turned_lines(turned: GeometricPhase) -> list[str]:
     found = _circular(turned)
     return [
         f"  turned in its lattice, {1e3 * turned.size_um:.1f} nm: {found['converted']:.3f} +- "

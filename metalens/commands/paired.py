@@ -8,6 +8,8 @@ from typing import Literal
 
 from metalens import design
 from metalens.commands import design_words as words
+from metalens.core import store
+from metalens.core.errors import ConfigError
 from metalens.design import (
     Cubic,
     DoubleHelix,
@@ -15,10 +17,8 @@ from metalens.design import (
     FocusCheck,
     PhaseMap,
     PhaseOf,
-    Split,
+    PolarizationMetrics,
 )
-from metalens.ground import store
-from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens, check_gaps
 from metalens.pillars import axes
 from metalens.psf import FocusMetrics
@@ -27,7 +27,7 @@ BOTH: tuple[Literal["x", "y"], ...] = ("x", "y")
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class YPolarizationTarget:
     """What light polarised along y is to see.
 
     profile: which phase. sensor_distance_mm, source_distance_mm: what is imaged onto
@@ -51,13 +51,13 @@ class Target:
             )
 
 
-def holds(path: Path) -> bool:
+def is_two_size_library(path: Path) -> bool:
     """Whether a file is a library over two sizes."""
     return path.is_file() and store.load(path).kind == axes.KIND
 
 
-def phase(
-    wanted: Target, focus: Focus, where: Path, *, radius_um: float
+def y_polarization_phase(
+    wanted: YPolarizationTarget, focus: Focus, where: Path, *, radius_um: float
 ) -> tuple[PhaseOf, Focus]:
     """The phase for light along y, and what it images onto what; where: the config that
     names the map.
@@ -75,7 +75,7 @@ def phase(
     ), other
 
 
-def checks(
+def check_both_foci(
     made: Lens, profiles: tuple[str, str], *, skip: bool
 ) -> list[FocusCheck | None]:
     """The exact sum about the focus of either light; None where a profile has no focus,
@@ -90,7 +90,7 @@ def checks(
     ]
 
 
-def figures(made: Lens, split: Split) -> list[FocusMetrics | None]:
+def figures(made: Lens, split: PolarizationMetrics) -> list[FocusMetrics | None]:
     """Of the PSF of either light."""
     return [
         words.focus_figures(made.seen(light), quality)
@@ -98,8 +98,8 @@ def figures(made: Lens, split: Split) -> list[FocusMetrics | None]:
     ]
 
 
-def values(
-    split: Split,
+def polarization_values(
+    split: PolarizationMetrics,
     found: list[FocusCheck | None],
     of_psf: list[FocusMetrics | None],
 ) -> dict[str, object]:
@@ -113,7 +113,7 @@ def values(
     for place, (light, quality) in enumerate(
         zip(BOTH, (split.x, split.y), strict=True)
     ):
-        own = words.values(quality, found[place], None, of_psf[place])
+        own = words.design_values(quality, found[place], None, of_psf[place])
         own |= {
             "wavefront_efficiency_error": split.wavefront_efficiency_error[place],
             "leaked": split.leaked[place],
@@ -123,10 +123,10 @@ def values(
     return told
 
 
-def text(
+def polarization_text(
     head: str,
     layers: Layers,
-    split: Split,
+    split: PolarizationMetrics,
     found: list[FocusCheck | None],
     of_psf: list[FocusMetrics | None],
 ) -> str:
@@ -139,7 +139,7 @@ def text(
     for place, (light, quality) in enumerate(
         zip(BOTH, (split.x, split.y), strict=True)
     ):
-        lines += words.text(
+        lines += words.design_text(
             f"  light polarised along {light}:",
             layers,
             quality,

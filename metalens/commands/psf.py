@@ -17,16 +17,16 @@ from metalens import design, lens, psf
 from metalens.cell import describe_order_loss
 from metalens.commands import far_field
 from metalens.commands import psf_words as words
-from metalens.commands.common import Common, MaybeOutput
-from metalens.commands.psf_settings import Settings, read
-from metalens.ground import config, reading, store, transaction
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
-from metalens.ground.report import write
-from metalens.ground.store import Provenance, write_bytes
+from metalens.commands.common import CommonOptions, MaybeOutput
+from metalens.commands.psf_settings import PsfSettings, read_psf_settings
+from metalens.core import config, reading, store, transaction
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
+from metalens.core.report import write_report
+from metalens.core.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
 
-# by kind of file, the module whose ``load`` gives a :class:`Built`; filled by the
+# by kind of file, the module whose ``load`` gives a :class:`AsBuiltSource`; filled by the
 # command line
 SOURCES: dict[str, str] = {}
 CAPTIONS = {
@@ -41,7 +41,7 @@ CAPTIONS = {
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens psf``.
 
     Attributes:
@@ -117,15 +117,15 @@ class Options(Common):
     report: bool = False
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> PsfSettings:
         """Those of the file with the options in their place."""
         table: dict[str, Any] = {}
-        for name in Settings.__slots__:
+        for name in PsfSettings.__slots__:
             value = getattr(self, name, None)
             if isinstance(value, tuple):
                 value = [str(v) if isinstance(v, Path) else v for v in value]
             table[name] = value
-        return read(self.config, table)
+        return read_psf_settings(self.config, table)
 
 
 def run(options: Options) -> int:
@@ -135,7 +135,7 @@ def run(options: Options) -> int:
     if options.far_field:
         return _far(options)
     target, settings = options.output or Path("psf.h5"), options.settings
-    psf_export.check(target)
+    psf_export.check_psf_format(target)
     made, built = _read(options.lens)
     made = made if settings.layers is None else replace(made, layers=settings.layers)
     settings = settings.about(made, None if built is None else built.angle_rad)
@@ -171,7 +171,7 @@ def _far(options: Options) -> int:
         )
     made = lens.load(options.lens)
     wanted, inputs = (
-        far_field.asked(options, made),
+        far_field.far_field_request(options, made),
         {options.lens.name: reading.sha256(options.lens)},
     )
     with options.claim(
@@ -179,15 +179,18 @@ def _far(options: Options) -> int:
         beside=("_far.png", ".html"),
         room=transaction.ROOM + 4 * wanted.samples**2,
     ) as draft:
-        found = far_field.compute(made, wanted, options.console)
-        far_field.save(draft.path, wanted, found, inputs=inputs, page=options.report)
+        found = far_field.compute_far_fields(made, wanted, options.console)
+        far_field.save_far_fields(
+            draft.path, wanted, found, inputs=inputs, page=options.report
+        )
     options.console.result(
-        far_field.values(wanted, found), far_field.text(target, wanted, found)
+        far_field.far_field_values(wanted, found),
+        far_field.far_field_text(target, wanted, found),
     )
     return 0
 
 
-class Built(Protocol):
+class AsBuiltSource(Protocol):
     """A lens that was made, with the PSFs of what was made."""
 
     @property
@@ -205,19 +208,19 @@ class Built(Protocol):
         """Relative L2 error of the PSFs by what the captures leave open."""
 
 
-def _read(path: Path) -> tuple[lens.Lens, Built | None]:
+def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
     """The design of a file, and what was made of it where the file is of another kind
     that the command line knows.
     """
     kind = store.kind_of(path)
     if kind not in SOURCES:
         return lens.load(path), None
-    found: Built = importlib.import_module(SOURCES[kind]).load(path)
+    found: AsBuiltSource = importlib.import_module(SOURCES[kind]).load(path)
     return found.design, found
 
 
 def _compute(
-    path: Path, settings: Settings, made: lens.Lens, built: Built | None
+    path: Path, settings: PsfSettings, made: lens.Lens, built: AsBuiltSource | None
 ) -> words.Computed:
     """PSFs, the figures of the sharpest of every angle, and a scan behind a lens for
     collimated light.
@@ -228,7 +231,7 @@ def _compute(
         return words.Computed(stack, figures, design.lens_meeting_um(made))
     made = _in_light(path, made, settings)
     known = _own_cell(made, settings) if settings.own_cell else None
-    if known is not None and isinstance(known.neighbours, lens.Neighbours):
+    if known is not None and isinstance(known.neighbours, lens.NeighbourRows):
         made = replace(made, neighbours=known.neighbours)
     stack = _of_design(made, settings, known, _provenance(path, settings))
     figures = psf.focus_metrics(stack, made, power_error=design.power_error(made))
@@ -238,12 +241,12 @@ def _compute(
 
 
 def _scan(
-    made: lens.Lens, settings: Settings, stack: psf.PsfStack
+    made: lens.Lens, settings: PsfSettings, stack: psf.PsfStack
 ) -> "psf.FocusScan | None":
     """Behind a lens for collimated light, unless its sources were stated."""
     if not math.isinf(made.source_distance_um) or settings.sources_mm != (math.inf,):
         return None
-    nodes = psf.Nodes(stack.wavelengths_um, stack.weights, 0.0)
+    nodes = psf.SpectralNodes(stack.wavelengths_um, stack.weights, 0.0)
     return psf.focus_scan(made, offset_um=settings.offset_um, nodes=nodes)
 
 
@@ -251,14 +254,14 @@ def _write(path: Path, found: words.Computed, *, page: bool) -> None:
     """The file of PSFs, its pictures, and with ``page`` its report."""
     from metalens.psf import plots as psf_plots
 
-    psf_export.write(path, found.stack)
+    psf_export.export_psf(path, found.stack)
     limit = max((one.limit for one in found.figures), key=lambda one: one.cutoff_per_um)
-    pictures = psf_plots.pictures(found.stack, limit=limit, scan=found.scan)
+    pictures = psf_plots.psf_pictures(found.stack, limit=limit, scan=found.scan)
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
     if page:
         sections = words.sections(found, {CAPTIONS[n]: i for n, i in pictures.items()})
-        write(
+        write_report(
             path.with_suffix(".html"),
             "Point spread functions",
             sections,
@@ -266,7 +269,7 @@ def _write(path: Path, found: words.Computed, *, page: bool) -> None:
         )
 
 
-def _of_built(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
+def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.PsfStack:
     """PSFs of a kind of file that the command line knows a source for, the posterior of
     its fit in their error.
     """
@@ -290,7 +293,7 @@ def _of_built(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
     )
 
 
-def _in_light(path: Path, made: lens.Lens, settings: Settings) -> lens.Lens:
+def _in_light(path: Path, made: lens.Lens, settings: PsfSettings) -> lens.Lens:
     """The lens for the polarisation that is asked for."""
     if settings.light == "both" or (
         made.pairs is None and made.one_light == f"light along {settings.light}"
@@ -307,7 +310,7 @@ def _in_light(path: Path, made: lens.Lens, settings: Settings) -> lens.Lens:
 
 def _of_design(
     made: lens.Lens,
-    settings: Settings,
+    settings: PsfSettings,
     known: psf.LeftOut | None,
     provenance: Provenance,
 ) -> psf.PsfStack:
@@ -334,21 +337,21 @@ def _of_design(
         raise ConfigError(
             "light along x and y is focused at other distances by this lens: give light = 'x' or 'y'"
         )
-    return psf.unpolarised(of(x), of(y))
+    return psf.mean_over_polarizations(of(x), of(y))
 
 
-def _provenance(path: Path, settings: Settings) -> Provenance:
+def _provenance(path: Path, settings: PsfSettings) -> Provenance:
     files = [path, *(file for file in settings.spectrum if file.is_file())]
     return Provenance(
         config.dumps(settings), {file.name: reading.sha256(file) for file in files}
     )
 
 
-def _own_cell(made: lens.Lens, settings: Settings) -> psf.LeftOut:
+def _own_cell(made: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
     """Neighbours and angle of the lens's own pillars, at the largest aperture and angle
     of the view.
     """
-    apertures = [psf.aperture(made, angle) for angle in settings.view.angles_rad]
+    apertures = [psf.sine_aperture(made, angle) for angle in settings.view.angles_rad]
     incidence = max(
         float(np.arctan(np.hypot(*np.tan(angle)))) for angle in settings.view.angles_rad
     )

@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from metalens import design, lens, propagate, psf
-from metalens.ground import config
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.core import config
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 from metalens.lens import Layers, reach
 from metalens.psf import spectrum as spectra
 
@@ -21,7 +21,7 @@ AIRY = 28.0  # width of a window in units of wavelength / NA
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class PsfSettings:
     """What is computed; kept in the file.
 
     depths_mm: nearest and farthest source, and the largest step between depths; left
@@ -192,7 +192,7 @@ class Settings:
             raise ConfigError("window_um is left to the lens, and there is none")
         return self.window_um
 
-    def about(self, made: lens.Lens, angles_rad: Array | None = None) -> "Settings":
+    def about(self, made: lens.Lens, angles_rad: Array | None = None) -> "PsfSettings":
         """These with depths, angles and window of this lens where they were left out.
 
         angles_rad: (n, 2) angles that it was measured at, in place of its field's.
@@ -247,7 +247,7 @@ class Settings:
             tuple(np.deg2rad([x, y]).tolist())
             for x, y in zip(self.angles_deg, along_y, strict=True)
         ]
-        angles = tuple(propagate.angles(pair) for pair in pairs)
+        angles = tuple(propagate.to_angle_pair(pair) for pair in pairs)
         window = self.width_um, self.width_um / self.samples * self.samples_y
         return psf.View(
             tuple(depths.tolist()),
@@ -271,17 +271,19 @@ class Settings:
 
     def spectrum_of(
         self, made: lens.Lens
-    ) -> spectra.Nodes | spectra.Source | spectra.Measured | None:
+    ) -> spectra.SpectralNodes | spectra.Source | spectra.MeasuredSpectrum | None:
         """Wavelengths with weights, a diode or measured curves; None for the design
         wavelength alone.
         """
         if self.wavelengths_nm:
             share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
-            return spectra.Nodes(
+            return spectra.SpectralNodes(
                 np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0
             )
         if self.spectrum:
-            return spectra.measured(self.spectrum, within_um=made.proxy.wavelengths_um)
+            return spectra.read_measured_spectrum(
+                self.spectrum, within_um=made.proxy.wavelengths_um
+            )
         return (
             spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm)
             if self.led_fwhm_nm
@@ -303,14 +305,14 @@ def _angles_deg(
     return (0.0, float(f"{half:.2g}")), (0.0, 0.0)
 
 
-def read(path: Path | None, over: dict[str, Any]) -> Settings:
+def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
     """Settings of a file (None: those of the record) with what was given on the command
     line in their place.
 
     Raises:
-        ConfigError: as :func:`metalens.ground.config.load`.
+        ConfigError: as :func:`metalens.core.config.load`.
     """
-    table = {} if path is None else config.read(path, Settings, empty=False)
+    table = {} if path is None else config.read(path, PsfSettings, empty=False)
     given = {name: value for name, value in over.items() if value is not None}
     where = " and ".join(
         [
@@ -318,4 +320,4 @@ def read(path: Path | None, over: dict[str, Any]) -> Settings:
             *(["the command line"] if given else []),
         ]
     )
-    return config.from_table(table | given, Settings, where=where or "metalens psf")
+    return config.from_table(table | given, PsfSettings, where=where or "metalens psf")

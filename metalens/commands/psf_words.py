@@ -11,7 +11,7 @@ import numpy as np
 
 from metalens import psf
 from metalens.commands import design_words
-from metalens.ground.report import Figure, KeyFigure, Section, Table
+from metalens.core.report import Figure, KeyFigure, Section, Table
 
 DARK = 0.1  # share of the light in the window, below which it holds no image
 BUDGET_WORDS = (

@@ -8,15 +8,15 @@ from typing import Any
 
 from metalens import design
 from metalens.commands import design_words as words
-from metalens.design import FocusCheck, Quality, Wanted
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
+from metalens.design import FocusCheck, Quality, WavelengthTarget
 from metalens.lens import Layers, Lens
 from metalens.pillars import PillarLibrary
 from metalens.psf import FocusMetrics
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class AdditionalWavelength:
     """Light beside the design's own that the same pillars are to serve.
 
     wavelength_nm: of that light. weight: of its squared errors, against 1 of the
@@ -35,16 +35,18 @@ class Beside:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class WavelengthMetrics:
     """What light beside the design's own gets."""
 
-    light: Beside
+    light: AdditionalWavelength
     quality: Quality
     check: FocusCheck | None
     figures: FocusMetrics | None
 
 
-def check(wavelengths: tuple[Beside, ...], profile: str) -> None:
+def check_single_wavelength_profile(
+    wavelengths: tuple[AdditionalWavelength, ...], profile: str
+) -> None:
     """Refuse profiles that are of one wavelength."""
     if wavelengths and profile in ("fisher", "map"):
         raise ConfigError(
@@ -52,8 +54,10 @@ def check(wavelengths: tuple[Beside, ...], profile: str) -> None:
         )
 
 
-def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
-    """The design (:class:`metalens.commands.design.Design`) as each wavelength is to
+def designs_by_wavelength(
+    wanted: Any, made_of: PillarLibrary
+) -> Iterator[tuple[Any, float]]:
+    """The design (:class:`metalens.commands.design.DesignSettings`) as each wavelength is to
     see it, and its weight; its own
     first. Nothing where there is no other.
 
@@ -78,14 +82,14 @@ def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
         yield replace(wanted, **told, wavelengths=()), one.weight
 
 
-def judged(
+def judge_wavelengths(
     made: Lens,
-    beside: Sequence[Beside],
-    wanted: Sequence[Wanted],
+    beside: Sequence[AdditionalWavelength],
+    wanted: Sequence[WavelengthTarget],
     found: Sequence[Quality],
     *,
     check: bool,
-) -> tuple[Judged, ...]:
+) -> tuple[WavelengthMetrics, ...]:
     """Every other wavelength with its quality, and the exact sum about its focus if
     that is asked for.
     """
@@ -98,7 +102,7 @@ def judged(
             source_distance_um=one.focus.source_distance_um,
         )
         out.append(
-            Judged(
+            WavelengthMetrics(
                 light,
                 quality,
                 design.check_focus(seen, expected=quality.strehl) if check else None,
@@ -108,20 +112,20 @@ def judged(
     return tuple(out)
 
 
-def numbers(beside: Sequence[Judged]) -> dict[str, object]:
+def wavelength_values(beside: Sequence[WavelengthMetrics]) -> dict[str, object]:
     """Of the other wavelengths, for programs; nothing where there is none."""
     found = [
         {
             "wavelength_nm": one.light.wavelength_nm,
             "weight": one.light.weight,
-            **words.values(one.quality, one.check, None, one.figures),
+            **words.design_values(one.quality, one.check, None, one.figures),
         }
         for one in beside
     ]
     return {"wavelengths": found} if found else {}
 
 
-def lines(beside: Sequence[Judged], layers: Layers) -> str:
+def wavelength_text(beside: Sequence[WavelengthMetrics], layers: Layers) -> str:
     """Of the other wavelengths, for people."""
     heads = [
         f"\n  light of {one.light.wavelength_nm:g} nm, weight {one.light.weight:g}:"
@@ -129,7 +133,7 @@ def lines(beside: Sequence[Judged], layers: Layers) -> str:
     ]
     found = zip(heads, beside, strict=True)
     return "".join(
-        words.text(
+        words.design_text(
             head, layers, one.quality, one.check, None, one.figures, several=True
         )
         for head, one in found

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands.common import Distributed, Output
-from metalens.ground import config
-from metalens.ground.units import nm
-from metalens.pillars import Journal, Study, study_plots
+from metalens.commands.common import DistributedOptions, Output
+from metalens.core import config
+from metalens.core.units import nm
+from metalens.pillars import CellStudy, SweepJournal, study_plots
 from metalens.pillars import study as cell_study
 
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 
 
 @dataclass(frozen=True)
-class Options(Distributed):
+class Options(DistributedOptions):
     """Options of ``metalens study``.
 
     Attributes:
@@ -44,9 +44,9 @@ class Options(Distributed):
 def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
     study = (
-        Study()
+        CellStudy()
         if options.config is None
-        else config.load(options.config, Study, empty=False)
+        else config.load(options.config, CellStudy, empty=False)
     )
     given = "" if options.config is None else f" {options.config.name}"
     if options.process is not None:
@@ -54,13 +54,13 @@ def run(options: Options) -> int:
         given += f" --process {options.process.name}"
     command = f"metalens study{given} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.shared():
-        journal = Journal(
+        journal = SweepJournal(
             options.output.with_name(options.output.name + ".resume"), study
         )
-        verdicts = cell_study.run(study, options.console, journal=journal)
+        verdicts = cell_study.run_study(study, options.console, journal=journal)
         study_plots.write_study(draft.path, study, verdicts, command=command)
     journal.finish()
-    best = cell_study.choice(study, verdicts)
+    best = cell_study.best_cell(study, verdicts)
     values = {
         "pitch_um": best and best[0],
         "height_um": best and best[1],
@@ -69,14 +69,14 @@ def run(options: Options) -> int:
     text = f"{options.output}: {len(verdicts)} cells"
     if best is not None:
         text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
-    missed = cell_study.unsure(study, verdicts)
+    missed = cell_study.uncertain_entries(study, verdicts)
     text += f"\n  {missed}" if missed else ""
     return options.console.judged(
         values, text, [] if best else ["no cell covers a full turn at all wavelengths"]
     )
 
 
-def _printable(path: Path, study: Study) -> Study:
+def _printable(path: Path, study: CellStudy) -> CellStudy:
     """The study with the limits of a process file, through a package above this one
     that the command line names.
     """

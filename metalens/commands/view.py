@@ -9,10 +9,10 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands.common import MASKS, Common, MaybeOutput
-from metalens.ground import manifest, store
-from metalens.ground.errors import ConfigError
-from metalens.view import Panel, write
+from metalens.commands.common import MASKS, CommonOptions, MaybeOutput
+from metalens.core import manifest, store
+from metalens.core.errors import ConfigError
+from metalens.view import Panel, write_page
 
 VIEWS: dict[
     str, str
@@ -39,7 +39,7 @@ OWN = {
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens view``.
 
     Attributes:
@@ -61,7 +61,7 @@ def run(options: Options) -> int:
     target = options.output or _beside(options.file)
     with options.claim(target) as draft:
         title, panels = _shown(options.file)
-        write(draft.path, title, panels, about=_about(options.file))
+        write_page(draft.path, title, panels, about=_about(options.file))
     size = target.stat().st_size
     options.console.result(
         {"page": target.name, "panels": len(panels), "bytes": size},
@@ -145,7 +145,7 @@ def _inside(path: Path) -> list[Path]:
 def _about(path: Path) -> dict[str, object]:
     """Where an artefact comes from."""
     if path.is_dir() or path.suffix != ".h5":
-        found = manifest.read(path if path.is_dir() else path.parent) or {}
+        found = manifest.read_manifest(path if path.is_dir() else path.parent) or {}
         return {name: found[name] for name in found if name != "files"}
     made = store.load(path).provenance
     return {

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.design.sites import PhaseOf, Sites
-from metalens.ground.arrays import Array
-from metalens.ground.threads import split
+from metalens.core.arrays import Array
+from metalens.core.threads import run_split
+from metalens.design.sites import LatticeSites, PhaseOf
 
 _STARTS, _ROUNDS, _SAMPLE = (
     16,
@@ -78,7 +78,7 @@ class CandidateTable:
                 some = slice(a, min(a + _ROWS, stop))
                 out[some] = choose(self.sums(phases_rad[:, some]))
 
-        split(len(out), work)
+        run_split(len(out), work)
         return out
 
     def pistons(self, phases_rad: Array) -> Array:
@@ -122,7 +122,7 @@ def make_candidates(
     return CandidateTable(t, weights, common_piston, factors, power)
 
 
-def sample_phases(place: Sites, phases: Sequence[PhaseOf]) -> Array:
+def sample_phases(place: LatticeSites, phases: Sequence[PhaseOf]) -> Array:
     """(channels, sites) wanted phases at some of the sites, evenly picked."""
     wanted = [
         np.concatenate([block for *_, block in place.blocks(phase)]) for phase in phases
@@ -132,7 +132,7 @@ def sample_phases(place: Sites, phases: Sequence[PhaseOf]) -> Array:
 
 
 def wanted_blocks(
-    place: Sites, phases: Sequence[PhaseOf], pistons: Array
+    place: LatticeSites, phases: Sequence[PhaseOf], pistons: Array
 ) -> Iterator[tuple[slice, Array, Array]]:
     """Blocks of rows: which sites hold a pillar, and (channels, sites) wanted phases.
 

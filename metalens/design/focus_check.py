@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from metalens import propagate, psf
+from metalens.core.arrays import Array
 from metalens.design.focusing import lens_meeting_um
 from metalens.design.own_cell import power_error
 from metalens.design.profiles import Focus
-from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.propagate import Case, field_at, kernel
+from metalens.propagate import PropagationCase, field_at, rayleigh_sommerfeld_kernel
 from metalens.psf import FocusMetrics
 
 _ARM = np.linspace(
@@ -150,7 +150,7 @@ def focus_figures(lens: Lens) -> FocusMetrics:
     """
     meets = lens_meeting_um(lens)
     offset = (0.0, 0.0) if meets is None else (meets[0], meets[1])
-    airy = lens.wavelength_um / (2 * psf.aperture(lens, (0.0, 0.0)))
+    airy = lens.wavelength_um / (2 * psf.sine_aperture(lens, (0.0, 0.0)))
     for width, samples in ((16, 128), (64, 512)):
         view = psf.View(
             (lens.source_distance_um,),
@@ -176,9 +176,9 @@ def _lit(lens: Lens) -> Any:
     )
 
 
-def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
+def _case(lens: Lens, step_um: float, shift_um: float) -> PropagationCase:
     """One sample on the axis, the sensor farther by ``shift_um`` of the cover."""
-    return propagate.case(
+    return propagate.make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
         wavelength_um=lens.wavelength_um,
@@ -203,13 +203,15 @@ def _axial_peak(
 _AXIS = np.zeros((1, 2))
 
 
-def _in_step(level: Array, case: Case) -> float:
+def _in_step(level: Array, case: PropagationCase) -> float:
     """Magnitude at the focus if all pillars were in step: sum of p² T d / (2 pi r²)
     |1/r - ik|.
     """
     y, x = case.pillars_um
     total = sum(
-        float((row * np.abs(kernel(case, x, at, 0.0, 0.0, 0.0))).sum())
+        float(
+            (row * np.abs(rayleigh_sommerfeld_kernel(case, x, at, 0.0, 0.0, 0.0))).sum()
+        )
         for row, at in zip(level, y, strict=True)
     )
     return total * case.area_um2

@@ -4,9 +4,9 @@ meet the sensor.
 
 import numpy as np
 
+from metalens.core.arrays import Array
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf
-from metalens.ground.arrays import Array
 from metalens.lens import Lens, media
 
 RAYS = 25  # along an axis

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import StoreError
+from metalens.core.arrays import Array
+from metalens.core.errors import StoreError
 
 _MEMORY, _A_BYTE = (
     2 << 30,
@@ -51,7 +51,9 @@ except BaseException as error:
 """
 
 
-def arrays(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Array]:
+def read_arrays_in_subprocess(
+    path: Path, kind: Literal["MATLAB", "NPZ"]
+) -> dict[str, Array]:
     """Numeric arrays of a MATLAB file (4 to 7.3), or of an NPZ file of NumPy, by name.
 
     Raises:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import materials
-from metalens.ground.arrays import Array
-from metalens.lens import Lens, Neighbours
+from metalens.core.arrays import Array
+from metalens.lens import Lens, NeighbourRows
 from metalens.rcwa import block_of, solve_row
 
 LONG = 6  # pillars: of shorter rows several are solved
@@ -29,7 +29,7 @@ def neighbours(
     counts: tuple[int, ...] = (6, 5),
     harmonics: int = 3,
     diagonal: bool = True,
-) -> Neighbours:
+) -> NeighbourRows:
     """How far unlike neighbours change the pillars of this lens: blazed rows of its own
     pillars, both polarisations.
 
@@ -69,7 +69,7 @@ def neighbours(
         for reach in (harmonics, harmonics - 1)
     ]
     fine, coarse = ([factor for factor, _ in one] for one in found)
-    return Neighbours(
+    return NeighbourRows(
         np.array([sine for _, sine in told]),
         np.array([turned for (_, turned), _ in told], bool),
         np.array(fine).reshape(-1, 2).T,

@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 
 from metalens.cell import Cell, no_resonance_um
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, LensError
+from metalens.core.store import Provenance
 from metalens.design import phase_map, profiles
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
-from metalens.design.sites import PhaseOf, least_period_um, sites
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, LensError
-from metalens.ground.store import Provenance
+from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import DiameterMap, Hand, Lens
-from metalens.pillars import Proxy, taller
+from metalens.pillars import Proxy, height_hint
 
 PLACES, SEARCHED = (
     61,
@@ -99,26 +99,28 @@ def phase_of(
         columns) in rad.
     """
     if isinstance(shape, PhaseMap):
-        samples = phase_map.read(shape)
+        samples = phase_map.read_phase_map(shape)
 
         def mapped(x_um: Array, y_um: Array) -> Array:
-            phase = phase_map.interpolate(samples, x_um, y_um, radius_um=radius_um)
+            phase = phase_map.interpolate_phase(
+                samples, x_um, y_um, radius_um=radius_um
+            )
             return (
-                phase + profiles.hyperbolic(x_um, y_um[:, None], focus)
+                phase + profiles.hyperbolic_phase(x_um, y_um[:, None], focus)
                 if shape.add_focus
                 else phase
             )
 
         return mapped
     if isinstance(shape, DoubleHelix):
-        return lambda x, y: profiles.double_helix(
+        return lambda x, y: profiles.double_helix_phase(
             x, y[:, None], focus, shape, radius_um=radius_um
         )
     if isinstance(shape, Cubic):
-        return lambda x, y: profiles.cubic(
+        return lambda x, y: profiles.cubic_phase(
             x, y[:, None], focus, shape, radius_um=radius_um
         )
-    return lambda x, y: profiles.hyperbolic(x, y[:, None], focus)
+    return lambda x, y: profiles.hyperbolic_phase(x, y[:, None], focus)
 
 
 def make(
@@ -156,7 +158,7 @@ def make(
             a full turn, or the phase has
             another shape.
     """
-    within = printable(
+    within = printable_range_um(
         proxy,
         cell,
         limits or Limits(),
@@ -164,8 +166,8 @@ def make(
         accept_partial_turn=accept_partial_turn,
     )
     gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"
-    place = sites(cell, aperture_um, grid_nm=(limits or Limits()).grid_nm)
-    diameter, sums = np.zeros(place.shape, np.float32), Sums()
+    place = lattice_sites(cell, aperture_um, grid_nm=(limits or Limits()).grid_nm)
+    diameter, sums = np.zeros(place.shape, np.float32), MetricSums()
     for rows, inside, wanted in place.blocks(phase):
         diameter[rows][inside] = proxy.diameter_um(
             wanted, focus.wavelength_um, within_um=within, gap=gap
@@ -207,7 +209,7 @@ def lens_of(
     )
 
 
-def printable(
+def printable_range_um(
     proxy: Proxy,
     cell: Cell,
     limits: Limits,
@@ -232,13 +234,13 @@ def printable(
     if turns < 1 and not accept_partial_turn:
         raise LensError(
             f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um:g} um, need 1"
-            f"; {cure(proxy, cell, limits, turns)}, or looser process limits, or "
+            f"; {phase_coverage_hint(proxy, cell, limits, turns)}, or looser process limits, or "
             "accept the nearest pillar (accept_partial_turn) at the loss of efficiency that the design then states"
         )
     return low, high
 
 
-def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
+def phase_coverage_hint(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
     """What would cover a turn where these pillars cover less (``turns``), for a person.
 
     Phase grows with the height as long as no resonance ends it: where the process ends
@@ -251,7 +253,7 @@ def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
         proxy.domain_um[0] <= thinnest + EDGE_UM
         and proxy.domain_um[1] >= widest - EDGE_UM
     ):
-        return taller(cell.height_um, turns)
+        return height_hint(cell.height_um, turns)
     return (
         f"the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
         f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep: sweep as far as is printed, and "
@@ -266,7 +268,7 @@ def _printed(cell: Cell, limits: Limits) -> tuple[float, float]:
     return cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
 
 
-class Sums:
+class MetricSums:
     """Running sums over all pillars that :class:`Quality` is made of."""
 
     def __init__(self) -> None:
@@ -358,7 +360,7 @@ def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
     x, y, lit_um2 = _lit(focus, radius_um, math.tan(angle_rad))
     if lit_um2 <= 0 or lit_um2 < LIT * _lit(focus, radius_um, 0.0)[2]:
         return math.inf
-    path = profiles.hyperbolic(x, y, focus)
+    path = profiles.hyperbolic_phase(x, y, focus)
     for one in focus.paths_from(x, y, math.tan(angle_rad)):
         path = path + 2 * np.pi / focus.wavelength_um * one
     basis = np.stack([np.ones_like(x), x, y], axis=1)

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from metalens import rcwa
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.design.neighbours import neighbours, printed
 from metalens.design.profiles import Focus
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
-from metalens.lens import CURVED, Lens, Neighbours
+from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.psf import NEIGHBOURS, LeftOut
 
 RINGS = 48  # of a lens, over which light is summed
@@ -67,7 +67,7 @@ def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Unlike:
+class NeighbourCouplingLoss:
     """What unlike neighbours leave of the light that pillars, taken one by one, bring
     to the focus.
 
@@ -81,7 +81,7 @@ class Unlike:
     pillars: tuple[int, ...] = ()
 
 
-def rows(lens: Lens, *, radius_um: float) -> Neighbours:
+def solve_coupling_rows(lens: Lens, *, radius_um: float) -> NeighbourRows:
     """Rows of the lens's own pillars with the zones of its rim and longer ones, for the
     lens to hold.
 
@@ -94,7 +94,7 @@ def rows(lens: Lens, *, radius_um: float) -> Neighbours:
     )
 
 
-def unlike(lens: Lens, *, radius_um: float) -> Unlike:
+def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplingLoss:
     """Rows of the lens's own pillars (those that it holds, else solved here), summed
     over its aperture.
 
@@ -103,9 +103,9 @@ def unlike(lens: Lens, *, radius_um: float) -> Unlike:
         zones that get shorter from one to the next, which no row has.
 
     Raises:
-        CellError: as :func:`rows`.
+        CellError: as :func:`solve_coupling_rows`.
     """
-    found = lens.neighbours or rows(lens, radius_um=radius_um)
+    found = lens.neighbours or solve_coupling_rows(lens, radius_um=radius_um)
     sine, weight = _rings(lens, radius_um)
     share = found.share(sine, weight)
     less = [other.share(sine, weight) for other in found.others]
@@ -113,14 +113,16 @@ def unlike(lens: Lens, *, radius_um: float) -> Unlike:
         (abs(one - share) for one in less), default=0.0
     )
     pitches = lens.wavelength_um / (found.sine[~found.diagonal] * lens.cell.pitch_um)
-    return Unlike(
+    return NeighbourCouplingLoss(
         share,
         error + CURVED * abs(1 - share),
         tuple(np.rint(pitches).astype(int).tolist()),
     )
 
 
-def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
+def estimate_neighbour_coupling_loss(
+    lens: Lens, *, radius_um: float
+) -> NeighbourCouplingLoss:
     """The same with the factor of another cell
     (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
 
@@ -129,7 +131,7 @@ def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
     sine, weight = _rings(lens, radius_um)
     a, b = NEIGHBOURS
     share = float(abs(weight @ (1 + a * sine + b * sine**2)) ** 2)
-    return Unlike(share, abs(1 - share))
+    return NeighbourCouplingLoss(share, abs(1 - share))
 
 
 def power_error(lens: Lens) -> float:
@@ -142,7 +144,11 @@ def power_error(lens: Lens) -> float:
         else lens.pairs.entry_error
     )
     radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
-    known = rough_unlike if lens.neighbours is None else unlike
+    known = (
+        estimate_neighbour_coupling_loss
+        if lens.neighbours is None
+        else neighbour_coupling_loss
+    )
     return math.hypot(2 * pillars, known(lens, radius_um=radius_um).error)
 
 

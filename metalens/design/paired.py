@@ -9,19 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
+from metalens.core.store import Provenance
 from metalens.design.candidates import (
     make_candidates,
     sample_phases,
     wanted_blocks,
 )
-from metalens.design.of_phase import Limits, Quality, Sums
+from metalens.design.of_phase import Limits, MetricSums, Quality
 from metalens.design.profiles import Focus
-from metalens.design.sites import PhaseOf, least_period_um, sites
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
-from metalens.ground.store import Provenance
-from metalens.lens import Lens, Pairs
-from metalens.pillars.axes import AxesLibrary, sized
+from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
+from metalens.lens import Lens, TwoSizeTable
+from metalens.pillars.axes import AxesLibrary, cell_of_sizes
 
 _COVERED_RAD = (
     0.2  # a wanted pair of phases is covered where a pillar gives both within this, and
@@ -31,7 +31,7 @@ _GAPS = 12  # sizes along each axis at which the gap to the neighbours is worked
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
+class PolarizationMetrics:
     """What a lens of two sizes makes of light along x and along y.
 
     x, y: quality for either; their ``wavefront_efficiency`` is the share of that light in its
@@ -53,7 +53,7 @@ class Split:
     pairs: int
 
 
-def make_paired(
+def assign_polarization_multiplexed(
     phases: tuple[PhaseOf, PhaseOf | None],
     focuses: tuple[Focus, Focus],
     *,
@@ -62,7 +62,7 @@ def make_paired(
     limits: Limits | None = None,
     profile: str = "map",
     provenance: Provenance | None = None,
-) -> tuple[Lens, Split]:
+) -> tuple[Lens, PolarizationMetrics]:
     """Fill a round aperture with pillars of two sizes, entries of the library.
 
     Args:
@@ -79,12 +79,12 @@ def make_paired(
     """
     limits, at = limits or Limits(), library.at(focuses[0].wavelength_um)
     stock = _stock(library, at, limits)
-    place = sites(library.cell, aperture_um, grid_nm=limits.grid_nm)
+    place = lattice_sites(library.cell, aperture_um, grid_nm=limits.grid_nm)
     wanted = phases[0], phases[1] or phases[0]
     table = make_candidates(stock.t.T, np.ones(2), common_piston=phases[1] is None)
     pistons = table.pistons(sample_phases(place, wanted))
     size, length = np.zeros(place.shape, np.float32), np.zeros(place.shape, np.float32)
-    sums, chosen = (Sums(), Sums()), []
+    sums, chosen = (MetricSums(), MetricSums()), []
     for rows, inside, block in wanted_blocks(place, wanted, pistons):
         pick = table.nearest(block)
         size[rows][inside], length[rows][inside] = stock.sizes[pick].T
@@ -160,7 +160,10 @@ def _printable(library: AxesLibrary, limits: Limits) -> Array:
         )
     ends = [np.linspace(v[0], v[-1], _GAPS) for v in (x, y)]
     gap = np.array(
-        [[sized(library.cell, a, b).gap_um(a) for b in ends[1]] for a in ends[0]]
+        [
+            [cell_of_sizes(library.cell, a, b).gap_um(a) for b in ends[1]]
+            for a in ends[0]
+        ]
     )
     row, column = (
         np.minimum(np.searchsorted(e, v), _GAPS - 1)
@@ -171,24 +174,24 @@ def _printable(library: AxesLibrary, limits: Limits) -> Array:
     )  # of the next larger pair
 
 
-def _pairs(library: AxesLibrary, focus_y: Focus, entry_error: float) -> Pairs:
+def _pairs(library: AxesLibrary, focus_y: Focus, entry_error: float) -> TwoSizeTable:
     t = np.stack([library.t[..., 0, 0], library.t[..., 1, 1]], axis=-1)
     distances = focus_y.sensor_distance_um, focus_y.source_distance_um
-    return Pairs(
+    return TwoSizeTable(
         library.wavelength_um, library.x_um, library.y_um, t, distances, entry_error
     )
 
 
 def _split(
     stock: _Stock,
-    sums: tuple[Sums, Sums],
+    sums: tuple[MetricSums, MetricSums],
     used: Array,
     focuses: tuple[Focus, Focus],
     aperture_um: float,
     library: AxesLibrary,
     *,
     alike: bool,
-) -> Split:
+) -> PolarizationMetrics:
     covered = _covered(stock, alike)
     period = least_period_um(library.cell)
     qualities = [
@@ -200,7 +203,7 @@ def _split(
     )  # of t: the peak's amplitude is off by no more
     errors = [2 * math.sqrt(q.wavefront_efficiency) * mean + mean**2 for q in qualities]
     leaked = (used[:, None] * stock.leaked).sum(axis=0) / used.sum()
-    return Split(
+    return PolarizationMetrics(
         qualities[0],
         qualities[1],
         (errors[0], errors[1]),

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from metalens.core import reading, store
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError, StoreError, nearest_name_hint
 from metalens.design import limited
 from metalens.design.profiles import PhaseMap
-from metalens.ground import reading, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError, StoreError, nearest
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
 CORE, MANY = (
@@ -31,7 +31,7 @@ PERIODS = {  # of 2 pi, by what the setting of a map that is not in radians shou
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Samples:
+class PhaseSamples:
     """A phase map as it was read.
 
     phase_rad: (y, x), +x right, +y down; nan where the file says that there is no data.
@@ -44,7 +44,7 @@ class Samples:
     centre_um: tuple[float, float] = (0.0, 0.0)
 
 
-def read(shape: PhaseMap) -> Samples:
+def read_phase_map(shape: PhaseMap) -> PhaseSamples:
     """Read the file of a phase map, by the ending of its name, in radians.
 
     ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named;
@@ -67,7 +67,7 @@ def read(shape: PhaseMap) -> Samples:
     path = shape.file
     if not path.is_file():
         raise LensError(
-            f"{path}: {reading.absent(path)}; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)"
+            f"{path}: {reading.missing_reason(path)}; need a phase map (.npy, .npz, .csv, .mat or a Zemax grid phase .dat)"
         )
     ending = path.suffix.lower()
     if ending == ".dat":
@@ -80,7 +80,7 @@ def read(shape: PhaseMap) -> Samples:
         samples = _text(path, shape)
     phase = samples.phase_rad if ending == ".dat" else _radians(samples, path, shape)
     phase = -phase if shape.conjugate else phase
-    return Samples(phase, samples.step_um, samples.centre_um)
+    return PhaseSamples(phase, samples.step_um, samples.centre_um)
 
 
 def _require_pitch(path: Path, pitch_um: float | None) -> None:
@@ -90,14 +90,14 @@ def _require_pitch(path: Path, pitch_um: float | None) -> None:
         )
 
 
-def _square(values: Any, path: Path, shape: PhaseMap) -> Samples:
+def _square(values: Any, path: Path, shape: PhaseMap) -> PhaseSamples:
     """A matrix with the same stated spacing along x and y."""
     _require_pitch(path, shape.pitch_um)
     pitch_um = float(shape.pitch_um or 0)
-    return Samples(_checked(values, path, shape), (pitch_um, pitch_um))
+    return PhaseSamples(_checked(values, path, shape), (pitch_um, pitch_um))
 
 
-def _radians(samples: Samples, path: Path, shape: PhaseMap) -> Array:
+def _radians(samples: PhaseSamples, path: Path, shape: PhaseMap) -> Array:
     """Values of a file in radians, by the stated unit.
 
     Raises:
@@ -136,8 +136,8 @@ def _refuse_other_unit(values: Array, path: Path) -> None:
             )
 
 
-def interpolate(
-    samples: Samples, x_um: Array, y_um: Array, *, radius_um: float = math.inf
+def interpolate_phase(
+    samples: PhaseSamples, x_um: Array, y_um: Array, *, radius_um: float = math.inf
 ) -> Array:
     """Phase between the samples, (y, x), by bilinear interpolation of the phasor exp(i
     phase).
@@ -285,7 +285,7 @@ def _npy(path: Path, variable: str | None) -> Any:
         raise LensError(f"{path}: not a phase map: {error}") from error
 
 
-def _text(path: Path, shape: PhaseMap) -> Samples:
+def _text(path: Path, shape: PhaseMap) -> PhaseSamples:
     """A matrix, or rows of x, y and phase."""
     _no_variable(path, shape.variable)
     try:
@@ -297,7 +297,7 @@ def _text(path: Path, shape: PhaseMap) -> Samples:
         raise LensError(
             f"{path}: not a phase map: it holds {len(rows)} rows of numbers"
         )
-    mark, decimal = reading.parting(max(*rows[:2], rows[-1], key=len))
+    mark, decimal = reading.column_separator(max(*rows[:2], rows[-1], key=len))
     if decimal:
         rows = [line.replace(",", ".") for line in rows]
     if mark and rows[0].startswith(mark):  # the corner of a table with named rows
@@ -362,7 +362,9 @@ def _length_scale(name: str) -> float:
     return {"nm": 1e-3, "mm": 1e3, "m": 1e6}[found.group(1)] if found else 1.0
 
 
-def _gridded(path: Path, table: Array, header: list[str], shape: PhaseMap) -> Samples:
+def _gridded(
+    path: Path, table: Array, header: list[str], shape: PhaseMap
+) -> PhaseSamples:
     """Rows of x, y (down) and phase on an even grid, in any order.
 
     x and y are in um, or in the unit that their names end in: x (nm), x_mm.
@@ -397,7 +399,7 @@ def _gridded(path: Path, table: Array, header: list[str], shape: PhaseMap) -> Sa
             f"{pitch_um}; leave pitch_um out (x and y are um)"
         )
     centre = (float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2)
-    return Samples(_checked(phase, path, shape), (steps[0], steps[1]), centre)
+    return PhaseSamples(_checked(phase, path, shape), (steps[0], steps[1]), centre)
 
 
 def _no_variable(path: Path, variable: str | None) -> None:
@@ -427,7 +429,7 @@ def _named(path: Path, held: dict[str, Any], variable: str | None) -> Any:
     if variable is not None:
         if variable not in held:
             raise LensError(
-                f"{path}: holds no variable {variable!r}{nearest(variable, held)}"
+                f"{path}: holds no variable {variable!r}{nearest_name_hint(variable, held)}"
             )
         return held[variable]
     if len(arrays) != 1:
@@ -439,12 +441,12 @@ def _named(path: Path, held: dict[str, Any], variable: str | None) -> Any:
 
 def _held(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Any]:
     try:
-        return dict(limited.arrays(path, kind))
+        return dict(limited.read_arrays_in_subprocess(path, kind))
     except StoreError as error:
         raise LensError(str(error)) from None
 
 
-def _zemax(path: Path, pitch_um: float | None) -> Samples:
+def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:
     """A grid-phase file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy
     [nodata]`` a point.
 
@@ -478,7 +480,7 @@ def _zemax(path: Path, pitch_um: float | None) -> Samples:
         raise LensError(
             f"{path}: spacing of {step[0]} x {step[1]} um, but pitch_um = {pitch_um}; leave pitch_um out"
         )
-    return Samples(phase, step, centre)
+    return PhaseSamples(phase, step, centre)
 
 
 def _zemax_head(

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, LensError
-from metalens.ground.paths import path_difference, source_path
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, LensError
+from metalens.core.paths import path_difference, source_path
 from metalens.lens import Layers, check_gaps, media
 
 
@@ -166,7 +166,7 @@ class PhaseMap:
             )
 
 
-def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
+def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
     """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both
     sides).
 
@@ -181,7 +181,7 @@ def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
     )
 
 
-def double_helix(
+def double_helix_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float
 ) -> Array:
     """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes
@@ -192,15 +192,15 @@ def double_helix(
         np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones
     )
     return np.asarray(
-        hyperbolic(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um)
+        hyperbolic_phase(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um)
     )
 
 
-def cubic(
+def cubic_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float
 ) -> Array:
     """Hyperbolic phase plus :class:`Cubic`."""
     x, y = x_um / radius_um, y_um / radius_um
     return np.asarray(
-        hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)
+        hyperbolic_phase(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)
     )

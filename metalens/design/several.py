@@ -9,17 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
+from metalens.core.store import Provenance
 from metalens.design.candidates import (
     make_candidates,
     sample_phases,
     wanted_blocks,
 )
-from metalens.design.of_phase import Limits, Quality, Sums, lens_of, printable
+from metalens.design.of_phase import (
+    Limits,
+    MetricSums,
+    Quality,
+    lens_of,
+    printable_range_um,
+)
 from metalens.design.profiles import Focus
-from metalens.design.sites import PhaseOf, least_period_um, sites
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
-from metalens.ground.store import Provenance
+from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import Lens
 from metalens.pillars import Proxy
 
@@ -29,7 +35,7 @@ _STEP_RAD = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class WavelengthTarget:
     """What light of a wavelength is to see.
 
     phase: :func:`metalens.design.phase_of` of the focus. weight: of its squared error, above 0.
@@ -40,8 +46,8 @@ class Wanted:
     weight: float = 1.0
 
 
-def make_several(
-    wanted: Sequence[Wanted],
+def assign_multi_wavelength(
+    wanted: Sequence[WavelengthTarget],
     *,
     aperture_um: float,
     cell: Cell,
@@ -73,7 +79,8 @@ def make_several(
     limits = limits or Limits()
     waves = [one.focus.wavelength_um for one in wanted]
     span, *_ = (
-        printable(proxy, cell, limits, wave, accept_partial_turn=True) for wave in waves
+        printable_range_um(proxy, cell, limits, wave, accept_partial_turn=True)
+        for wave in waves
     )  # all alike
     sizes = _sizes(proxy, span, waves)
     step_um = sizes[1] - sizes[0]
@@ -83,11 +90,11 @@ def make_several(
     ]
     table = make_candidates(np.stack(t), np.array([one.weight for one in wanted]))
     place, phases = (
-        sites(cell, aperture_um, grid_nm=limits.grid_nm),
+        lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm),
         [one.phase for one in wanted],
     )
     pistons = table.pistons(sample_phases(place, phases))
-    diameter, sums = np.zeros(place.shape, np.float32), [Sums() for _ in wanted]
+    diameter, sums = np.zeros(place.shape, np.float32), [MetricSums() for _ in wanted]
     for rows, inside, block in wanted_blocks(place, phases, pistons):
         diameter[rows][inside] = span[0] + step_um * table.between(block)
         made = diameter[rows][inside].astype(float).clip(*span)
@@ -106,7 +113,7 @@ def make_several(
     )
 
 
-def _check(wanted: Sequence[Wanted]) -> None:
+def _check(wanted: Sequence[WavelengthTarget]) -> None:
     waves = [one.focus.wavelength_um for one in wanted]
     if not waves or len(set(waves)) < len(waves):
         raise LensError(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell, Lattice
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.lens import DiameterMap
 
 PhaseOf = Callable[
@@ -22,7 +22,7 @@ _BLOCK_SITES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Sites:
+class LatticeSites:
     """Where pillars may stand: centres half a pitch inside a round aperture.
 
     shape: (y, x) of the map. steps_um: (x, y) from site to site of the map; on a
@@ -80,7 +80,7 @@ class Sites:
         )
 
 
-def sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> Sites:
+def lattice_sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> LatticeSites:
     """The sites of the cell's lattice in an aperture.
 
     grid_nm: of the mask: rows of a hexagonal lattice are sqrt(3)/2 pitches apart,
@@ -96,14 +96,14 @@ def sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> Sites:
     period = cell.lattice.periods_um(cell.pitch_um)
     if not cell.lattice.centred:
         counts = tuple(max(1, int(aperture_um / step)) for step in period[::-1])
-        return Sites(
+        return LatticeSites(
             cell.pitch_um, cell.lattice, (counts[0], counts[1]), period, aperture_um
         )
     grid = grid_nm * 1e-3
     steps = cell.pitch_um / 2, max(1, round(period[1] / 2 / grid)) * grid
     half_x, half_y = (int((aperture_um - cell.pitch_um) / 2 / step) for step in steps)
     half_x += (half_x + half_y) % 2  # the middle of the map is a site
-    return Sites(
+    return LatticeSites(
         cell.pitch_um,
         cell.lattice,
         (2 * half_y + 1, 2 * half_x + 1),

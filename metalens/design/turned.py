@@ -8,18 +8,18 @@ from typing import Literal
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.design.of_phase import Limits, Quality, Sums, lens_of
+from metalens.core.errors import LensError
+from metalens.core.store import Provenance
+from metalens.design.of_phase import Limits, MetricSums, Quality, lens_of
 from metalens.design.profiles import Focus
-from metalens.design.sites import PhaseOf, least_period_um, sites
-from metalens.ground.errors import LensError
-from metalens.ground.store import Provenance
+from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import HANDS, Lens
 from metalens.pillars import PillarLibrary, Proxy
-from metalens.pillars.circular import Turned
+from metalens.pillars.circular import GeometricPhase
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Conversion:
+class ConversionMetrics:
     """What becomes of circular light of the design's hand, from solved cells of the
     pillar at several turns.
 
@@ -38,7 +38,7 @@ class Conversion:
     isolated_error: float
 
 
-def make_turned(
+def assign_geometric_phase(
     phase: PhaseOf,
     focus: Focus,
     *,
@@ -48,7 +48,7 @@ def make_turned(
     limits: Limits | None = None,
     profile: str = "map",
     provenance: Provenance | None = None,
-) -> tuple[Lens, Quality, Conversion]:
+) -> tuple[Lens, Quality, ConversionMetrics]:
     """Fill a round aperture with pillars of the library's best size, each turned by
     half of its phase.
 
@@ -73,7 +73,7 @@ def make_turned(
         )
     cell, limits = library.cell, limits or Limits()
     _check(cell, turned, limits)
-    place, sums = sites(cell, aperture_um, grid_nm=limits.grid_nm), Sums()
+    place, sums = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm), MetricSums()
     size, angle = np.zeros(place.shape, np.float32), np.zeros(place.shape, np.float32)
     start, step = (
         float(proxy.phase_rad(turned.size_um, focus.wavelength_um)),
@@ -95,19 +95,21 @@ def make_turned(
     )
 
 
-def _level(proxy: Proxy, turned: Turned, focus: Focus, count: int) -> np.ndarray:
+def _level(
+    proxy: Proxy, turned: GeometricPhase, focus: Focus, count: int
+) -> np.ndarray:
     return np.full(
         count, float(proxy.transmission(turned.size_um, focus.wavelength_um))
     )
 
 
-def _conversion(turned: Turned, hand: str) -> Conversion:
+def _conversion(turned: GeometricPhase, hand: str) -> ConversionMetrics:
     sign = float(np.sign(HANDS[hand]))
     shares = *turned.efficiency(sign), *turned.unconverted(sign)
-    return Conversion(turned.size_um, *shares, turned.model_error)
+    return ConversionMetrics(turned.size_um, *shares, turned.model_error)
 
 
-def _check(cell: Cell, turned: Turned, limits: Limits) -> None:
+def _check(cell: Cell, turned: GeometricPhase, limits: Limits) -> None:
     """Refuse what is not printed at any turn of it and its neighbours."""
     outline = cell.outline(turned.size_um)
     gap = (

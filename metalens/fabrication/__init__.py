@@ -4,7 +4,7 @@ states of them, their spread, and the bias of a mask.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.fabrication import perturbations as perturbations
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from metalens.fabrication.two_sizes import PairTable as PairTable
     from metalens.fabrication.two_sizes import pair_sensitivities as pair_sensitivities
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Answer": "response",

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 
 # |d bias / d diameter| above this is refused: the inverse would not be a contraction
 STEEPEST = 0.5
@@ -137,7 +137,7 @@ def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
     pairs = []
     for number, line in rows:
         try:
-            first, second = (float(cell) for cell in reading.columns(line))
+            first, second = (float(cell) for cell in reading.split_columns(line))
         except ValueError:
             raise ProcessError(
                 f"{path}, line {number}: {line[:60]!r}, need two numbers"

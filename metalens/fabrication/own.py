@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.core import executor
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.fabrication.perturbations import Perturbation, ResponseError, of_kind
-from metalens.ground import executor
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
-from metalens.pillars.axes import sized
+from metalens.pillars.axes import cell_of_sizes
 
 if TYPE_CHECKING:
     from metalens.lens import Lens
@@ -59,7 +59,10 @@ def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
         {} if lens.cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
     )
     (found,) = _rates(
-        lens, [(lens.cell, float(d)) for d in size_um], edges, (seen(lens),)
+        lens,
+        [(lens.cell, float(d)) for d in size_um],
+        edges,
+        (polarization_weights(lens),),
     )
     return found
 
@@ -71,7 +74,7 @@ def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, Own
     ``edges`` are 0.
     """
     cells = [
-        (sized(lens.cell, float(w), float(d)), float(w))
+        (cell_of_sizes(lens.cell, float(w), float(d)), float(w))
         for w, d in zip(width_um, length_um, strict=True)
     ]
     return dict(zip("xy", _rates(lens, cells, {}, (_ALONG_X, _ALONG_Y)), strict=True))
@@ -86,7 +89,9 @@ def _rates(
     """Of pillars of these cells and sizes, for each weighting of the Jones matrix."""
     reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
     tasks = [(cell, size, harmonics) for harmonics in reach for cell, size in cells]
-    some = list(executor.gather(_derived, (lens.wavelength_um, edges, weights), tasks))
+    some = list(
+        executor.gather_parallel(_derived, (lens.wavelength_um, edges, weights), tasks)
+    )
     every = (
         np.array(some)
         .reshape(len(reach), len(cells), len(weights), -1)
@@ -105,7 +110,7 @@ def _judged(coarse: Array, fine: Array) -> OwnRates:
     return OwnRates(fine[:-1], fine[-1], float((off * known).max()))
 
 
-def seen(lens: "Lens") -> Array:
+def polarization_weights(lens: "Lens") -> Array:
     """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of, its
     geometric phase aside.
     """

@@ -21,7 +21,7 @@ import numpy as np
 
 from metalens.cell import Cell, Index, index
 from metalens.cell.shapes import Ellipse, Rectangle
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from metalens.core import config
 from metalens.fabrication.bias import Bias, read_csv
 from metalens.fabrication.spread import Spread
-from metalens.ground import config
 
 DIAMETER_STEP_NM = 2  # one class of pillars each
 

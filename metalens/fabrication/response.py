@@ -10,6 +10,8 @@ import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
 from metalens.cell import Cell, Index
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.fabrication.own import own_rates
 from metalens.fabrication.perturbations import (
     Guide,
@@ -19,8 +21,6 @@ from metalens.fabrication.perturbations import (
 )
 from metalens.fabrication.solved import Solved
 from metalens.fabrication.two_sizes import PairSensitivities
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
 from metalens.lens import Lens
 from metalens.pillars import Proxy
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.core.errors import ProcessError
 from metalens.fabrication.perturbations import PERTURBATIONS, Drawn, lacking
 from metalens.fabrication.state import State
-from metalens.ground.errors import ProcessError
 
 DRAWN: dict[str, Drawn] = {
     row.drawn.name: row.drawn for row in PERTURBATIONS if row.drawn

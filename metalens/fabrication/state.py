@@ -6,6 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, nearest_name_hint
 from metalens.fabrication.perturbations import (
     PERTURBATIONS,
     CDError,
@@ -14,8 +16,6 @@ from metalens.fabrication.perturbations import (
     of_kind,
     polynomials,
 )
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, nearest
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,7 +36,9 @@ class State:
         names = [row.name for row in PERTURBATIONS]
         for name in values or {}:
             if name not in names:
-                raise ConfigError(f"unknown cause {name!r}{nearest(name, names)}")
+                raise ConfigError(
+                    f"unknown cause {name!r}{nearest_name_hint(name, names)}"
+                )
         return cls(np.array([(values or {}).get(name, 0.0) for name in names]))
 
     def __getitem__(self, name: str) -> float:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.fabrication.own import pair_rates
 from metalens.fabrication.perturbations import with_missing
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap, Lens
 
 _PAIRS = 24  # that are solved

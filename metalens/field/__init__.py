@@ -4,7 +4,7 @@ around the lens.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.field.engine import imager as imager
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from metalens.field.waves import cell_um as cell_um
     from metalens.lens import Layers as Layers
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Grid": "plan",

@@ -3,17 +3,17 @@
 import numba
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.threads import split
+from metalens.core.arrays import Array
+from metalens.core.threads import run_split
 from metalens.image.scene import fixed as fixed
 from metalens.image.scene import plain as plain
 from metalens.image.scene import values as values
 from metalens.lens import answers
-from metalens.propagate import turns32
+from metalens.propagate import sincos_turns32
 
 PART, put = (
     answers.PART,
-    answers.answers,
+    answers.evaluate_row,
 )  # compiled loops know names of their own module
 
 
@@ -26,7 +26,7 @@ def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
     """
     out = np.empty((len(mix), *turns.shape, 2), np.float32)
     light = weight.astype(np.float32)
-    split(
+    run_split(
         turns.shape[0],
         lambda a, b: _phasors(light[a:b], turns[a:b], paths[:, a:b], mix, out[:, a:b]),
     )
@@ -67,7 +67,7 @@ def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
                     for x in range(start, stop):
                         line[x] += mix[d, v] * paths[v, y, x]
             for x in range(start, stop):
-                c, s = turns32(line[x] - np.rint(line[x]))
+                c, s = sincos_turns32(line[x] - np.rint(line[x]))
                 out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s
 
 
@@ -94,7 +94,7 @@ def cells(
 
     Args:
         ideal_rad: (y, x) float32. polynomials: of the diameters, by
-            :func:`metalens.lens.answers.polynomials`.
+            :func:`metalens.lens.answers.response_polynomials`.
         block: pillars along a cell, and rows and columns of the first one that lie
             before the map.
     """
@@ -103,7 +103,7 @@ def cells(
         -(-(n + b) // side) for n, b in zip(diameter_um.shape, before, strict=True)
     ]
     out = np.zeros((3, *shape), np.float32)
-    split(
+    run_split(
         shape[0],
         lambda a, b: _cells(diameter_um, ideal_rad, polynomials, block, out[:, a:b], a),
     )
@@ -127,7 +127,7 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
                 put(some, polynomials, x[:n], phase[:n], level[:n])
                 for j in range(n):
                     t = (phase[j] - ideal[i, start + j]) / (2 * np.pi)
-                    c, s = turns32(t - np.rint(t))
+                    c, s = sincos_turns32(t - np.rint(t))
                     x[j], phase[j] = level[j] * c, level[j] * s
                 for j in range(n):
                     if some[j] > 0:

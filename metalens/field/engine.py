@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.core.errors import SceneError
 from metalens.field import left_out
 from metalens.field.forming import Imager, build_imager
 from metalens.field.low_rank import PsfField, frame_maps, plane_images, psf_nodes
@@ -20,10 +21,9 @@ from metalens.field.stray import stray_of
 from metalens.field.texture import CONTRAST, scene_error
 from metalens.field.through import through
 from metalens.field.waves import PillarWave, SmoothWave, Wave, wave_of
-from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
-from metalens.psf import Nodes, Polarisation, Source, blur_um
+from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
 from metalens.psf import spectrum as spectra
 
 # pixels of the frame at which the PSFs that are used are compared with true ones
@@ -43,7 +43,7 @@ def imager(
     lens: Lens | Wave,
     scene_grid: Grid,
     *,
-    spectrum: Source | spectra.Measured | Nodes | None = None,
+    spectrum: Source | spectra.MeasuredSpectrum | SpectralNodes | None = None,
     layers: Layers | None = None,
     field: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-2,
@@ -56,7 +56,7 @@ def imager(
     Args:
         lens: a lens file's content, or a wave (:class:`SmoothWave`,
             :class:`PillarWave`).
-        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.measured`),
+        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.read_measured_spectrum`),
             wavelengths with weights, or
             None for the design wavelength alone.
         layers: films around the lens; by default those of the lens file with the cover
@@ -93,7 +93,7 @@ def imager(
     optics = Optics(
         wave, layers, focus.sensor_distance_um if distance_um is None else distance_um
     )
-    source = spectrum or Nodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
+    source = spectrum or SpectralNodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
     round_ = (
@@ -109,7 +109,9 @@ def imager(
         made = build_imager(*about, tolerance=found.tolerance)
         parts = {**fitted(made), **_held_out(optics, made)}
     if isinstance(wave, PillarWave):
-        parts["unknown"] = spectra.unknown(source, wave.lens.proxy.wavelengths_um)
+        parts["unknown"] = spectra.share_outside_library(
+            source, wave.lens.proxy.wavelengths_um
+        )
     stray = stray_of(
         optics, scene_grid, float(1 / (1 / found.plan.depths_um).mean()), middle
     )
@@ -168,7 +170,7 @@ def _shaded(
         y,
         x,
         depth,
-        Nodes(np.array([wavelength_um]), np.ones(1), 0.0),
+        SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0),
         window,
         folds=False,
     )

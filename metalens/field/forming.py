@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from metalens.core.errors import SceneError
 from metalens.field.low_rank import (
     KernelBasis,
     LowRankPsfs,
@@ -30,7 +31,6 @@ from metalens.field.low_rank import (
 from metalens.field.plan import SHARES, Grid, Plan
 from metalens.field.slopes import by_nodes
 from metalens.field.stray import Stray, add_stray
-from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.image.scene import fixed
 

@@ -18,7 +18,7 @@ from metalens import propagate
 from metalens.field.points import Optics, Window, psfs, sampling
 from metalens.field.texture import texture_error, weigh_by_light
 from metalens.field.waves import Pillars
-from metalens.psf import Nodes, Polarisation, psf_stack
+from metalens.psf import Polarisation, SpectralNodes, psf_stack
 
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
@@ -30,7 +30,7 @@ class Judged:
     """
 
     optics: Optics
-    waves: Nodes
+    waves: SpectralNodes
     window: Window
     at: tuple[Tensor, Tensor]
 
@@ -217,7 +217,7 @@ def _of_pillars(
         "samples": count * finer,
         "layers": optics.layers,
     }
-    chief = propagate.case(
+    chief = propagate.make_case(
         tuple(t.shape), **about | {"layers": optics.layers.open}
     ).centre_um
     offset = [float(a) - b for a, b in zip(place, chief, strict=True)]

@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.core.errors import SceneError
+from metalens.core.threads import run_split_torch
 from metalens.field import compiled
 from metalens.field.left_out import Judged, folded, neglected, polarised
 from metalens.field.points import Optics, Window, psfs
 from metalens.field.splines import TAPS, spline_matrix
 from metalens.field.texture import scene_error, texture_error
 from metalens.field.waves import PillarWave
-from metalens.ground.errors import SceneError
-from metalens.ground.threads import apart
-from metalens.psf import Nodes, Polarisation, Source
+from metalens.psf import Polarisation, Source, SpectralNodes
 from metalens.psf import spectrum as spectra
 
 DEPTH_NODES = (5, 7, 9, 13, 17, 25)  # numbers that are tried
@@ -122,7 +122,7 @@ class Plan:
     y_um: Tensor
     x_um: Tensor
     depths_um: Tensor
-    waves: Nodes
+    waves: SpectralNodes
     window: Window
     folds: bool
 
@@ -130,7 +130,7 @@ class Plan:
 def planned(
     optics: Optics,
     grid: Grid,
-    source: Source | spectra.Measured | Nodes,
+    source: Source | spectra.MeasuredSpectrum | SpectralNodes,
     middle_um: tuple[float, float],
     *,
     tolerance: float,
@@ -156,7 +156,7 @@ def planned(
     waves = waves_of(
         optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"]
     )
-    coarse = waves if isinstance(source, Nodes) else _coarse(optics, source, 2)
+    coarse = waves if isinstance(source, SpectralNodes) else _coarse(optics, source, 2)
     ends = depth_nodes(grid, 3)
     window = _unfolded(
         optics,
@@ -211,7 +211,11 @@ def depth_nodes(grid: Grid, count: int) -> Tensor:
 
 
 def spectral(
-    optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, window: Window
+    optics: Optics,
+    at_um: Tensor,
+    depths_um: Tensor,
+    waves: SpectralNodes,
+    window: Window,
 ) -> Tensor:
     """(points, depths, h, w) PSFs summed over the spectrum; light of each wavelength
     with its weight.
@@ -239,7 +243,7 @@ def spectral(
             found[i + 1] = of(others[i])
 
     if compiled.plain(found[0]):
-        apart(len(others), torch.no_grad()(some))
+        run_split_torch(len(others), torch.no_grad()(some))
     else:  # derivatives, or another device
         some(0, len(others))
     return torch.cat(found)
@@ -247,7 +251,7 @@ def spectral(
 
 def _unfolded(
     optics: Optics,
-    waves: Nodes,
+    waves: SpectralNodes,
     window: Window,
     at: tuple[Tensor, Tensor],
     tolerance: float,
@@ -278,15 +282,15 @@ def _places(
 def waves_of(
     optics: Optics,
     grid: Grid,
-    source: Source | spectra.Measured | Nodes,
+    source: Source | spectra.MeasuredSpectrum | SpectralNodes,
     middle_um: tuple[float, float],
     half_um: list[float],
     tolerance: float,
-) -> Nodes:
+) -> SpectralNodes:
     """As few wavelengths of a source as image within the tolerance at three places; a
     given rule is kept as it is.
     """
-    if isinstance(source, Nodes):
+    if isinstance(source, SpectralNodes):
         return source
     at = torch.tensor([[0.0, 0.0], [0.5, 0.3], [0.9, 0.8]], dtype=torch.float64)
     at = at * torch.tensor(
@@ -294,7 +298,7 @@ def waves_of(
     ) + torch.tensor(middle_um, dtype=torch.float64)
     ends, window = depth_nodes(grid, 2), Window(grid.window, grid.step_um)
     last = spectral(optics, at, ends, _coarse(optics, source, 1), window)
-    beside = source.beside if isinstance(source, spectra.Measured) else 0.0
+    beside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):
         made = _coarse(optics, source, count)
         found = spectral(optics, at, ends, made, window)
@@ -310,12 +314,18 @@ def waves_of(
     )
 
 
-def _coarse(optics: Optics, source: Source | spectra.Measured, count: int) -> Nodes:
+def _coarse(
+    optics: Optics, source: Source | spectra.MeasuredSpectrum, count: int
+) -> SpectralNodes:
     """So many wavelengths of a spectrum, which the lens's pillars are known for."""
-    made = Nodes(*spectra.gauss(*spectra.points(source), count), np.nan)
+    made = SpectralNodes(
+        *spectra.gauss_rule(*spectra.spectrum_points(source), count), np.nan
+    )
     if not isinstance(optics.wave, PillarWave):
         return made
-    return spectra.known(made, source, optics.wave.lens.proxy.wavelengths_um)
+    return spectra.nodes_inside_library(
+        made, source, optics.wave.lens.proxy.wavelengths_um
+    )
 
 
 def _along(count: int, length: float) -> int:

@@ -25,12 +25,12 @@ import scipy.fft
 import torch
 from torch import Tensor
 
+from metalens.core.errors import PropagationError
 from metalens.field import compiled, polarised
 from metalens.field.rays import Paths, Rays, landing, rays, source_paths, through_stop
 from metalens.field.waves import Wave
-from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, media
-from metalens.psf import Mixed, strongest
+from metalens.psf import VectorPupil, dominant_components
 
 SPARE = 1.06  # period of the nodes per width of the window
 # of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
@@ -307,7 +307,7 @@ def _one(
     mixed = None
     if grid.components:
         fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
-        mixed = strongest(fields, pupil.weight, grid.components)
+        mixed = dominant_components(fields, pupil.weight, grid.components)
     few = (
         1 if light.device.type == "cpu" else len(light)
     )  # one depth at a time stays in a processor's cache
@@ -361,7 +361,7 @@ def _shown(
 
 
 def _fluxes(
-    light: Tensor, mixed: Mixed | None, aside: tuple[Tensor, ...], size: int
+    light: Tensor, mixed: VectorPupil | None, aside: tuple[Tensor, ...], size: int
 ) -> list[Tensor]:
     """(depths, size, size) |U|² of the transforms of the light on the nodes, and with
     ``aside`` the flux along x and y.

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from metalens.field.rays import Rays
-from metalens.psf import Mixed, beyond_faces, of_flux, turned
+from metalens.psf import VectorPupil, beyond_faces, of_flux, transmitted_polarization
 
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
 STEEPEST = (
@@ -32,10 +32,10 @@ STEEPEST = (
 
 def factors(
     seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool
-) -> Mixed:
+) -> VectorPupil:
     """Both polarisations on the nodes, float64: of the flux through the sensor's plane
     (8), or of |E|² (6 as
-    :func:`metalens.psf.turned`); squares with their signs add up to 2, and to 2 / cos
+    :func:`metalens.psf.transmitted_polarization`); squares with their signs add up to 2, and to 2 / cos
     θ.
 
     Args:
@@ -49,8 +49,10 @@ def factors(
     p, q = (side * torch.sqrt(room.clamp_max(1)) for side in (p, q))
     first, b = (_directions(p / n, q / n) for n in (order[0], order[-1]))
     slope = torch.cat([tangents, tangents.new_ones(1)])
-    electric = beyond_faces(turned(slope / slope.norm(), first), first, order)
-    return of_flux(electric, b) if flux else Mixed(electric, (1.0,) * OF_ENERGY)
+    electric = beyond_faces(
+        transmitted_polarization(slope / slope.norm(), first), first, order
+    )
+    return of_flux(electric, b) if flux else VectorPupil(electric, (1.0,) * OF_ENERGY)
 
 
 def _directions(p: Tensor, q: Tensor) -> Tensor:

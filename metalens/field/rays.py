@@ -297,7 +297,10 @@ def _each(
             chief = float(media.chord(before, np.float64(math.hypot(sx, sy))))
             away2 = (x - sx) ** 2 + (y - sy) ** 2
             away2 = away2.clamp(max=float((away2 * (seen.whole > 0)).max()))
-            out.append(smooth.over(functools.partial(_chord, before), away2) - chief)
+            out.append(
+                smooth.chebyshev_interpolant(functools.partial(_chord, before), away2)
+                - chief
+            )
     return torch.stack(out)
 
 

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.field import compiled
-from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Lens, Media, answers, media, smooth
 from metalens.psf import among
 
@@ -226,7 +226,9 @@ class PillarWave:
         """With the factor of unlike neighbours where the lens holds their rows."""
         if self.lens.neighbours is None:
             return t
-        return t * among.mean(t, self.lens.neighbours, self.lens.diameters.pitch_um)
+        return t * among.mean_coupling(
+            t, self.lens.neighbours, self.lens.diameters.pitch_um
+        )
 
     def orders(self, wavelength_um: float, orders: tuple[int, ...]) -> dict[int, float]:
         """Share of the light on the aperture that leaves in each diffraction order of
@@ -258,7 +260,7 @@ class PillarWave:
         open_ = (d > 0).to(torch.float32)
         if compiled.values(d):
             phases, levels = torch.empty(2, *d.shape)
-            answers.put_all(
+            answers.fill_response_of(
                 proxy,
                 d.detach().numpy(),
                 (wavelength_um, tilt),
@@ -284,7 +286,7 @@ class PillarWave:
         if self.lens.neighbours is None and compiled.values(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
-            known = answers.polynomials(self.lens.proxy, sizes, at)
+            known = answers.response_polynomials(self.lens.proxy, sizes, at)
             mean = torch.from_numpy(
                 compiled.cells(sizes, self._ideal.numpy(), known, block)
             )
@@ -352,7 +354,7 @@ def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
 def _longer(between: Media, r2: Tensor) -> Tensor:
     """Optical path of the ray of squared reach r² less that along the normal, um."""
     if len(between.layers) > 1:
-        extra: Tensor = smooth.over(
+        extra: Tensor = smooth.chebyshev_interpolant(
             lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2
         )
         return extra

@@ -4,7 +4,7 @@ information).
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.field.engine import imager as imager
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from metalens.image.sensor import low_snr as low_snr
     from metalens.image.sensor import pixel_weights as pixel_weights
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "CODES": "scene",

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from metalens.image.sensor import integrate, whole_pixels
 
 Normalisation = Literal["sum", "l2", "none"]

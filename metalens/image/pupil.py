@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from metalens.ground.errors import PropagationError
-from metalens.ground.paths import path_difference, sensor_path, source_path
+from metalens.core.errors import PropagationError
+from metalens.core.paths import path_difference, sensor_path, source_path
 
 
 @dataclass(frozen=True, slots=True)

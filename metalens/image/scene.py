@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 
 CODES = 4096  # depths of the look-up table of kernel weights, at equal steps of 1/z
 # blurred coverage below which a far sheet fades behind the near one; rounding grows by

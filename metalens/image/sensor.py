@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 
 
 @dataclass(frozen=True, slots=True)

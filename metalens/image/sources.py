@@ -7,8 +7,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from metalens.ground import threads
-from metalens.ground.arrays import Array
+from metalens.core import threads
+from metalens.core.arrays import Array
 
 
 def weighted(
@@ -36,7 +36,7 @@ def weighted(
     def part(start: int, stop: int) -> None:
         _weigh(light, cover, depth_um, table, near, far, start, stop, out)
 
-    threads.split(len(light), part)
+    threads.run_split(len(light), part)
     return out
 
 

@@ -4,7 +4,7 @@ around them.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.lens import answers as answers
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from metalens.lens.layers import check_gaps as check_gaps
     from metalens.lens.media import Media as Media
     from metalens.lens.neighbours import CURVED as CURVED
-    from metalens.lens.neighbours import Neighbours as Neighbours
-    from metalens.lens.pairs import Pairs as Pairs
+    from metalens.lens.neighbours import NeighbourRows as NeighbourRows
+    from metalens.lens.pairs import TwoSizeTable as TwoSizeTable
     from metalens.lens.record import HANDS as HANDS
     from metalens.lens.record import Hand as Hand
     from metalens.lens.record import Lens as Lens
-    from metalens.lens.record import from_parts as from_parts
+    from metalens.lens.record import lens_from_parts as lens_from_parts
+    from metalens.lens.record import lens_to_parts as lens_to_parts
     from metalens.lens.record import load as load
+    from metalens.lens.record import load_out_of_core as load_out_of_core
     from metalens.lens.record import load_plain as load_plain
-    from metalens.lens.record import parts as parts
     from metalens.lens.record import save as save
-    from metalens.lens.record import streamed as streamed
     from metalens.lens.stop import Stop as Stop
-    from metalens.lens.waves import saddle as saddle
+    from metalens.lens.waves import saddle_correction as saddle_correction
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "CURVED": "neighbours",
@@ -42,22 +42,22 @@ __getattr__, __dir__, __all__ = attach(
         "Layers": "layers",
         "Lens": "record",
         "Media": "media",
-        "Neighbours": "neighbours",
-        "Pairs": "pairs",
+        "NeighbourRows": "neighbours",
+        "TwoSizeTable": "pairs",
         "Stop": "stop",
         "answers": "",
         "check_gaps": "layers",
         "export": "",
-        "from_parts": "record",
+        "lens_from_parts": "record",
         "load": "record",
         "load_plain": "record",
         "media": "",
-        "parts": "record",
+        "lens_to_parts": "record",
         "picture": "",
         "reach": "",
-        "saddle": "waves",
+        "saddle_correction": "waves",
         "save": "record",
         "smooth": "",
-        "streamed": "record",
+        "load_out_of_core": "record",
     },
 )

@@ -11,8 +11,8 @@ the cast to the dtype of the result.
 import numba
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.threads import split
+from metalens.core.arrays import Array
+from metalens.core.threads import run_split
 from metalens.lens.record import Lens
 from metalens.pillars import Proxy
 
@@ -23,7 +23,9 @@ PART = 512  # pillars of a row at a time
 FASTMATH = {"contract", "nsz", "reassoc"}
 
 
-def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> None:
+def fill_response(
+    lens: Lens, at: tuple[float, float], phase: Array, level: Array
+) -> None:
     """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in
     their dtype; 0 where there is
     none.
@@ -47,12 +49,12 @@ def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> Non
         if lens.diameters.angle_rad is None
         else np.asarray(lens.geometric_rad(slice(None)))
     )
-    put_all(
+    fill_response_of(
         lens.proxy, np.asarray(lens.diameters.diameter_um), at, phase, level, turned
     )
 
 
-def put_all(
+def fill_response_of(
     proxy: Proxy,
     d: Array,
     at: tuple[float, float],
@@ -60,20 +62,22 @@ def put_all(
     level: Array,
     turned: Array | None = None,
 ) -> None:
-    """As :func:`fill`, of (y, x) diameters in um; turned: (y, x) phase in rad that is
+    """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad that is
     added.
     """
-    loop, numbers = _fill, polynomials(proxy, d, at)
+    loop, numbers = _fill, response_polynomials(proxy, d, at)
     turn = np.zeros((len(d), 0)) if turned is None else turned
-    split(len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b]))
+    run_split(
+        len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b])
+    )
 
 
-def polynomials(
+def response_polynomials(
     proxy: Proxy, diameter_um: Array, at: tuple[float, float]
 ) -> Polynomials:
-    """What :func:`answers` takes of these diameters, for a wavelength in um and an
+    """What :func:`evaluate_row` takes of these diameters, for a wavelength in um and an
     angle in rad; raises as
-    :func:`fill`."""
+    :func:`fill_response`."""
     phase, level = proxy.at(*at), proxy.level_at(*at)
     most = float(np.max(diameter_um, initial=0.0))
     if most > 0:
@@ -88,7 +92,7 @@ def polynomials(
 @numba.njit(
     fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def answers(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
+def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
     """Phase in rad and |T| of a part of a row; x: work."""
     scale, shift, power, ceiling, in_phase, in_level = numbers
     for j in range(d.size):
@@ -111,13 +115,13 @@ def answers(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True)
 def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
-    """Some rows of :func:`fill`."""
+    """Some rows of :func:`fill_response`."""
     x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
     for i in range(d.shape[0]):
         for start in range(0, d.shape[1], PART):
             row = d[i, start : start + PART]
             n = row.size
-            answers(row, numbers, x[:n], phase[:n], level[:n])
+            evaluate_row(row, numbers, x[:n], phase[:n], level[:n])
             if turned.shape[1] > 0:
                 for j in range(n):
                     phase[j] += turned[i, start + j]

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from metalens.cell import Lattice
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 from metalens.lens.rows import RowsOnDisk
 
 _BLOCK_ROWS = 256
 
 
-class Grid(NamedTuple):
+class SiteSpacing(NamedTuple):
     """Distances of columns and rows, and the area of a pillar's cell; 0: as on a square
     lattice.
     """
@@ -130,13 +130,15 @@ class DiameterMap:
         return x * y * (2 if self.lattice.centred else 1)
 
     @property
-    def grid(self) -> "Grid":
-        """The map's sites as :func:`metalens.propagate.case` takes them; zeros on a
+    def grid(self) -> "SiteSpacing":
+        """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on a
         square lattice.
         """
         square = self.lattice.kind == "square" and not self.row_um
         column, row = self.steps_um
-        return Grid(column) if square else Grid(column, row, self.site_um2)
+        return (
+            SiteSpacing(column) if square else SiteSpacing(column, row, self.site_um2)
+        )
 
     @property
     def plain(self) -> bool:

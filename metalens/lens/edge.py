@@ -12,8 +12,8 @@ up to ``LONGEST``, 1e-7, and 1 / (iπw) Σ (2n - 1)!! / (iπw²)^n beyond, 1e-7.
 import numba
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.threads import split
+from metalens.core.arrays import Array
+from metalens.core.threads import run_split
 
 LONGEST, STEPS = 5, 32  # of the table, and in a unit of w
 
@@ -74,7 +74,7 @@ def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyp
         out[i] = (one[1] - other[1]) / (2 * half) - bent * (one[0] - other[0])
 
 
-def behind(
+def edge_diffraction_factor(
     at_um: tuple[Array, Array],
     width_um: float | Array,
     ray: tuple[float, float],
@@ -108,5 +108,5 @@ def behind(
             out[a:b],
         )
 
-    split(len(x), work)
+    run_split(len(x), work)
     return out.reshape(shape)

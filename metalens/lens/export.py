@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
-from metalens.ground.store import write_bytes
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
+from metalens.core.store import write_bytes
 from metalens.lens.record import Lens
 
 ARRAYS, GRID = (".npz", ".mat"), ".dat"
@@ -24,7 +24,7 @@ _MM, _NO_DATA = (
 _RIM = 4  # points: a cubic spline forgets an edge as 0.27^points
 
 
-def check(path: str | Path) -> None:
+def check_export_format(path: str | Path) -> None:
     """Refuse a file name that says no known format.
 
     Raises:
@@ -36,7 +36,7 @@ def check(path: str | Path) -> None:
         )
 
 
-def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
+def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     """Write a lens in the format that the name's ending says.
 
     ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission,
@@ -52,15 +52,15 @@ def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
 
     Raises:
         LensError: another ending, or a phase that no smooth map has (see
-            :func:`unwrapped`).
+            :func:`unwrap_phase`).
     """
-    check(path)
+    check_export_format(path)
     suffix = Path(path).suffix.lower()
     if suffix == GRID:
         grid = grid_phase(lens, samples)
         write_bytes(path, grid.text().encode("ascii"))
         return grid.error_rad
-    values = arrays(lens)
+    values = lens_arrays(lens)
     file = io.BytesIO()
     if suffix == ".npz":
         np.savez_compressed(file, allow_pickle=False, **values)
@@ -79,7 +79,7 @@ def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     return 0.0
 
 
-def arrays(lens: Lens) -> dict[str, Array]:
+def lens_arrays(lens: Lens) -> dict[str, Array]:
     """Axes, diameters, wrapped phase and magnitude of every pillar, by name."""
     d = lens.diameters
     return {
@@ -135,7 +135,7 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
 
     Raises:
         LensError: fewer than 5 samples, or another lattice than a square one; see
-            :func:`unwrapped`.
+            :func:`unwrap_phase`.
     """
     from scipy.ndimage import binary_erosion, map_coordinates
 
@@ -145,7 +145,7 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
         )
     if samples < 5:
         raise LensError(f"{samples} samples across the aperture: need 5 or more")
-    phase, d = unwrapped(lens), lens.diameters
+    phase, d = unwrap_phase(lens), lens.diameters
     step = 2 * d.radius_um / (samples - 1)
     centre = [(n - 1) / 2 for n in phase.shape]
     at = (np.arange(samples) - (samples - 1) / 2) * step / d.pitch_um
@@ -207,7 +207,7 @@ def _filled(grid: Array) -> Array:
     return np.asarray(grid[tuple(nearest)])
 
 
-def unwrapped(lens: Lens) -> Array:
+def unwrap_phase(lens: Lens) -> Array:
     """(y, x) phase that is continuous from pillar to pillar, nan where there is none; 0
     at the middle.
 

@@ -10,11 +10,18 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Film, Index, Material, index
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError, PropagationError
 from metalens.lens import media
 from metalens.lens.media import Media
-from metalens.lens.stop import Stop, crossing, left_out, lit_um, passed, shadow
+from metalens.lens.stop import (
+    Stop,
+    illuminated_radius_um,
+    stop_crossing,
+    stop_model_error,
+    stop_shadow,
+    stop_transmission,
+)
 
 MOST_ABSORBED = 0.02
 
@@ -147,7 +154,9 @@ class Layers:
         if self.stop is None:
             return 1.0
         before, between = self._around_stop(depth_um, wavelength_um)
-        return passed(self.stop, crossing(before, between, tangents, *at_um), width_um)
+        return stop_transmission(
+            self.stop, stop_crossing(before, between, tangents, *at_um), width_um
+        )
 
     def shadow(
         self,
@@ -165,7 +174,7 @@ class Layers:
         if self.stop is None:
             return np.ones(np.broadcast_shapes(np.shape(at_um[0]), np.shape(at_um[1])))
         around = self._around_stop(depth_um, wavelength_um)
-        return shadow(self.stop, around, tangents, wavelength_um, at_um, width_um)
+        return stop_shadow(self.stop, around, tangents, wavelength_um, at_um, width_um)
 
     def shadow_error(
         self,
@@ -187,7 +196,7 @@ class Layers:
         if self.stop is None:
             return 0.0
         zones = self.stop.radius_um * blur_rad / wavelength_um / held**0.25
-        return left_out(
+        return stop_model_error(
             self.stop,
             self._around_stop(depth_um, wavelength_um),
             tangents,
@@ -202,7 +211,9 @@ class Layers:
         return (
             math.inf
             if self.stop is None
-            else lit_um(self.stop, *self._around_stop(depth_um, wavelength_um))
+            else illuminated_radius_um(
+                self.stop, *self._around_stop(depth_um, wavelength_um)
+            )
         )
 
     def _around_stop(

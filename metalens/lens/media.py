@@ -17,8 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from metalens.ground import paths
-from metalens.ground.errors import PropagationError
+from metalens.core import paths
+from metalens.core.errors import PropagationError
 
 NEWTON = 14  # steps at most; each doubles the digits
 Pairs = Sequence[

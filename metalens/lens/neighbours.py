@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
 
 # of the change: a cut through a lens solved whole changes that much less (python -m
 # benchmarks neighbours)
@@ -35,7 +35,7 @@ _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Neighbours:
+class NeighbourRows:
     """Rows of a lens's own unlike pillars, each solved as one cell.
 
     sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
@@ -147,7 +147,7 @@ class Neighbours:
         """
         return float(abs(weight @ self.mean(sine)) ** 2)
 
-    def without(self, row: int) -> "Neighbours":
+    def without(self, row: int) -> "NeighbourRows":
         """The same without a row."""
         return replace(
             self,
@@ -155,12 +155,12 @@ class Neighbours:
         )
 
     @property
-    def coarser(self) -> "Neighbours":
+    def coarser(self) -> "NeighbourRows":
         """The same at the coarser truncation."""
         return replace(self, factor=self.coarse)
 
     @property
-    def others(self) -> list["Neighbours"]:
+    def others(self) -> list["NeighbourRows"]:
         """The same without any one of the rows, as long as one along the lattice is
         left.
         """
@@ -171,7 +171,7 @@ class Neighbours:
         ]
         return [self.without(k) for k in kept]
 
-    def doubted(self, sine: Array) -> list["Neighbours"]:
+    def doubted(self, sine: Array) -> list["NeighbourRows"]:
         """What it may be as well: at the coarser truncation, without the row that
         changes most at these sines, and with
         what zones that get shorter from one to the next change."""
@@ -188,7 +188,7 @@ class Neighbours:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Neighbours":
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> "NeighbourRows":
         """Inverse of :meth:`to_arrays`."""
         wave, cover = arrays["wavelength_um_cover"].tolist()
         return cls(

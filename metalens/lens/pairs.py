@@ -9,15 +9,15 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError, LensError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError, LensError
 from metalens.pillars import Proxy
 
 NAMES = ("wavelength_um", "x_um", "y_um", "t")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pairs:
+class TwoSizeTable:
     """Transmission of pillars over the size along x and that along y, for light
     polarised along x and along y.
 
@@ -96,7 +96,7 @@ class Pairs:
         return {name: getattr(self, name) for name in NAMES} | alone
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "Pairs":
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> "TwoSizeTable":
         """Inverse of :meth:`to_arrays`."""
         sensor, source = arrays["focus_y_um"].tolist()
         wavelength, x, y, t = (arrays[name] for name in NAMES)

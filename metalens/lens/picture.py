@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from metalens.cell.shapes import turned
-from metalens.ground import report
-from metalens.ground.arrays import Array
+from metalens.cell.shapes import rotate_corners
+from metalens.core import report
+from metalens.core.arrays import Array
 from metalens.lens.record import Lens
-from metalens.pillars.axes import sized
+from metalens.pillars.axes import cell_of_sizes
 
 _PIXELS = 420  # along the longer side of the phase picture
 _ZOOM = 28  # pillars along the side of the zoom
 
 
-def picture(lens: Lens) -> bytes:
+def lens_picture(lens: Lens) -> bytes:
     """PNG: wrapped phase at the design wavelength, and single pillars halfway to the
     rim.
 
@@ -24,10 +24,10 @@ def picture(lens: Lens) -> bytes:
     phase turns within it, so that no
     lenses appear that are none.
     """
-    figure, (left, right) = report.canvas(1, 2, size=(9.6, 4.4))
+    figure, (left, right) = report.make_figure(1, 2, size=(9.6, 4.4))
     _phase(figure, left, lens)
     _pillars(figure, right, lens)
-    return report.png(figure)
+    return report.figure_png(figure)
 
 
 def _phase(figure: Any, axes: Any, lens: Lens) -> None:
@@ -144,8 +144,10 @@ def _outline(
 ) -> Array:
     """(n, 2) corners of one pillar where it stands."""
     cell = (
-        sized(lens.cell, float(size_um), float(length_um)) if length_um else lens.cell
+        cell_of_sizes(lens.cell, float(size_um), float(length_um))
+        if length_um
+        else lens.cell
     )
     corners = cell.outline(float(size_um)).line(32)
-    placed: Array = turned(corners, float(turn_rad)) + np.array([x_um, y_um])
+    placed: Array = rotate_corners(corners, float(turn_rad)) + np.array([x_um, y_um])
     return placed

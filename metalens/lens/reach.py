@@ -19,7 +19,7 @@ BLURS = 8.0  # width of a window, in radii of the blur
 
 
 @dataclass(frozen=True, slots=True)
-class Aperture:
+class ApertureSummary:
     """What of a lens decides how far it reaches: for a lens that is yet to be made."""
 
     radius_um: float
@@ -29,14 +29,14 @@ class Aperture:
     layers: Layers = field(default_factory=Layers)
 
 
-def defocus_per_um(lens: Lens | Aperture, depth_um: float) -> float:
+def defocus_per_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """1 / z of a source less that of best focus, 1/um, films in front taken as the air
     that bends light as much.
     """
     return 1 / _reduced(lens, depth_um) - 1 / _reduced(lens, lens.source_distance_um)
 
 
-def blur_um(lens: Lens | Aperture, depth_um: float) -> float:
+def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z -
     1/z0|.
     """
@@ -47,20 +47,20 @@ def blur_um(lens: Lens | Aperture, depth_um: float) -> float:
     )
 
 
-def sensor_reach_um(lens: Lens | Aperture) -> float:
+def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
     """Distance in air that bends paraxial light as much as the media between pillars
     and sensor.
     """
     return lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).reduced_um
 
 
-def diffraction_um(lens: Lens | Aperture) -> float:
+def diffraction_um(lens: Lens | ApertureSummary) -> float:
     """Wavelength over the paraxial numerical aperture of the image side, um."""
     return lens.wavelength_um * sensor_reach_um(lens) / _widest(lens)
 
 
 def window_um(
-    lens: Lens | Aperture, depths_um: tuple[float, ...], *, airy: float
+    lens: Lens | ApertureSummary, depths_um: tuple[float, ...], *, airy: float
 ) -> float:
     """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst
     of these depths; 3 digits.
@@ -69,19 +69,19 @@ def window_um(
     return _rounded(max(airy * diffraction_um(lens), BLURS * blur), 3)
 
 
-def disc_um(lens: Lens | Aperture) -> float:
+def disc_um(lens: Lens | ApertureSummary) -> float:
     """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2
     digits.
     """
     return _rounded(ENCIRCLED * diffraction_um(lens), 2)
 
 
-def pixel_um(lens: Lens | Aperture) -> float:
+def pixel_um(lens: Lens | ApertureSummary) -> float:
     """Pixels that show most of what a spot tells: 0.88 wavelength / NA, 2 digits."""
     return _rounded(PIXEL * diffraction_um(lens), 2)
 
 
-def depth_step_um(lens: Lens | Aperture, depth_um: float) -> float:
+def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """Step of depth that moves the rim by 0.115 waves against the middle: 0.23
     wavelength z² / R², 2 digits.
 
@@ -97,7 +97,7 @@ def depth_step_um(lens: Lens | Aperture, depth_um: float) -> float:
     return _rounded(min(step, 0.02 * depth_um), 2)
 
 
-def sample_um(lens: Lens | Aperture, pixel_um: float) -> float:
+def sample_um(lens: Lens | ApertureSummary, pixel_um: float) -> float:
     """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a
     pixel; 2 digits.
     """
@@ -105,7 +105,9 @@ def sample_um(lens: Lens | Aperture, pixel_um: float) -> float:
     return _rounded(min(SAMPLE * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
 
 
-def depth_range_um(lens: Lens | Aperture, *, digits: int = 2) -> tuple[float, float]:
+def depth_range_um(
+    lens: Lens | ApertureSummary, *, digits: int = 2
+) -> tuple[float, float]:
     """(near, far) depths at which the rim is 1.75 waves out of focus, R² |1/z - 1/z0| /
     (2 wavelength).
 
@@ -124,36 +126,36 @@ def depth_range_um(lens: Lens | Aperture, *, digits: int = 2) -> tuple[float, fl
     return max(_rounded(near + films, digits), thick), _rounded(far + films, digits)
 
 
-def _aperture(lens: Lens | Aperture) -> Aperture:
-    if isinstance(lens, Aperture):
+def _aperture(lens: Lens | ApertureSummary) -> ApertureSummary:
+    if isinstance(lens, ApertureSummary):
         return lens
     distances = lens.sensor_distance_um, lens.source_distance_um
-    return Aperture(
+    return ApertureSummary(
         lens.diameters.radius_um, lens.wavelength_um, *distances, lens.layers
     )
 
 
-def _widest(lens: Lens | Aperture) -> float:
+def _widest(lens: Lens | ApertureSummary) -> float:
     """Radius, at least one pitch, of what is lit."""
     radius = (
         lens.radius_um
-        if isinstance(lens, Aperture)
+        if isinstance(lens, ApertureSummary)
         else max(lens.diameters.radius_um, lens.diameters.pitch_um)
     )
     return _lit(lens, radius)
 
 
-def _lit(lens: Lens | Aperture, radius_um: float) -> float:
+def _lit(lens: Lens | ApertureSummary, radius_um: float) -> float:
     return min(
         radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
     )
 
 
-def _reduced(lens: Lens | Aperture, depth_um: float) -> float:
+def _reduced(lens: Lens | ApertureSummary, depth_um: float) -> float:
     return depth_um - _thinner(lens)
 
 
-def _thinner(lens: Lens | Aperture) -> float:
+def _thinner(lens: Lens | ApertureSummary) -> float:
     """What films in front take off the depth: sum of t (1 - 1/n)."""
     before = lens.layers.before(math.inf, lens.wavelength_um)
     return sum(

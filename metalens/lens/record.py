@@ -11,15 +11,15 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from metalens.cell import Cell, Lattice
-from metalens.ground import config, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import LensError
-from metalens.ground.reading import read_hdf5, reader
-from metalens.ground.store import Provenance
+from metalens.core import config, store
+from metalens.core.arrays import Array
+from metalens.core.errors import LensError
+from metalens.core.reading import read_hdf5, typed_reader
+from metalens.core.store import Provenance
 from metalens.lens.diameters import DiameterMap as DiameterMap
 from metalens.lens.layers import Layers, check_gaps
-from metalens.lens.neighbours import Neighbours
-from metalens.lens.pairs import Pairs
+from metalens.lens.neighbours import NeighbourRows
+from metalens.lens.pairs import TwoSizeTable
 from metalens.lens.rows import RowsOnDisk
 from metalens.pillars import Proxy
 
@@ -77,9 +77,9 @@ class Lens:
     provenance: Provenance = field(default_factory=Provenance)
     layers: Layers = field(default_factory=Layers)
     hand: Hand = ""
-    pairs: Pairs | None = None
+    pairs: TwoSizeTable | None = None
     light: Literal["x", "y"] = "x"
-    neighbours: Neighbours | None = None
+    neighbours: NeighbourRows | None = None
 
     def __post_init__(self) -> None:
         if (self.pairs is None) != (self.diameters.length_um is None) or (
@@ -161,7 +161,7 @@ class Lens:
         return np.where(d > 0, phase + self.geometric_rad(rows), 0)
 
     def _amplitude(
-        self, rows: slice, pairs: Pairs, wavelength_um: float | None
+        self, rows: slice, pairs: TwoSizeTable, wavelength_um: float | None
     ) -> Array:
         x, y = self.diameters.diameter_um[rows], self.diameters.length_um
         return pairs.amplitude(
@@ -194,11 +194,11 @@ class Lens:
 
 def save(path: str | Path, lens: Lens) -> None:
     """Write a lens file (kind ``lens``); diameters keep their dtype."""
-    arrays, attributes = parts(lens)
+    arrays, attributes = lens_to_parts(lens)
     store.save(path, "lens", arrays, attributes=attributes, provenance=lens.provenance)
 
 
-@reader
+@typed_reader
 def load(path: str | Path) -> Lens:
     """Read a lens file.
 
@@ -206,11 +206,11 @@ def load(path: str | Path) -> Lens:
         StoreError: not a lens file; LensError: its diameters are invalid.
     """
     stored = store.load(path, "lens")
-    lens = from_parts(stored.arrays, stored.attributes, where=str(path))
+    lens = lens_from_parts(stored.arrays, stored.attributes, where=str(path))
     return replace(lens, provenance=stored.provenance)
 
 
-@reader
+@typed_reader
 def load_plain(path: str | Path) -> Lens:
     """As :func:`load`, for what knows only round or fixed pillars on a square lattice.
 
@@ -233,8 +233,8 @@ def load_plain(path: str | Path) -> Lens:
     return made
 
 
-@reader
-def streamed(path: str | Path) -> Lens:
+@typed_reader
+def load_out_of_core(path: str | Path) -> Lens:
     """As :func:`load`; diameters that would take much memory stay in the file, as
     :class:`RowsOnDisk`.
 
@@ -250,7 +250,7 @@ def streamed(path: str | Path) -> Lens:
     stored = store.load(path, "lens", without=(_NAME,))
     held = {**stored.arrays, _NAME: cast(Array, RowsOnDisk(path, _NAME))}
     return replace(
-        from_parts(held, stored.attributes, where=str(path)),
+        lens_from_parts(held, stored.attributes, where=str(path)),
         provenance=stored.provenance,
     )
 
@@ -260,7 +260,9 @@ def _claimed(file: Any) -> int:
     return int(file[_NAME].nbytes)
 
 
-def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:
+def lens_to_parts(
+    lens: Lens, *, group: str = ""
+) -> tuple[dict[str, Array], dict[str, Any]]:
     """(arrays, attributes) of a lens for a store file; ``group`` stands before the
     names of the arrays.
     """
@@ -301,14 +303,14 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
     return arrays, attributes
 
 
-def from_parts(
+def lens_from_parts(
     arrays: Mapping[str, Array],
     attributes: Mapping[str, Any],
     *,
     where: str,
     group: str = "",
 ) -> Lens:
-    """Inverse of :func:`parts`; ``where`` names the file in errors."""
+    """Inverse of :func:`lens_to_parts`; ``where`` names the file in errors."""
     proxy, held, rows = (
         {
             name.removeprefix(start): array
@@ -317,7 +319,7 @@ def from_parts(
         }
         for start in (f"{group}proxy/", f"{group}pairs/", f"{group}neighbours/")
     )
-    pairs = Pairs.from_arrays(held) if held else None
+    pairs = TwoSizeTable.from_arrays(held) if held else None
     return Lens(
         diameters=_diameters(arrays, attributes, where, group),
         cell=config.loads(attributes["cell"], Cell, where=f"{where}: cell"),
@@ -330,7 +332,7 @@ def from_parts(
         hand=attributes.get("hand", ""),
         pairs=pairs,
         light=attributes.get("light", "x"),
-        neighbours=Neighbours.from_arrays(rows) if rows else None,
+        neighbours=NeighbourRows.from_arrays(rows) if rows else None,
     )
 
 

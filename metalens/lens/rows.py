@@ -6,8 +6,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from metalens.ground import reading
-from metalens.ground.arrays import Array
+from metalens.core import reading
+from metalens.core.arrays import Array
 
 _BAND = 256  # rows, where the file is not cut into chunks
 
@@ -20,12 +20,12 @@ class RowsOnDisk:
     ``numpy.asarray`` first. The band
     of rows read last is kept, whole chunks of the file. The file is to have been read
     with
-    :func:`metalens.ground.reading.read_hdf5` before; reading rows of one that was
+    :func:`metalens.core.reading.read_hdf5` before; reading rows of one that was
     written to since is a StoreError.
     """
 
     def __init__(self, path: str | Path, name: str) -> None:
-        self._path, self._stamp = path, reading.stamp(path)
+        self._path, self._stamp = path, reading.file_stamp(path)
         self._file = h5py.File(path, "r")
         self._data: h5py.Dataset = self._file[name]
         self.shape: tuple[int, int] = self._data.shape

@@ -17,7 +17,7 @@ LEFT = 4e-15  # of the largest coefficient: those of the last two degrees
 FEW = 1000  # places below which the function itself is quicker
 
 
-def over(function: Callable[[Any], Any], u: Any) -> Any:
+def chebyshev_interpolant(function: Callable[[Any], Any], u: Any) -> Any:
     """function(u), elementwise, of a float64 array or tensor; to 1e-14 of its largest
     value.
     """

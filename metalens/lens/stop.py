@@ -33,10 +33,10 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
 from metalens.lens import media, smooth
-from metalens.lens.edge import behind
+from metalens.lens.edge import edge_diffraction_factor
 from metalens.lens.media import Media
 
 BENT, INNER = 0.005, 0.055  # of PSFs of 60 lenses against plane waves through the glass
@@ -83,7 +83,7 @@ class Stop:
         return not any(self.centre_um)
 
 
-def crossing(
+def stop_crossing(
     before: Media | None,
     between: Media | None,
     tangents: tuple[float, float],
@@ -119,10 +119,10 @@ def _share(before: Media, between: Media, away2: Any) -> Any:
         w = media.square(before.layers, u)
         return media.bend(between.layers, w) / media.bend(before.layers, w)
 
-    return smooth.over(exact, away2)
+    return smooth.chebyshev_interpolant(exact, away2)
 
 
-def passed(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
+def stop_transmission(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
     """Share of light that passes where rays cross the stop at (x, y): 1 inside, 0
     outside, over the edge as much of a
     patch of ``width_um`` as lies inside; numpy or torch."""
@@ -132,7 +132,7 @@ def passed(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
     return share.clip(0, 1) if isinstance(share, np.ndarray) else share.clamp(0, 1)
 
 
-def shadow(
+def stop_shadow(
     stop: Stop,
     media_um: tuple[Media | None, Media | None],
     tangents: tuple[float, float],
@@ -144,20 +144,22 @@ def shadow(
     a place; numpy arrays.
 
     Args:
-        media_um: before and between, tangents: as in :func:`crossing`. at_um: (x, y) of
+        media_um: before and between, tangents: as in :func:`stop_crossing`. at_um: (x, y) of
             the pillars, broadcast.
 
-    Accuracy: of a PSF of sum 1, by :func:`left_out`; energies are 0.18 / N short, N the
+    Accuracy: of a PSF of sum 1, by :func:`stop_model_error`; energies are 0.18 / N short, N the
     Fresnel number there.
     """
-    x, y = crossing(*media_um, tangents, *at_um)
+    x, y = stop_crossing(*media_um, tangents, *at_um)
     if media_um[1] is None:
-        return np.asarray(passed(stop, (x, y), width_um))
+        return np.asarray(stop_transmission(stop, (x, y), width_um))
     slope = math.hypot(*tangents)
     ray = (tangents[0] / slope, tangents[1] / slope) if slope else (1.0, 0.0)
     lengths = fresnel_um(media_um[0], media_um[1], tangents)
     x, y = np.broadcast_arrays(x - stop.centre_um[0], y - stop.centre_um[1])
-    return behind((x, y), width_um, ray, lengths, stop.radius_um, wavelength_um)
+    return edge_diffraction_factor(
+        (x, y), width_um, ray, lengths, stop.radius_um, wavelength_um
+    )
 
 
 def fresnel_um(
@@ -178,14 +180,14 @@ def fresnel_um(
     ), across * (1 - across / whole)
 
 
-def left_out(
+def stop_model_error(
     stop: Stop,
     media_um: tuple[Media | None, Media | None],
     tangents: tuple[float, float],
     wavelength_um: float,
     zones: float = 0.0,
 ) -> float:
-    """Relative L2 error of a PSF by what :func:`shadow` leaves out: (``BENT`` +
+    """Relative L2 error of a PSF by what :func:`stop_shadow` leaves out: (``BENT`` +
     ``INNER`` zones) / N.
 
     N = R² / (λ L) is the Fresnel number of the shadow. Of the edge's bend the next term
@@ -203,7 +205,9 @@ def left_out(
     return (BENT + INNER * zones) / number
 
 
-def lit_um(stop: Stop, before: Media | None, between: Media | None) -> float:
+def illuminated_radius_um(
+    stop: Stop, before: Media | None, between: Media | None
+) -> float:
     """Radius of what a source on the axis lights on the pillars (paraxial)."""
     if before is None or between is None:
         return stop.radius_um

@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import media
 from metalens.lens.media import Media
 
@@ -44,7 +44,7 @@ STEEPEST = 0.9999  # of a ray, in units of the rarest index that the light meets
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Saddle:
+class SaddleCorrection:
     """C as a power series in (s - middle) / half: real and imaginary coefficients,
     lowest first.
 
@@ -78,9 +78,9 @@ class Saddle:
         )
 
 
-def saddle(
+def saddle_correction(
     behind: Media, wavenumber: float, reach_um: float, light: Light = "mean"
-) -> Saddle:
+) -> SaddleCorrection:
     """C of all rays up to this reach; ``wavenumber`` in vacuum, rad/um. light: whose
     power passes the faces, of s, of p
     or the mean of both."""
@@ -98,13 +98,15 @@ def saddle(
 
 
 @functools.lru_cache(maxsize=64)
-def _saddle(behind: Media, wavenumber: float, most: float, light: Light) -> Saddle:
+def _saddle(
+    behind: Media, wavenumber: float, most: float, light: Light
+) -> SaddleCorrection:
     """C of rays of w = p² up to ``most``."""
     rarest = behind.layers[0][0]
     ends = math.sqrt(rarest * rarest - most), rarest
     middle, half = sum(ends) / 2, (ends[1] - ends[0]) / 2
     if len(set(behind.order)) == 1:
-        return Saddle(
+        return SaddleCorrection(
             rarest,
             middle,
             half,
@@ -129,7 +131,7 @@ def _saddle(behind: Media, wavenumber: float, most: float, light: Light) -> Sadd
     )
     real, imaginary = (np.ascontiguousarray(part) for part in (power.real, power.imag))
     missed = np.abs(_horner(power, u) - want) / turns
-    return Saddle(
+    return SaddleCorrection(
         rarest,
         middle,
         half,
@@ -143,18 +145,20 @@ def _saddle(behind: Media, wavenumber: float, most: float, light: Light) -> Sadd
 def _settled(
     behind: Media, wavenumber: float, w: Array, light: Light
 ) -> tuple[Array, Array]:
-    """(n,) :func:`waves` with as many as suit each ray, and by how much fewer differ:
+    """(n,) :func:`plane_wave_correction` with as many as suit each ray, and by how much fewer differ:
     steep rays through thin films
     settle at first, and part again where nodes lie beyond what the ray alone governs.
     """
-    every = np.stack([waves(behind, wavenumber, w, count, light) for count in WAVES])
+    every = np.stack(
+        [plane_wave_correction(behind, wavenumber, w, count, light) for count in WAVES]
+    )
     apart = np.abs(np.diff(every, axis=0))
     best = np.argmin(apart, axis=0)
     at = np.arange(len(w))
     return every[best + 1, at], apart[best, at]
 
 
-def waves(
+def plane_wave_correction(
     behind: Media,
     wavenumber: float,
     w: Array,

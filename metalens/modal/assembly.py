@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.modal.mesh import DiscMesh, MeshPatch, MeshPlan, build_mesh
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Light, index
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Incidence, index
+from metalens.core.errors import CellError
 
 LEAST_CONTRAST = (
     2.0  # of permittivities, of a pillar that is told from its surroundings
@@ -124,7 +124,7 @@ def fresnel_scattering(case: ModalCase) -> np.ndarray:
     return np.array([[r, t], [t, -r]], complex)
 
 
-def case_of(cell: Cell, diameter_um: float, light: Light) -> ModalCase:
+def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
     """Check a case, and put it into half pitches.
 
     Raises:
@@ -156,7 +156,7 @@ def case_of(cell: Cell, diameter_um: float, light: Light) -> ModalCase:
     )
 
 
-def plane_of_incidence(light: Light) -> str:
+def plane_of_incidence(light: Incidence) -> str:
     """The lattice axis, "x" or "y", that the plane of incidence contains.
 
     Raises:
@@ -171,7 +171,7 @@ def plane_of_incidence(light: Light) -> str:
     return "x" if round(quarter) % 2 == 0 else "y"
 
 
-def half_spaces(cell: Cell, light: Light) -> tuple[complex, complex]:
+def half_spaces(cell: Cell, light: Incidence) -> tuple[complex, complex]:
     """Indices of substrate and cover, neither absorbing, with a zero order in both.
 
     Raises:

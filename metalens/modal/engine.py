@@ -8,14 +8,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
-from metalens.ground.errors import CellError
-from metalens.ground.threads import one_blas_thread
+from metalens.cell import Cell, Incidence, Polarization, Response, check_tolerance
+from metalens.core.errors import CellError
+from metalens.core.threads import one_blas_thread
 from metalens.modal.assembly import AssembledDisc, assemble_disc
 from metalens.modal.case import MeshSolution, ModalCase, case_of, fresnel_scattering
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import HomogeneousBasis, homogeneous_modes
-from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
+from metalens.modal.ladder import COMPARED, RUNGS, MeshLevel, first_rung
 from metalens.modal.layer import LayerMedium, electric_modes, magnetic_modes
 from metalens.modal.match import (
     CARRY,
@@ -220,7 +220,9 @@ def solve_form(
     )
 
 
-def evaluate(case: ModalCase, plan: MeshPlan, *, weak: float = CARRY) -> MeshSolution:
+def solve_on_mesh(
+    case: ModalCase, plan: MeshPlan, *, weak: float = CARRY
+) -> MeshSolution:
     """Both forms on one mesh.
 
     weak: modes weaker than this over the height end at the interface they start from,
@@ -297,7 +299,7 @@ class RefinementResult:
     """Where the ladder was left: the solution, its rung and error estimate, and why."""
 
     solution: MeshSolution
-    rung: Rung
+    rung: MeshLevel
     error: float
     converged: bool
     reason: str
@@ -325,7 +327,7 @@ def refine_mesh(case: ModalCase, tolerance: float) -> RefinementResult:
         plan = rung.choice(case.rho).plan
         if plan == last:  # of wide discs, for which two rungs have one mesh
             continue
-        solution, last = evaluate(case, plan, weak=rung.weak), plan
+        solution, last = solve_on_mesh(case, plan, weak=rung.weak), plan
         known = not case.strange or len(solved) >= COMPARED
         error = rung.error(solution, case.rho, solved) if known else 1.0
         solved.append(solution)
@@ -372,7 +374,7 @@ def solve(
         CellError, MaterialError: see ``case_of``.
     """
     check_tolerance(tolerance)
-    light = Light(
+    light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
     if cell.round and (cell.sidewall_rad or cell.under or cell.over):
@@ -400,7 +402,7 @@ def solve(
 
 
 def _as_built(
-    cell: Cell, diameter_um: float, light: Light, tolerance: float
+    cell: Cell, diameter_um: float, light: Incidence, tolerance: float
 ) -> Response:
     """A pillar with a tilted wall or films, from upright ones without."""
     plain = anchored.upright_cell(cell)

@@ -246,7 +246,7 @@ def fixed_point(
             last = change = float(np.abs(after[:slow] - e[:slow]).max())
             e = after
             if change < aim:
-                return symmetrised(e, signs)
+                return symmetrize_by_signs(e, signs)
         else:
             rows = e[:slow] @ e
             rows *= weight[:slow]
@@ -259,7 +259,7 @@ def fixed_point(
     return None
 
 
-def symmetrised(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
+def symmetrize_by_signs(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     """A matrix made symmetric with respect to the signs to the last bit: products of
     some processors are not, and what
     is left of the difference is light that is lost."""

@@ -174,7 +174,7 @@ class MeshChoice:
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
+class MeshLevel:
     """Meshes of one accuracy, thinnest disc first.
 
     usual: the estimate that most pillars of many waves in a pitch end with. alone:
@@ -374,7 +374,7 @@ def _rough(*choices: MeshChoice) -> tuple[MeshChoice, ...]:
 
 
 RUNGS = (
-    Rung(
+    MeshLevel(
         "coarse",
         _rough(
             MeshChoice(
@@ -419,7 +419,7 @@ RUNGS = (
         2e-3,
         alone=ErrorFactors(7.0, 7.0, 3e-4, 3e-4, oblique=1e-3),
     ),
-    Rung(
+    MeshLevel(
         "fair",
         _rough(
             MeshChoice(
@@ -462,7 +462,7 @@ RUNGS = (
         4e-4,
         alone=ErrorFactors(7.0, 7.0, 1e-4, 1e-4, oblique=5e-5),
     ),
-    Rung(
+    MeshLevel(
         "even",
         (
             MeshChoice(
@@ -490,7 +490,7 @@ RUNGS = (
         alone=ErrorFactors(9.0, 9.0, 3e-5, 3e-5, oblique=2e-5),
         settling=DampedEstimate(moved=1.05, forms=1.05, shared=4.5e-6),
     ),
-    Rung(
+    MeshLevel(
         "good",
         (
             MeshChoice(
@@ -534,15 +534,17 @@ RUNGS = (
     ),
     # what "fine" adds to "good" is lost on wide discs, whose gap it does not divide:
     # they go on to "finer"
-    Rung(
+    MeshLevel(
         "fine",
         (*_finer(FINE, 1.0, 3e-7, 3e-7)[:1], *ON_FINER[1:]),
         2.5e-5,
         _alone(1.0, 3e-7, 3e-7),
     ),
-    Rung("finer", ON_FINER, 8e-6, _alone(0.5, 4e-8, 1e-7)),
-    Rung("finest", _finer(FINEST, 0.35, 2e-8, 5e-8), 3e-6, _alone(0.35, 2e-8, 5e-8)),
-    Rung("reference", _finer(REFERENCE, 0.3, 1e-8), 1e-6, _alone(0.3, 1e-8)),
+    MeshLevel("finer", ON_FINER, 8e-6, _alone(0.5, 4e-8, 1e-7)),
+    MeshLevel(
+        "finest", _finer(FINEST, 0.35, 2e-8, 5e-8), 3e-6, _alone(0.35, 2e-8, 5e-8)
+    ),
+    MeshLevel("reference", _finer(REFERENCE, 0.3, 1e-8), 1e-6, _alone(0.3, 1e-8)),
 )
 
 
@@ -556,7 +558,7 @@ def first_rung(tolerance: float, rho: float | None = None, size: float = LARGE) 
     """
     fewer = min(1.0, size / LARGE) ** FALL
 
-    def usual(rung: Rung) -> float:
+    def usual(rung: MeshLevel) -> float:
         return fewer * ((None if rho is None else rung.choice(rho).usual) or rung.usual)
 
     return next(

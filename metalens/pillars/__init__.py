@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.pillars import axes as axes
@@ -16,30 +16,30 @@ if TYPE_CHECKING:
     from metalens.pillars import study_plots as study_plots
     from metalens.pillars import workers as workers
     from metalens.pillars.fit import ProxyFit as ProxyFit
-    from metalens.pillars.fit import Wanted as Wanted
+    from metalens.pillars.fit import ProxyTolerances as ProxyTolerances
     from metalens.pillars.proxy import MOST_ERROR as MOST_ERROR
     from metalens.pillars.proxy import Proxy as Proxy
-    from metalens.pillars.proxy import taller as taller
+    from metalens.pillars.proxy import height_hint as height_hint
     from metalens.pillars.record import DEFAULT_CELL as DEFAULT_CELL
     from metalens.pillars.record import PillarLibrary as PillarLibrary
     from metalens.pillars.record import Sweep as Sweep
-    from metalens.pillars.study import Study as Study
+    from metalens.pillars.study import CellStudy as CellStudy
     from metalens.pillars.study_plots import library_figure as library_figure
-    from metalens.pillars.workers import Journal as Journal
+    from metalens.pillars.workers import SweepJournal as SweepJournal
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "study_plots": "",
         "DEFAULT_CELL": "record",
-        "Journal": "workers",
+        "SweepJournal": "workers",
         "MOST_ERROR": "proxy",
         "PillarLibrary": "record",
         "Proxy": "proxy",
         "ProxyFit": "fit",
-        "Study": "study",
+        "CellStudy": "study",
         "Sweep": "record",
-        "Wanted": "fit",
+        "ProxyTolerances": "fit",
         "axes": "",
         "converted": "",
         "curve": "",
@@ -49,7 +49,7 @@ __getattr__, __dir__, __all__ = attach(
         "rational": "",
         "record": "",
         "study": "",
-        "taller": "proxy",
+        "height_hint": "proxy",
         "workers": "",
     },
 )

@@ -12,17 +12,17 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars import circular
 from metalens.pillars.fit import (
-    Data,
+    FitData,
     ProxyFit,
-    Wanted,
+    ProxyTolerances,
     entry_error,
     fit_terms,
-    missed,
-    shortfall,
+    tolerance_ratio,
+    tolerance_shortfall,
 )
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary
@@ -32,7 +32,7 @@ LEAST_ENTRIES = 12
 NEAREST_SHARE = 0.85
 
 
-def converted(library: PillarLibrary) -> Array:
+def cross_polarized_amplitude(library: PillarLibrary) -> Array:
     """(wavelength, size) amplitude (t_x - t_y)/2 that leaves with the other hand, of
     pillars that are not turned.
     """
@@ -43,21 +43,21 @@ def best_size_um(library: PillarLibrary) -> float:
     """The size whose least conversion over the wavelengths is largest, off resonances
     (bars within the tolerance).
     """
-    least = np.abs(converted(library)).min(axis=0)
+    least = np.abs(cross_polarized_amplitude(library)).min(axis=0)
     sure = (library.t_error <= library.sweep.bar).all(axis=(0, 1, 2))
     return float(
         library.diameter_um[int(np.where(sure | ~sure.any(), least, -1.0).argmax())]
     )
 
 
-def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
+def fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
     """The proxy of the converted light on the widest run of sizes around the best one
     that meets the tolerances.
 
     Raises:
         DomainError: fewer than 12 sizes without resonance around the best one.
     """
-    t, d = converted(library), library.diameter_um
+    t, d = cross_polarized_amplitude(library), library.diameter_um
     middle = int(np.searchsorted(d, best_size_um(library)))
     least = NEAREST_SHARE * np.abs(t[:, middle]).min()
     good = (np.abs(t).min(axis=0) >= least) & ~_sharp(
@@ -81,7 +81,7 @@ def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
     phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[
         :, None
     ]
-    kept = Data(
+    kept = FitData(
         phase[None],
         np.abs(t[:, run])[None],
         d[run],
@@ -95,13 +95,15 @@ def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
     notes = (
         f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",
     )
-    return ProxyFit(proxy, notes, (), math.nan, 0.0, shortfall(proxy, wanted), math.nan)
+    return ProxyFit(
+        proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, wanted), math.nan
+    )
 
 
-def with_turns(library: PillarLibrary) -> PillarLibrary:
+def with_rotations(library: PillarLibrary) -> PillarLibrary:
     """With the best pillar solved at several turns, at the middle wavelength."""
     wavelength = float(library.wavelength_um[len(library.wavelength_um) // 2])
-    turned = circular.solve(
+    turned = circular.solve_rotations(
         library.cell, best_size_um(library), wavelength, tolerance=library.sweep.bar
     )
     return dataclasses.replace(library, turned=turned)
@@ -116,14 +118,14 @@ def _sharp(library: PillarLibrary, least_half_width_um: float) -> Array:
     return near
 
 
-def _widest(data: Data, middle: int, wanted: Wanted) -> Proxy:
+def _widest(data: FitData, middle: int, wanted: ProxyTolerances) -> Proxy:
     """The widest run about ``middle`` on which as many coefficients as are wanted meet
     the tolerances.
     """
     reach = max(middle, len(data.diameter) - 1 - middle)
     while True:
         part = slice(max(0, middle - reach), middle + reach + 1)
-        some = Data(
+        some = FitData(
             data.phase[..., part],
             data.level[..., part],
             data.diameter[part],
@@ -132,7 +134,7 @@ def _widest(data: Data, middle: int, wanted: Wanted) -> Proxy:
         )
         count = len(some.diameter)
         proxy = fit_terms(some, 1, min(max(2, wanted.coefficients // 2), count // 3))
-        if missed(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
+        if tolerance_ratio(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
             return proxy
         nearer = max(LEAST_ENTRIES // 2, int(0.9 * reach))
         if nearer >= reach:

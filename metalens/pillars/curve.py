@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Response
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars import rational
-from metalens.pillars.rational import Rational
+from metalens.pillars.rational import RationalFunction
 
 Solver = Callable[[float], Response]
 FIT_SHARE = 0.2  # of the tolerance: residual of the rational fit
@@ -33,7 +33,7 @@ FINEST_UM = 2e-5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Nodes:
+class SolvedNodes:
     """Exact solves of one curve, in the order they were made.
 
     diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver. energy:
@@ -51,7 +51,7 @@ class Nodes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Curve:
+class ResponseCurve:
     """t(D) and r(D) between the nodes, with an error estimate.
 
     nodes: the exact solves.
@@ -59,9 +59,9 @@ class Curve:
     tolerance: that the nodes were chosen for.
     """
 
-    nodes: Nodes
-    best: Rational
-    rivals: tuple[Rational, ...]
+    nodes: SolvedNodes
+    best: RationalFunction
+    rivals: tuple[RationalFunction, ...]
     tolerance: float
 
     def __call__(self, diameter_um: Array) -> tuple[Array, Array]:
@@ -152,15 +152,17 @@ class Curve:
         return np.column_stack([poles.real, np.abs(poles.imag)])
 
 
-def starts(low_um: float, high_um: float, count: int = FIRST) -> list[float]:
-    """Diameters that :func:`explore` solves first: Chebyshev points with both ends."""
+def starting_diameters(
+    low_um: float, high_um: float, count: int = FIRST
+) -> list[float]:
+    """Diameters that :func:`sample_adaptively` solves first: Chebyshev points with both ends."""
     middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
     start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
     start[[0, -1]] = low_um, high_um
     return [float(v) for v in start]
 
 
-def explore(
+def sample_adaptively(
     solve: Solver,
     low_um: float,
     high_um: float,
@@ -169,7 +171,7 @@ def explore(
     first: int = FIRST,
     most: int = 80,
     cheaper_um: Array | None = None,
-) -> Nodes:
+) -> SolvedNodes:
     """Choose diameters one by one and solve them, until the rational fit predicts what
     comes.
 
@@ -183,9 +185,9 @@ def explore(
     """
     cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
     cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
-    x = starts(low_um, high_um, first)
+    x = starting_diameters(low_um, high_um, first)
     made = [solve(v) for v in x]
-    past: list[Rational] = []
+    past: list[RationalFunction] = []
     calm = 0
     while calm < CALM and len(x) < most:
         fit, simpler = _fits(np.array(x), _responses(made), tolerance)
@@ -210,32 +212,37 @@ def explore(
         np.array([m.t_error for m in made]),
         np.array([m.energy for m in made]),
     )
-    return Nodes(np.array(x), _responses(made), errors, energies, calm == CALM, reason)
+    return SolvedNodes(
+        np.array(x), _responses(made), errors, energies, calm == CALM, reason
+    )
 
 
-def curve(nodes: Nodes, *, tolerance: float) -> Curve:
+def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:
     """The rational curve through exact solves, and the rivals that judge it."""
     x, y = nodes.diameter_um, nodes.response
     best, simpler = _fits(x, y, tolerance)
     shorter = tuple(
-        rational.fit(x[:-k], y[:-k], tolerance=FIT_SHARE * tolerance) for k in (1, 2)
+        rational.fit_rational_aaa(x[:-k], y[:-k], tolerance=FIT_SHARE * tolerance)
+        for k in (1, 2)
     )
-    return Curve(nodes, best, (simpler, *shorter), tolerance)
+    return ResponseCurve(nodes, best, (simpler, *shorter), tolerance)
 
 
-def _fits(x: Array, y: Array, tolerance: float) -> tuple[Rational, Rational]:
+def _fits(
+    x: Array, y: Array, tolerance: float
+) -> tuple[RationalFunction, RationalFunction]:
     """A fit with a pole more than the data ask for, and the fit of least degree that
     meets them.
     """
-    simpler = rational.fit(x, y, tolerance=FIT_SHARE * tolerance)
-    best = rational.fit(
+    simpler = rational.fit_rational_aaa(x, y, tolerance=FIT_SHARE * tolerance)
+    best = rational.fit_rational_aaa(
         x, y, tolerance=0.0, terms=len(simpler.support) + 1, start=simpler.support
     )
     return best, simpler
 
 
 def _suspect(
-    fit: Rational, rivals: list[Rational], x: Array, cheaper: Array
+    fit: RationalFunction, rivals: list[RationalFunction], x: Array, cheaper: Array
 ) -> tuple[float, float]:
     """Where the fits disagree most, or nearly so at a cheaper place, and by how much at
     most; narrow resonances are

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Response
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
-from metalens.pillars.curve import FIRST, starts
+from metalens.cell import Cell, Incidence, Response
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
+from metalens.pillars.curve import FIRST, starting_diameters
 
 PROBES = [
     4,
@@ -27,7 +27,7 @@ ENOUGH = 1.2
 Engine = Literal["auto", "rcwa", "modal"]
 
 
-def choose(cell: Cell, engine: Engine = "auto") -> str:
+def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
     """``modal`` for round pillars on a square lattice (more precise, and faster where
     upright), ``rcwa`` for others.
 
@@ -42,8 +42,8 @@ def choose(cell: Cell, engine: Engine = "auto") -> str:
     return engine
 
 
-def precise(
-    cell: Cell, light: Light, *, tolerance: float, engine: str
+def solve_to_tolerance(
+    cell: Cell, light: Incidence, *, tolerance: float, engine: str
 ) -> Callable[[float], Response]:
     """Response at a diameter, refined until its own error estimate meets the tolerance."""
     if engine == "modal":
@@ -51,29 +51,31 @@ def precise(
     return functools.partial(_rcwa, cell, light, tolerance, None)
 
 
-def smooth(
+def solver_at_fixed_discretization(
     cell: Cell,
-    light: Light,
+    light: Incidence,
     span_um: tuple[float, float],
     *,
     tolerance: float,
     engine: str,
 ) -> Callable[[float], Response]:
-    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so
+    """As :func:`solve_to_tolerance`, on one discretisation for all diameters of ``span_um``, so
     far as it goes.
     """
-    return smooth_all(cell, [light], span_um, tolerance=tolerance, engine=engine)[0]
+    return solvers_at_common_discretization(
+        cell, [light], span_um, tolerance=tolerance, engine=engine
+    )[0]
 
 
-def smooth_all(
+def solvers_at_common_discretization(
     cell: Cell,
-    lights: Sequence[Light],
+    lights: Sequence[Incidence],
     span_um: tuple[float, float],
     *,
     tolerance: float,
     engine: str,
 ) -> list[Callable[[float], Response]]:
-    """:func:`smooth` for several lights, on the discretisation that all of them need.
+    """:func:`solver_at_fixed_discretization` for several lights, on the discretisation that all of them need.
 
     It is the least that meets the tolerance at three probes, which a curve over the
     span solves anyhow: answers are
@@ -85,9 +87,13 @@ def smooth_all(
     The jump there is the true error
     of the coarser mesh, some tenth of its bar.
     """
-    if cell.height_um == 0 or (engine == "modal" and not upright(cell, engine)):
+    if cell.height_um == 0 or (
+        engine == "modal" and not has_upright_walls(cell, engine)
+    ):
         return [
-            functools.cache(precise(cell, light, tolerance=tolerance, engine=engine))
+            functools.cache(
+                solve_to_tolerance(cell, light, tolerance=tolerance, engine=engine)
+            )
             for light in lights
         ]
     make = _modal_levels if engine == "modal" else _rcwa_levels
@@ -96,7 +102,7 @@ def smooth_all(
         for light in lights
     ]
     levels = list(zip(*of_lights, strict=True))
-    probes = np.array(starts(*span_um))[PROBES].tolist()
+    probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
     allowed = 1 if engine == "modal" else 0
     for place, level in enumerate(levels[:-1]):
         if all(_failing(at, probes, allowed) <= allowed for at in level):
@@ -108,15 +114,15 @@ def smooth_all(
     return list(levels[-1])
 
 
-def upright(cell: Cell, engine: str) -> bool:
+def has_upright_walls(cell: Cell, engine: str) -> bool:
     """Whether the modal engine solves the pillar by itself: its lights of one direction
     then share modes and a mesh.
     """
     return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
 
 
-def at_the_finest(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`smooth` took the finest discretisation there is, by the errors of
+def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
+    """Whether :func:`solver_at_fixed_discretization` took the finest discretisation there is, by the errors of
     the nodes that came of it (the
     first ones as a curve begins with): a pillar solved by itself has no less error
     then."""
@@ -179,17 +185,17 @@ def _met(
 
 
 def _modal_levels(
-    cell: Cell, light: Light, largest_um: float, tolerance: float
+    cell: Cell, light: Incidence, largest_um: float, tolerance: float
 ) -> list[Callable[[float], Response]]:
     """One mesh a level: the one that the ladder takes for the largest diameter."""
-    from metalens.modal import RUNGS, Rung, case_of, evaluate, first_rung
+    from metalens.modal import RUNGS, MeshLevel, case_of, first_rung, solve_on_mesh
 
-    def level(rung: Rung) -> Callable[[float], Response]:
+    def level(rung: MeshLevel) -> Callable[[float], Response]:
         mesh = rung.choice(largest_um / cell.pitch_um)
 
         def at(diameter_um: float) -> Response:
             case = case_of(cell, diameter_um, light)
-            made = evaluate(case, mesh.plan, weak=rung.weak)
+            made = solve_on_mesh(case, mesh.plan, weak=rung.weak)
             error = rung.error(made, case.rho, mesh=mesh)
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
             return Response(
@@ -209,7 +215,7 @@ def _modal_levels(
 
 
 def _rcwa_levels(
-    cell: Cell, light: Light, largest_um: float, tolerance: float
+    cell: Cell, light: Incidence, largest_um: float, tolerance: float
 ) -> list[Callable[[float], Response]]:
     reaches: tuple[int, ...] = (6, 8, 10, 12, 14)
     if not cell.round:
@@ -224,7 +230,9 @@ def _rcwa_levels(
     ]
 
 
-def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Response:
+def _modal(
+    cell: Cell, light: Incidence, tolerance: float, diameter_um: float
+) -> Response:
     from metalens import modal
 
     return modal.solve(
@@ -240,7 +248,7 @@ def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Re
 
 def _rcwa(
     cell: Cell,
-    light: Light,
+    light: Incidence,
     tolerance: float,
     harmonics: int | None,
     diameter_um: float,

@@ -7,12 +7,12 @@ import math
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from metalens.cell import Light, Polarization
-from metalens.ground.arrays import Array
+from metalens.cell import Incidence, Polarization
+from metalens.core.arrays import Array
 from metalens.pillars.record import Sweep
 
 Normal = dict[str, Polarization]
-Rows = dict[Light, Array]  # (3, diameter) complex: t, r, error estimate
+Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
 ALL_UP_TO = 6  # values of an axis that are all solved
 # half-width of a resonance that may lie between two nodes and show at neither
 NARROW_UM = 0.005
@@ -22,7 +22,7 @@ NEIGHBOURS = 4  # diameters on either side whose changes count
 SAFETY = 3.0  # on the extrapolated error of a polynomial
 
 
-def picks(values: tuple[float, ...]) -> tuple[float, ...]:
+def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
     """The values to solve first: all of a few, else five Leja points.
 
     Each is where the product of the distances to those before it is largest, which
@@ -50,17 +50,17 @@ UNLIKE: dict[str, Polarization] = {
 }  # planes of incidence along x: s is the light along y
 
 
-def lights(
+def plane_waves(
     sweep: Sweep,
     wavelengths_um: tuple[float, ...],
     angles_deg: tuple[float, ...],
     normal: Normal = ALIKE,
-) -> list[Light]:
+) -> list[Incidence]:
     """Every distinct plane wave; ``normal``: what the polarisations are at normal
     incidence.
     """
     found = [
-        light(w, a, p, normal)
+        plane_wave(w, a, p, normal)
         for a in angles_deg
         for p in sweep.polarizations
         for w in wavelengths_um
@@ -68,24 +68,24 @@ def lights(
     return list(dict.fromkeys(found))
 
 
-def light(
+def plane_wave(
     wavelength_um: float,
     angle_deg: float,
     polarization: Polarization,
     normal: Normal = ALIKE,
-) -> Light:
+) -> Incidence:
     """The plane wave of an entry."""
-    return Light(
+    return Incidence(
         wavelength_um,
         math.radians(angle_deg),
         polarization if angle_deg else normal[polarization],
     )
 
 
-def complete(
+def complete_sweep(
     sweep: Sweep,
     solved: Rows,
-    poles: dict[Light, Array],
+    poles: dict[Incidence, Array],
     diameters: Array,
     normal: Normal = ALIKE,
 ) -> Rows:
@@ -101,20 +101,25 @@ def complete(
     for polarization in sweep.polarizations:
         for angle in sweep.angles_deg:
             family = {
-                w: light(w, angle, polarization, normal) for w in sweep.wavelengths_um
+                w: plane_wave(w, angle, polarization, normal)
+                for w in sweep.wavelengths_um
             }
             _fill(rows, family, sharp, diameters)
         for wavelength in sweep.wavelengths_um:
             at = {math.sin(math.radians(a)) ** 2: a for a in sweep.angles_deg}
             family = {
-                x: light(wavelength, a, polarization, normal) for x, a in at.items()
+                x: plane_wave(wavelength, a, polarization, normal)
+                for x, a in at.items()
             }
             _fill(rows, family, sharp, diameters)
     return rows
 
 
 def _fill(
-    rows: Rows, family: dict[float, Light], sharp: dict[Light, Array], diameters: Array
+    rows: Rows,
+    family: dict[float, Incidence],
+    sharp: dict[Incidence, Array],
+    diameters: Array,
 ) -> None:
     """Add the rows of a family (position: light) that are missing, where at least five
     are there.
@@ -128,7 +133,7 @@ def _fill(
     )
     for x, wave in family.items():
         if wave not in rows:
-            row = between(nodes, table, x)
+            row = interpolate_row(nodes, table, x)
             right = int(np.searchsorted(nodes, x))
             first, second = (
                 sharp.get(have[float(nodes[i])], np.empty((0, 2)))
@@ -161,7 +166,7 @@ def _passed(first: Array, second: Array, diameters: Array) -> Array:
     return mask
 
 
-def between(nodes: Array, table: Array, x: float) -> Array:
+def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     """(3, diameter) row at ``x`` by the polynomial through all nodes.
 
     The error is extrapolated. Leaving out one node changes the row by the error of the
@@ -175,19 +180,19 @@ def between(nodes: Array, table: Array, x: float) -> Array:
 
     nodes: (m,). table: (m, 3, diameter).
     """
-    weights = lagrange(nodes, x)
+    weights = lagrange_weights(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
     one, two = np.zeros(table.shape[2]), np.zeros(table.shape[2])
     for k in range(len(nodes)):
         keep = np.arange(len(nodes)) != k
-        without = np.tensordot(lagrange(nodes[keep], x), table[keep, 0], 1)
+        without = np.tensordot(lagrange_weights(nodes[keep], x), table[keep, 0], 1)
         one = np.maximum(one, np.abs(without - row[0]))
         for j in range(k):
             fewer = keep & (np.arange(len(nodes)) != j)
             two = np.maximum(
                 two,
                 np.abs(
-                    np.tensordot(lagrange(nodes[fewer], x), table[fewer, 0], 1)
+                    np.tensordot(lagrange_weights(nodes[fewer], x), table[fewer, 0], 1)
                     - without
                 ),
             )
@@ -197,7 +202,7 @@ def between(nodes: Array, table: Array, x: float) -> Array:
     return row
 
 
-def lagrange(nodes: Array, x: float) -> Array:
+def lagrange_weights(nodes: Array, x: float) -> Array:
     """(m,) weights of the values at the nodes in the polynomial through them at ``x``."""
     ratio = (x - nodes[None, :]) / (
         nodes[:, None] - nodes[None, :] + np.eye(len(nodes))

@@ -10,12 +10,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars import polynomial
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary
-from metalens.pillars.stretch import LEAST_ENTRIES, Stretch, stretch
+from metalens.pillars.stretch import (
+    LEAST_ENTRIES,
+    MonotonicBranch,
+    longest_monotonic_branch,
+)
 
 TURN = 2 * math.pi
 FOLLOWED, KNOWN_SHARE = (
@@ -33,7 +37,7 @@ MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ProxyTolerances:
     """What a proxy must meet.
 
     phase_tolerance_rad, transmission_tolerance: largest deviation from the library
@@ -63,7 +67,7 @@ class Wanted:
             self.transmission_tolerance or FOLLOWED,
         )
 
-    def settled(self, entry_error: float) -> "Wanted":
+    def settled(self, entry_error: float) -> "ProxyTolerances":
         """What is left out, by the errors of the entries themselves: no curve need
         follow what is not known.
         """
@@ -78,7 +82,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class FitTrial:
     """One line of the table of error against coefficients."""
 
     coefficients: int
@@ -104,7 +108,7 @@ class ProxyFit:
 
     proxy: Proxy
     notes: tuple[str, ...]
-    table: tuple[Trial, ...]
+    table: tuple[FitTrial, ...]
     turns: float
     polarization_spread: float
     shortfall: str
@@ -112,7 +116,7 @@ class ProxyFit:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Data:
+class FitData:
     """What is fitted: phase and |T| (angle, wavelength, diameter), and the coordinates."""
 
     phase: Array
@@ -122,7 +126,7 @@ class Data:
     angle: Array
 
 
-def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
+def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
     """The proxy of a library.
 
     Every other diameter is fitted (least largest deviation, by Lawson's weights), all
@@ -136,7 +140,7 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
     Raises:
         DomainError: no stretch of diameters without resonance holds enough entries.
     """
-    wanted = wanted or Wanted()
+    wanted = wanted or ProxyTolerances()
     found = _fitted(library, wanted, across_resonances=False)
     if any(width < wanted.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
@@ -148,10 +152,10 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
 
 
 def _fitted(
-    library: PillarLibrary, wanted: Wanted, *, across_resonances: bool
+    library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool
 ) -> ProxyFit:
     """The proxy on one side of all narrow resonances, or across them."""
-    smooth = stretch(
+    smooth = longest_monotonic_branch(
         library,
         least_transmission=wanted.least_transmission,
         least_half_width_um=wanted.least_half_width_um,
@@ -159,7 +163,7 @@ def _fitted(
         across_resonances=across_resonances,
     )
     wanted = wanted.settled(entry_error(library, smooth.diameter_um))
-    data = Data(
+    data = FitData(
         smooth.phase,
         smooth.level,
         smooth.diameter_um,
@@ -181,7 +185,11 @@ def _fitted(
     )
     table = tuple(trial for trial in trials if trial is not None)
     notes = _notes(smooth, data, kept, terms)
-    short = TURNS_BACK if math.isinf(_cost(proxy, wanted)) else shortfall(proxy, wanted)
+    short = (
+        TURNS_BACK
+        if math.isinf(_cost(proxy, wanted))
+        else tolerance_shortfall(proxy, wanted)
+    )
     return ProxyFit(
         proxy,
         notes,
@@ -203,7 +211,7 @@ def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
     )
 
 
-def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
+def _followed(data: FitData, wanted: ProxyTolerances) -> tuple[FitData, Proxy, int]:
     """The domain that a proxy follows, and its number of coefficients: those wanted;
     more where a full turn takes them;
     fewer where so few entries let those wanted swing between them."""
@@ -225,7 +233,9 @@ def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
     return shorter or (kept, proxy, terms)
 
 
-def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] | None:
+def _shorter(
+    data: FitData, wanted: ProxyTolerances, terms: int
+) -> tuple[FitData, Proxy, int] | None:
     """Without the last diameters, beside what bounds the domain, where the tolerances
     are met so; they are excluded as
     the resonance is, up to a tenth of the phase. None where that is not enough."""
@@ -240,7 +250,7 @@ def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] 
     return None
 
 
-def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
+def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> Proxy:
     """The proxy of a library alone; :func:`fit` gives its table of error against
     coefficients too.
     """
@@ -261,7 +271,9 @@ def proxy_of(library: PillarLibrary) -> Proxy:
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
-def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
+def _longest(
+    data: FitData, wanted: ProxyTolerances, terms: int
+) -> tuple[FitData, Proxy]:
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
     tolerances.
     """
@@ -284,11 +296,11 @@ def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
     return _head(data, good), best
 
 
-def shortfall(proxy: Proxy, wanted: Wanted) -> str:
+def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
     """By how much a proxy misses its tolerances, for a person; empty where it meets
     them.
     """
-    if missed(proxy, wanted) <= 1:
+    if tolerance_ratio(proxy, wanted) <= 1:
         return ""
     phase, level = wanted.tolerances
     return (
@@ -298,13 +310,13 @@ def shortfall(proxy: Proxy, wanted: Wanted) -> str:
     )
 
 
-def missed(proxy: Proxy, wanted: Wanted) -> float:
+def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
     """The larger error in units of its tolerance."""
     phase, level = wanted.tolerances
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 
-def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
+def _best(data: FitData, wanted: ProxyTolerances, terms: int) -> Proxy | None:
     """Of the powers of the diameter, the one with the least error in units of the
     tolerances; None where each takes
     |T| below 0 between the entries."""
@@ -315,23 +327,25 @@ def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
     return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
 
 
-def _cost(proxy: Proxy, wanted: Wanted) -> float:
-    """As :func:`missed`; infinite where the phase turns back (the library's does not)."""
+def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
+    """As :func:`tolerance_ratio`; infinite where the phase turns back (the library's does not)."""
     middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
     monotone = all(
         proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}
     )
-    return missed(proxy, wanted) if monotone else math.inf
+    return tolerance_ratio(proxy, wanted) if monotone else math.inf
 
 
-def fit_terms(data: Data, power: int, terms: int) -> Proxy:
+def fit_terms(data: FitData, power: int, terms: int) -> Proxy:
     """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
     many for |T|.
     """
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
     level = _minimax(axes, data.level, terms)
-    high = polynomial.bounds(level, points=64 if level.size > terms else 512)[1]
+    high = polynomial.certified_bounds(level, points=64 if level.size > terms else 512)[
+        1
+    ]
     if high > 1 - HEADROOM:
         level = level * ((1 - HEADROOM) / high)
     errors = [
@@ -351,7 +365,7 @@ def fit_terms(data: Data, power: int, terms: int) -> Proxy:
     )
 
 
-def _axes(data: Data, power: int) -> tuple[Array, Array, Array]:
+def _axes(data: FitData, power: int) -> tuple[Array, Array, Array]:
     """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
     sine = np.sin(data.angle) ** 2
     return (
@@ -415,19 +429,19 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     return best
 
 
-def _trial(data: Data, power: int, coefficients: int) -> Trial | None:
+def _trial(data: FitData, power: int, coefficients: int) -> FitTrial | None:
     """One line of the table; None where |T| falls below 0 between the entries."""
     try:
         proxy = fit_terms(data, power, coefficients // 2)
     except DomainError:
         return None
-    return Trial(
+    return FitTrial(
         coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error
     )
 
 
-def _head(data: Data, count: int) -> Data:
-    return Data(
+def _head(data: FitData, count: int) -> FitData:
+    return FitData(
         data.phase[..., :count],
         data.level[..., :count],
         data.diameter[:count],
@@ -436,11 +450,13 @@ def _head(data: Data, count: int) -> Data:
     )
 
 
-def _turns(data: Data) -> float:
+def _turns(data: FitData) -> float:
     return float(abs(data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
 
 
-def _notes(smooth: Stretch, data: Data, kept: Data, terms: int) -> tuple[str, ...]:
+def _notes(
+    smooth: MonotonicBranch, data: FitData, kept: FitData, terms: int
+) -> tuple[str, ...]:
     if len(kept.diameter) == len(data.diameter):
         return smooth.notes
     return (

@@ -7,10 +7,10 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars import polynomial
-from metalens.pillars.polynomial import Curve
+from metalens.pillars.polynomial import ChebyshevCurve
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
@@ -27,8 +27,8 @@ TURN = 2 * math.pi
 Intervals = tuple[tuple[float, float], ...]
 
 
-def diameter(
-    p: Curve,
+def invert_phase(
+    p: ChebyshevCurve,
     phase_rad: Values,
     *,
     within_um: tuple[float, float] | None,
@@ -44,7 +44,7 @@ def diameter(
         raise DomainError(
             f"within_um = ({low}, {high}), need a range inside the curve's domain ({p.low}, {p.high}) um"
         )
-    if not polynomial.monotone(p, (low, high)):
+    if not polynomial.is_monotonic(p, (low, high)):
         raise DomainError(
             f"the phase is not monotone between {low} and {high} um: no unique diameter; give a narrower within_um"
         )
@@ -56,7 +56,7 @@ def diameter(
 
 
 def _solve(
-    p: Curve,
+    p: ChebyshevCurve,
     phase: Array,
     within: tuple[float, float],
     gap: str,
@@ -64,7 +64,7 @@ def _solve(
 ) -> Array:
     if not np.isfinite(phase).all():
         raise DomainError(f"phase at index {_first(~np.isfinite(phase))} is not finite")
-    ends = polynomial.value(p, np.array(within))
+    ends = polynomial.evaluate_curve(p, np.array(within))
     start, cover = float(ends.min()), float(abs(ends[1] - ends[0]))
     if gap == "refuse" and cover < TURN:
         missing = (phase.astype(float) - start) % TURN > cover + 1e-6
@@ -100,7 +100,9 @@ def _moved(d: Array, excluded: Intervals, within: tuple[float, float]) -> Array:
     return d
 
 
-def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -> Array:
+def _newton(
+    p: ChebyshevCurve, target: Array, start: float, cover: float, table: Array
+) -> Array:
     """Diameters whose phase is start + target: linear in the table, then steps of
     Newton, one as a rule.
 
@@ -113,7 +115,11 @@ def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -
     d = table[index]
     d += place * np.diff(table)[index]
     for _ in range(HALVINGS):
-        missed = polynomial.horner(p.monomials, polynomial.unit(p, d)) - start - target
+        missed = (
+            polynomial.evaluate_horner(p.monomials, polynomial.to_unit_interval(p, d))
+            - start
+            - target
+        )
         if np.abs(missed).max(initial=0.0) < SOLVED_RAD:
             break
         rise = polynomial.slope_of(p, d)
@@ -122,22 +128,22 @@ def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -
     return d
 
 
-def _table(p: Curve, within: tuple[float, float]) -> Array:
+def _table(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
     """(TABLE,) diameters at even steps of the phase, from the end of least phase, by
     bisection.
     """
-    ends = polynomial.value(p, np.array(within))
+    ends = polynomial.evaluate_curve(p, np.array(within))
     target = np.linspace(ends.min(), ends.max(), TABLE)
     left, right = (np.full(TABLE, within[i]) for i in np.argsort(ends))
     for _ in range(HALVINGS):
         middle = (left + right) / 2
-        below = polynomial.value(p, middle) < target
+        below = polynomial.evaluate_curve(p, middle) < target
         left, right = np.where(below, middle, left), np.where(below, right, middle)
     return np.asarray((left + right) / 2)
 
 
 def _torch(
-    p: Curve,
+    p: ChebyshevCurve,
     phase: Any,
     within: tuple[float, float],
     gap: str,
@@ -150,7 +156,7 @@ def _torch(
 
     values = phase.detach().cpu().numpy()
     found = _solve(p, values, within, gap, excluded)
-    rise = torch.from_numpy(polynomial.slope(p, found)).to(phase.device)
+    rise = torch.from_numpy(polynomial.evaluate_slope(p, found)).to(phase.device)
     return torch.from_numpy(found).to(phase.device) + (phase - phase.detach()) / rise
 
 

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 
 CHUNK = 65536  # pillars a pass: its work arrays stay in the cache
 EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class ChebyshevCurve:
     """p(x) with x = (2 D^power - low^power - high^power) / (high^power - low^power), x
     in [-1, 1] on the domain.
 
@@ -51,10 +51,10 @@ class Curve:
         return -1 - self.scale * self.low**self.power
 
     @property
-    def slope(self) -> "Curve":
+    def slope(self) -> "ChebyshevCurve":
         """dp/dx; times :meth:`inner_slope` it is dp/dD."""
         terms = tuple(k * c for k, c in enumerate(self.monomials))[1:] or (0.0,)
-        return Curve(terms, self.low, self.high, self.power)
+        return ChebyshevCurve(terms, self.low, self.high, self.power)
 
     @property
     def inner_slope(self) -> float:
@@ -62,14 +62,16 @@ class Curve:
         return self.scale * self.power
 
 
-def curve(
+def chebyshev_curve(
     coefficients: Array,
     domain: tuple[float, float],
     power: int,
     ceiling: float = math.inf,
-) -> Curve:
+) -> ChebyshevCurve:
     """The curve of 1-D Chebyshev ``coefficients`` on ``domain``."""
-    return Curve(_monomials(tuple(coefficients.tolist())), *domain, power, ceiling)
+    return ChebyshevCurve(
+        _monomials(tuple(coefficients.tolist())), *domain, power, ceiling
+    )
 
 
 @functools.lru_cache(maxsize=256)
@@ -80,7 +82,7 @@ def _monomials(coefficients: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
-def value(p: Curve, diameter: Array) -> Array:
+def evaluate_curve(p: ChebyshevCurve, diameter: Array) -> Array:
     """p(D), shape and dtype of ``diameter``.
 
     Accuracy: of Horner's rule, a few times the rounding of the dtype times the sum of
@@ -89,19 +91,22 @@ def value(p: Curve, diameter: Array) -> Array:
     Raises:
         DomainError: a diameter lies outside the domain, or is not a number.
     """
-    check(p, diameter)
+    check_domain(p, diameter)
     return over_chunks(
-        lambda d: np.minimum(horner(p.monomials, unit(p, d)), p.ceiling), diameter
+        lambda d: np.minimum(
+            evaluate_horner(p.monomials, to_unit_interval(p, d)), p.ceiling
+        ),
+        diameter,
     )
 
 
-def slope(p: Curve, diameter: Array) -> Array:
-    """dp/dD, shape and dtype of ``diameter``; raises as :func:`value`."""
-    check(p, diameter)
+def evaluate_slope(p: ChebyshevCurve, diameter: Array) -> Array:
+    """dp/dD, shape and dtype of ``diameter``; raises as :func:`evaluate_curve`."""
+    check_domain(p, diameter)
     return over_chunks(lambda d: slope_of(p, d), diameter)
 
 
-def pulled_back(p: Curve, diameter: Array, weight: Array) -> Array:
+def pulled_back(p: ChebyshevCurve, diameter: Array, weight: Array) -> Array:
     """``weight`` times dp/dD in one pass; the diameters were checked before, the weight
     may be broadcast.
     """
@@ -118,7 +123,7 @@ def pulled_back(p: Curve, diameter: Array, weight: Array) -> Array:
     return over_chunks(part, diameter, places=True)
 
 
-def check(p: Curve, diameter: Any) -> None:
+def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
     """Refuse diameters (numpy or torch) outside the domain of ``p``."""
     if 0 in diameter.shape:
         return
@@ -130,16 +135,16 @@ def check(p: Curve, diameter: Any) -> None:
         )
 
 
-def slope_of(p: Curve, diameter: Array) -> Array:
+def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
     """dp/dD of one chunk."""
-    rise = horner(p.slope.monomials, unit(p, diameter))
+    rise = evaluate_horner(p.slope.monomials, to_unit_interval(p, diameter))
     rise *= p.inner_slope
     for _ in range(p.power - 1):
         rise *= diameter
     return rise
 
 
-def unit(p: Curve, diameter: Array) -> Array:
+def to_unit_interval(p: ChebyshevCurve, diameter: Array) -> Array:
     """x of one chunk."""
     x = diameter * p.scale
     for _ in range(p.power - 1):
@@ -148,11 +153,11 @@ def unit(p: Curve, diameter: Array) -> Array:
     return x
 
 
-def monotone(p: Curve, within: tuple[float, float]) -> bool:
+def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
     """Whether the curve rises or falls throughout: no root of its slope lies inside
     (certified, not sampled).
     """
-    low, high = unit(p, np.array(within, float))
+    low, high = to_unit_interval(p, np.array(within, float))
     roots = (
         np.polynomial.Polynomial(p.slope.monomials).roots()
         if len(p.monomials) > 2
@@ -166,7 +171,7 @@ def monotone(p: Curve, within: tuple[float, float]) -> bool:
     return bool(np.any(p.slope.monomials) and not inside.any())
 
 
-def horner(monomials: tuple[float, ...], x: Array) -> Array:
+def evaluate_horner(monomials: tuple[float, ...], x: Array) -> Array:
     """Sum of monomials[k] x^k, in the dtype of ``x``."""
     total = np.full_like(x, monomials[-1])
     for c in monomials[-2::-1]:
@@ -203,7 +208,7 @@ def over_chunks(
     return out.reshape(values.shape)
 
 
-def bounds(coefficients: Array, *, points: int = 64) -> tuple[float, float]:
+def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, float]:
     """Certified (lower, upper) bound of a tensor Chebyshev sum on [-1, 1]^n.
 
     With N >= points * degree Chebyshev nodes on the last axis (24 * degree on the

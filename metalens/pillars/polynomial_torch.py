@@ -7,22 +7,22 @@ from typing import Any, cast
 import torch
 
 from metalens.pillars import polynomial
-from metalens.pillars.polynomial import Curve
+from metalens.pillars.polynomial import ChebyshevCurve
 
 
-def value(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+def value(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """p(D) on the device and in the dtype of ``diameter``; differentiable by backward,
     forward and vmap.
     """
     return cast(torch.Tensor, _Polynomial.apply(diameter, p, 0))  # type: ignore[no-untyped-call]
 
 
-def slope(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+def slope(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """dp/dD, differentiable again."""
     return cast(torch.Tensor, _Polynomial.apply(diameter, p, 1))  # type: ignore[no-untyped-call]
 
 
-def _bend(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
+def _bend(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """d²p/dD², in differentiable operations: x' = a D^m gives p'' x'² + p' x''."""
     m = p.power - 1
     bend = value(p.slope.slope, diameter) * (p.inner_slope * diameter**m) ** 2
@@ -39,9 +39,9 @@ class _Polynomial(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(diameter: torch.Tensor, p: Curve, order: int) -> torch.Tensor:
+    def forward(diameter: torch.Tensor, p: ChebyshevCurve, order: int) -> torch.Tensor:
         if diameter.device.type == "cpu":
-            verb = polynomial.slope if order else polynomial.value
+            verb = polynomial.evaluate_slope if order else polynomial.evaluate_curve
             return torch.from_numpy(verb(p, diameter.detach().numpy()))
         return _on_device(diameter, p, order)
 
@@ -77,22 +77,22 @@ class _Polynomial(torch.autograd.Function):
         info: Any,
         in_dims: tuple[Any, ...],
         diameter: torch.Tensor,
-        p: Curve,
+        p: ChebyshevCurve,
         order: int,
     ) -> tuple[Any, Any]:
         return (slope if order else value)(p, diameter), in_dims[0]
 
 
-def _on_device(diameter: torch.Tensor, p: Curve, order: int) -> torch.Tensor:
+def _on_device(diameter: torch.Tensor, p: ChebyshevCurve, order: int) -> torch.Tensor:
     """p(D) (order 0) or dp/dD (order 1) by torch's own operations, on whatever device."""
-    polynomial.check(p, diameter)
+    polynomial.check_domain(p, diameter)
     x = diameter**p.power * p.scale + p.shift
     if order:
         return _horner(p.slope, x) * (p.inner_slope * diameter ** (p.power - 1))
     return _horner(p, x).clamp_max(p.ceiling)
 
 
-def _horner(p: Curve, x: torch.Tensor) -> torch.Tensor:
+def _horner(p: ChebyshevCurve, x: torch.Tensor) -> torch.Tensor:
     total = torch.full_like(x, p.monomials[-1])
     for c in p.monomials[-2::-1]:
         total = total * x + c

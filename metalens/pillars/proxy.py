@@ -9,8 +9,8 @@ from typing import Literal, cast
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars import inverse, polynomial
 from metalens.pillars.inverse import Values
 
@@ -20,7 +20,7 @@ AVERAGED = 65  # diameters over which |t| is averaged
 MOST_ERROR = 0.1
 
 
-def taller(height_um: float, turns: float) -> str:
+def height_hint(height_um: float, turns: float) -> str:
     """What would cover a turn of phase where pillars of this height cover less
     (``turns``), for a person.
     """
@@ -74,7 +74,7 @@ class Proxy:
             raise DomainError(
                 f"proxy domain is {self.domain_um} um, need 0 <= least < largest"
             )
-        least, most = polynomial.bounds(self.transmission_coefficients)
+        least, most = polynomial.certified_bounds(self.transmission_coefficients)
         slack = (
             3e-3 * (most - least) + 1e-12
         )  # the width of the certificate, not of the polynomial
@@ -143,7 +143,7 @@ class Proxy:
             DomainError: the phase is not monotone within ``within_um``, or no pillar
                 has a phase.
         """
-        return inverse.diameter(
+        return inverse.invert_phase(
             self.at(wavelength_um, angle_rad),
             phase_rad,
             within_um=within_um,
@@ -200,17 +200,19 @@ class Proxy:
         """Whether the phase rises or falls throughout: no root of its slope lies inside
         (certified, not sampled).
         """
-        return polynomial.monotone(
+        return polynomial.is_monotonic(
             self.at(wavelength_um, angle_rad), within_um or self.domain_um
         )
 
-    def at(self, wavelength_um: float, angle_rad: float = 0.0) -> polynomial.Curve:
+    def at(
+        self, wavelength_um: float, angle_rad: float = 0.0
+    ) -> polynomial.ChebyshevCurve:
         """The phase as a curve of the diameter alone."""
         return self._curve(self.phase_coefficients, wavelength_um, angle_rad)
 
     def level_at(
         self, wavelength_um: float, angle_rad: float = 0.0
-    ) -> polynomial.Curve:
+    ) -> polynomial.ChebyshevCurve:
         """|T| as a curve of the diameter alone."""
         return self._curve(
             self.transmission_coefficients, wavelength_um, angle_rad, ceiling=1.0
@@ -222,7 +224,7 @@ class Proxy:
         wavelength_um: float,
         angle_rad: float,
         ceiling: float = math.inf,
-    ) -> polynomial.Curve:
+    ) -> polynomial.ChebyshevCurve:
         if coefficients.ndim == 3:
             coefficients = np.asarray(
                 chebyshev.chebval(self._angle_unit(angle_rad), coefficients)
@@ -239,7 +241,7 @@ class Proxy:
             )
         unit = 0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
         row = np.asarray(chebyshev.chebval(unit, coefficients))
-        return polynomial.curve(row, self.domain_um, self.power, ceiling)
+        return polynomial.chebyshev_curve(row, self.domain_um, self.power, ceiling)
 
     def _angle_unit(self, angle_rad: float) -> float:
         if not abs(angle_rad) <= self.max_angle_rad + 1e-9:
@@ -250,7 +252,9 @@ class Proxy:
             1.0, 2 * (math.sin(angle_rad) / math.sin(self.max_angle_rad)) ** 2 - 1
         )
 
-    def _verb(self, verb: str, p: polynomial.Curve, diameter_um: Values) -> Values:
+    def _verb(
+        self, verb: str, p: polynomial.ChebyshevCurve, diameter_um: Values
+    ) -> Values:
         if _is_torch(diameter_um):
             from metalens.pillars import polynomial_torch
 

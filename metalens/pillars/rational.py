@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Rational:
+class RationalFunction:
     """r(x) = sum_j w_j f_j / (x - z_j) over sum_j w_j / (x - z_j); all components share
     their poles.
 
@@ -58,14 +58,14 @@ class Rational:
         return np.asarray(top[finite] / bottom[finite])
 
 
-def fit(
+def fit_rational_aaa(
     x: Array,
     y: Array,
     *,
     tolerance: float,
     terms: int | None = None,
     start: Array | None = None,
-) -> Rational:
+) -> RationalFunction:
     """The rational function of least degree that meets the data within ``tolerance``.
 
     Nakatsukasa, Sète and Trefethen, "The AAA algorithm for rational approximation",
@@ -95,7 +95,9 @@ def fit(
         weights, error = _weights(x, y, support)
         worst = int(np.argmax(error))
         if error[worst] <= tolerance or len(support) >= limit:
-            return Rational(x[support], y[support], weights, float(error[worst]))
+            return RationalFunction(
+                x[support], y[support], weights, float(error[worst])
+            )
         support.append(worst)
 
 

@@ -18,13 +18,13 @@ from metalens.cell import (
     check_subwavelength,
     index,
 )
-from metalens.ground import config, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, ConfigError, DomainError
-from metalens.ground.reading import reader
-from metalens.ground.store import Provenance
-from metalens.pillars.circular import Turned
-from metalens.pillars.circular import check as check_turned
+from metalens.core import config, store
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
+from metalens.pillars.circular import GeometricPhase
+from metalens.pillars.circular import check_geometric_phase as check_turned
 from metalens.pillars.proxy import MOST_ERROR, Proxy
 
 # Hydrogenated amorphous silicon deposited for near-infrared optics: n of 3.5-3.7 and
@@ -210,7 +210,7 @@ class PillarLibrary:
     proxy: Proxy | None = None
     notes: tuple[str, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
-    turned: Turned | None = None
+    turned: GeometricPhase | None = None
 
     def __post_init__(self) -> None:
         shape = (
@@ -251,7 +251,7 @@ class PillarLibrary:
         return float(np.interp(pillars, self.diameter_um, of_size).mean())
 
 
-def check(cell: Cell, sweep: Sweep) -> None:
+def check_sweep(cell: Cell, sweep: Sweep) -> None:
     """Refuse a sweep that cannot be computed, before anything is computed.
 
     Raises:
@@ -261,7 +261,7 @@ def check(cell: Cell, sweep: Sweep) -> None:
     span = sweep.span_um(cell)
     if sweep.lengths_um is not None:
         raise ConfigError(
-            "lengths_um: a library over two sizes is made by metalens.pillars.axes.sweep"
+            "lengths_um: a library over two sizes is made by metalens.pillars.axes.sweep_two_sizes"
         )
     if sweep.light == "circular":
         check_turned(cell, span[1])
@@ -273,7 +273,7 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
     orders that propagate in the cover.
 
     Raises:
-        CellError, MaterialError: as :func:`check`.
+        CellError, MaterialError: as :func:`check_sweep`.
     """
     films = [film.material for film in (*cell.under, *cell.over)]
     layered = [
@@ -333,7 +333,7 @@ def save(path: str | Path, library: PillarLibrary) -> None:
     )
 
 
-@reader
+@typed_reader
 def load(path: str | Path) -> PillarLibrary:
     """Read a library file.
 
@@ -370,7 +370,7 @@ def load(path: str | Path) -> PillarLibrary:
         proxy=Proxy.from_arrays(proxy) if proxy else None,
         notes=tuple(_text(v) for v in arrays["notes"]),
         provenance=stored.provenance,
-        turned=Turned.from_arrays(turned) if turned else None,
+        turned=GeometricPhase.from_arrays(turned) if turned else None,
     )
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DomainError
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
 from metalens.pillars.record import PillarLibrary
 
 LEAST_ENTRIES = 12
@@ -16,7 +16,7 @@ UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stretch:
+class MonotonicBranch:
     """Consecutive diameters without resonance.
 
     diameter_um: (d,). phase: (angle, wavelength, d) rad, unwrapped along every axis.
@@ -35,14 +35,14 @@ class Stretch:
     gaps_um: tuple[tuple[float, float], ...] = ()
 
 
-def stretch(
+def longest_monotonic_branch(
     library: PillarLibrary,
     *,
     least_transmission: float,
     least_half_width_um: float,
     within_um: tuple[float, float] | None = None,
     across_resonances: bool = False,
-) -> Stretch:
+) -> MonotonicBranch:
     """The stretch of most phase over which, at all wavelengths, angles and
     polarisations, |t| stays above
     ``least_transmission``, the phase rises (of openings, which leave less film the
@@ -82,7 +82,7 @@ def stretch(
     )
     mean = t.mean(axis=0)[..., best]
     spread = float(np.abs(t[0] - t[-1])[..., best].max()) / 2
-    return Stretch(
+    return MonotonicBranch(
         d[best],
         _unwrapped(np.angle(mean)),
         np.abs(mean),

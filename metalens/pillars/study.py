@@ -9,23 +9,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from metalens.cell import Blend, Cell, Light, Material, index, materials
-from metalens.ground.arrays import Array
-from metalens.ground.console import Console
-from metalens.ground.errors import CellError, ConfigError
+from metalens.cell import Blend, Cell, Incidence, Material, index, materials
+from metalens.core.arrays import Array
+from metalens.core.console import Console
+from metalens.core.errors import CellError, ConfigError
 from metalens.pillars import engines, workers
-from metalens.pillars.curve import Curve
+from metalens.pillars.curve import ResponseCurve
 from metalens.pillars.proxy import MOST_ERROR
 from metalens.pillars.record import PLAIN, Sweep, check_light
 from metalens.pillars.stretch import REACH, UNKNOWN
-from metalens.pillars.workers import Journal
+from metalens.pillars.workers import SweepJournal
 
 TURN = 2 * math.pi
 SAMPLES = 600
 
 
 @dataclass(frozen=True, slots=True)
-class Study:
+class CellStudy:
     """What is compared.
 
     pitches_um, heights_um, wavelengths_um: every combination.
@@ -104,7 +104,7 @@ class Study:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CellVerdict:
     """One cell at one wavelength.
 
     turns: of phase that the longest smooth stretch covers; from_um, to_um: its
@@ -131,9 +131,12 @@ class Verdict:
     pillar: str
 
 
-def run(
-    study: Study, console: Console | None = None, *, journal: Journal | None = None
-) -> list[Verdict]:
+def run_study(
+    study: CellStudy,
+    console: Console | None = None,
+    *,
+    journal: SweepJournal | None = None,
+) -> list[CellVerdict]:
     """Verdicts on every combination, wavelength by wavelength, then on the chosen cell
     with other materials.
 
@@ -151,14 +154,14 @@ def run(
         check_light(
             study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
         )
-    tried, _ = others(study)
+    tried, _ = other_materials(study)
     shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
     cases = [
         (study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes
     ]
-    journal = journal or Journal(None)
+    journal = journal or SweepJournal(None)
     verdicts = _judged(study, cases, journal, console or Console(quiet=True))
-    best = choice(study, verdicts)
+    best = best_cell(study, verdicts)
     if best is None:
         return verdicts
     cells = [study.made(*best, other) for other in tried]
@@ -168,7 +171,7 @@ def run(
     return verdicts + _judged(study, again, journal, Console(quiet=True))
 
 
-def others(study: Study) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Other materials that are tried, without the study's own; and those whose sources
     lack a wavelength.
 
@@ -178,7 +181,7 @@ def others(study: Study) -> tuple[tuple[str, ...], tuple[str, ...]]:
     named_else = [
         name for name in dict.fromkeys(study.others) if name != study.material
     ]
-    ranges = {name: materials.material(name).range_um for name in named_else}
+    ranges = {name: materials.find_material(name).range_um for name in named_else}
     held = [
         all(low <= w <= high for w in study.wavelengths_um)
         for low, high in ranges.values()
@@ -188,28 +191,33 @@ def others(study: Study) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _judged(
-    study: Study, cases: list[tuple[Cell, float]], journal: Journal, console: Console
-) -> list[Verdict]:
+    study: CellStudy,
+    cases: list[tuple[Cell, float]],
+    journal: SweepJournal,
+    console: Console,
+) -> list[CellVerdict]:
     """One rational curve t(D) a case, on all cores."""
     tasks = []
     for cell, wavelength in cases:
         span = _span(study, cell)
-        engine = engines.choose(cell)
+        engine = engines.choose_engine(cell)
         tasks.append(
             workers.curves_task(
                 cell,
-                [Light(wavelength)],
+                [Incidence(wavelength)],
                 span,
                 tolerance=study.tolerance,
                 engine=engine,
             )
         )
     found = journal.run(tasks, console, "cells")
-    made = [workers.curves(one, tolerance=study.tolerance)[0] for one in found]
-    return [judge(study, *case, curve) for case, curve in zip(cases, made, strict=True)]
+    made = [workers.solve_curves(one, tolerance=study.tolerance)[0] for one in found]
+    return [
+        judge_cell(study, *case, curve) for case, curve in zip(cases, made, strict=True)
+    ]
 
 
-def _span(study: Study, cell: Cell) -> tuple[float, float]:
+def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
     """(least, largest) printable size.
 
     Raises:
@@ -227,7 +235,9 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
     return low, high
 
 
-def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdict:
+def judge_cell(
+    study: CellStudy, cell: Cell, wavelength_um: float, curve: ResponseCurve
+) -> CellVerdict:
     """The smooth stretch that covers most phase on one curve."""
     d = np.linspace(
         curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES
@@ -255,7 +265,7 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
         "the printable range"
     ]
     run = slice(start, stop)
-    return Verdict(
+    return CellVerdict(
         cell.pitch_um,
         cell.height_um,
         wavelength_um,
@@ -267,7 +277,7 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
         " and ".join(why),
         max_angle_deg(cell, wavelength_um),
         float(error[run].max(initial=0.0)),
-        named(cell.pillar),
+        material_name(cell.pillar),
     )
 
 
@@ -304,7 +314,9 @@ def _mean_over_phase(phase: Array, power: Array) -> float:
     return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
 
 
-def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
+def study_markdown(
+    study: CellStudy, verdicts: list[CellVerdict], *, command: str
+) -> str:
     """The study as a page with one table a wavelength: turns covered (least |t|), pitch
     across, height down.
     """
@@ -330,12 +342,12 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
                 [v for v in _own(study, verdicts) if v.wavelength_um == wavelength],
             ),
         ]
-    missed = unsure(study, verdicts)
+    missed = uncertain_entries(study, verdicts)
     lines += ["", missed[0].upper() + missed[1:] + "."] if missed else []
     return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
 
 
-def unsure(study: Study, verdicts: Iterable[Verdict]) -> str:
+def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
     """On how many stretches an error bar of t lies above the tolerance, in words; empty
     where on none.
     """
@@ -351,15 +363,18 @@ def unsure(study: Study, verdicts: Iterable[Verdict]) -> str:
     )
 
 
-def _subject(study: Study) -> str:
+def _subject(study: CellStudy) -> str:
     """What the pillars are, in words."""
     if study.cell is None:
-        return f"Round pillars of {named(study.pillar)} on fused silica in air"
-    substrate, cover = named(study.cell.substrate), named(study.cell.cover)
-    return f"Pillars of {named(study.material)} on {substrate} under {cover}: {study.cell.described}"
+        return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
+    substrate, cover = (
+        material_name(study.cell.substrate),
+        material_name(study.cell.cover),
+    )
+    return f"Pillars of {material_name(study.material)} on {substrate} under {cover}: {study.cell.described}"
 
 
-def _limits(study: Study) -> str:
+def _limits(study: CellStudy) -> str:
     """What is printed, in words."""
     least, gap = (
         f"{1e3 * study.min_diameter_um:.4g} nm",
@@ -370,7 +385,7 @@ def _limits(study: Study) -> str:
     return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
 
 
-def named(material: Material) -> str:
+def material_name(material: Material) -> str:
     """A material in words."""
     if isinstance(material, Blend):
         mixed = f" with {material.share:.0%} {material.other}" if material.other else ""
@@ -382,11 +397,11 @@ def named(material: Material) -> str:
     )
 
 
-def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    return [v for v in verdicts if v.pillar == named(study.material)]
+def _own(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[CellVerdict]:
+    return [v for v in verdicts if v.pillar == material_name(study.material)]
 
 
-def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
+def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
     found = {(v.height_um, v.pitch_um): v for v in verdicts}
     head = (
         "| height \\ pitch (nm) | "
@@ -406,7 +421,9 @@ def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
     return lines
 
 
-def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
+def best_cell(
+    study: CellStudy, verdicts: list[CellVerdict]
+) -> tuple[float, float] | None:
     """(pitch, height) in um that covers a full turn at every wavelength with most turns
     at the worst of them, at the
     least height; None where no cell does."""
@@ -423,9 +440,9 @@ def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
     return best[1], best[0]
 
 
-def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
+def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
     waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
-    best = choice(study, verdicts)
+    best = best_cell(study, verdicts)
     if best is None:
         return [f"No cell covers a full turn at {waves} nm."]
     found = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
@@ -443,19 +460,23 @@ def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
             f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
             f"order up to {v.max_angle_deg:.0f} deg"
         )
-    _, outside = others(study)
+    _, outside = other_materials(study)
     return lines + [
         f"- {name} was not tried: its source does not hold {waves} nm"
         for name in outside
     ]
 
 
-def rounded(value: object) -> object:
+def round_to_tolerance(value: object) -> object:
     """Six significant digits: what the tolerance carries, and the same text on any
     machine.
     """
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
-    return [rounded(v) for v in value] if isinstance(value, list | tuple) else value
+        return {k: round_to_tolerance(v) for k, v in value.items()}
+    return (
+        [round_to_tolerance(v) for v in value]
+        if isinstance(value, list | tuple)
+        else value
+    )

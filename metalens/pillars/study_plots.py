@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from metalens.ground import store
-from metalens.ground.store import replacing
-from metalens.pillars.study import Study, Verdict, markdown, rounded
+from metalens.core import store
+from metalens.core.store import replace_atomically
+from metalens.pillars.study import (
+    CellStudy,
+    CellVerdict,
+    round_to_tolerance,
+    study_markdown,
+)
 
 if TYPE_CHECKING:
     from metalens.pillars.fit import ProxyFit
@@ -20,18 +25,21 @@ DEG, NM = 180 / np.pi, 1e3
 
 
 def write_study(
-    folder: Path, study: Study, verdicts: list[Verdict], *, command: str
+    folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
 ) -> None:
     """cell_study.json, README.md and cell_study.png in ``folder``, which must exist."""
     values = {"study": asdict(study), "verdicts": [asdict(v) for v in verdicts]}
     store.write_text(
-        folder / "cell_study.json", json.dumps(rounded(values), indent=1) + "\n"
+        folder / "cell_study.json",
+        json.dumps(round_to_tolerance(values), indent=1) + "\n",
     )
-    store.write_text(folder / "README.md", markdown(study, verdicts, command=command))
+    store.write_text(
+        folder / "README.md", study_markdown(study, verdicts, command=command)
+    )
     study_figure(folder / "cell_study.png", study, verdicts)
 
 
-def study_figure(path: Path, study: Study, verdicts: list[Verdict]) -> None:
+def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
     """Turns covered over pitch and height, a panel a wavelength; the line is one full
     turn.
     """
@@ -138,5 +146,5 @@ def _residuals(panel: Any, library: "PillarLibrary", made: "ProxyFit") -> None:
 
 
 def _write(figure: Figure, path: Path) -> None:
-    with replacing(path) as part:
+    with replace_atomically(path) as part:
         figure.savefig(part, format="png", metadata={"Software": "metalens"})

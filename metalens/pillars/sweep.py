@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from metalens.cell import Cell, Light
-from metalens.ground import config
-from metalens.ground.arrays import Array
-from metalens.ground.console import Console
-from metalens.ground.store import Provenance
+from metalens.cell import Cell, Incidence
+from metalens.core import config
+from metalens.core.arrays import Array
+from metalens.core.console import Console
+from metalens.core.store import Provenance
 from metalens.pillars import engines, few_nodes, workers
-from metalens.pillars.curve import Curve
+from metalens.pillars.curve import ResponseCurve
 from metalens.pillars.few_nodes import Rows
-from metalens.pillars.record import PillarLibrary, Sweep, check
-from metalens.pillars.workers import Journal, Result, Task
+from metalens.pillars.record import PillarLibrary, Sweep, check_sweep
+from metalens.pillars.workers import Result, SweepJournal, Task
 
 AROUND = (
     -3.0,
@@ -51,12 +51,12 @@ def sweep(
             it, to the same result.
 
     Raises:
-        CellError, MaterialError: see :func:`metalens.pillars.record.check`.
+        CellError, MaterialError: see :func:`metalens.pillars.record.check_sweep`.
     """
     settings = settings or Sweep()
     if wavelengths_um is not None:
         settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
-    check(cell, settings)
+    check_sweep(cell, settings)
     settings = settings.settled(cell)
     return _run(cell, settings, console=console, checkpoint=checkpoint)
 
@@ -71,13 +71,13 @@ def _run(
     the tolerance are solved too, and single entries that are still above it one by one.
     """
     console = console or Console(quiet=True)
-    engine = engines.choose(cell, sweep.engine)  # type: ignore[arg-type]
-    journal = Journal(checkpoint, cell, sweep)
+    engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
+    journal = SweepJournal(checkpoint, cell, sweep)
     span = sweep.span_um(cell)
     normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
 
-    def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
-        groups = _together(lights, engines.upright(cell, engine))
+    def solved(lights: list[Incidence], label: str) -> dict[Incidence, ResponseCurve]:
+        groups = _together(lights, engines.has_upright_walls(cell, engine))
         tasks = [
             workers.curves_task(cell, some, span, tolerance=sweep.bar, engine=engine)
             for some in groups
@@ -86,20 +86,20 @@ def _run(
         made = [
             curve
             for one in results
-            for curve in workers.curves(one, tolerance=sweep.bar)
+            for curve in workers.solve_curves(one, tolerance=sweep.bar)
         ]
         return dict(zip(itertools.chain(*groups), made, strict=True))
 
-    first = few_nodes.lights(
+    first = few_nodes.plane_waves(
         sweep,
-        few_nodes.picks(sweep.wavelengths_um),
-        few_nodes.picks(sweep.angles_deg),
+        few_nodes.pick_nodes(sweep.wavelengths_um),
+        few_nodes.pick_nodes(sweep.angles_deg),
         normal,
     )
     curves = solved(first, "curves")
     diameters = _diameters(span, sweep.samples, list(curves.values()))
     rows = {light: _evaluate(curve, diameters) for light, curve in curves.items()}
-    full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
+    full = few_nodes.complete_sweep(sweep, rows, _poles(curves), diameters, normal)
     weak = [
         light
         for light, row in full.items()
@@ -109,12 +109,12 @@ def _run(
         more = solved(weak, "more curves")
         curves |= more
         rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
-        full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
+        full = few_nodes.complete_sweep(sweep, rows, _poles(curves), diameters, normal)
     extra = _points(cell, sweep, engine, diameters, full, curves)
     for task, result in zip(
         extra, journal.run(extra, console, "entries one by one"), strict=True
     ):
-        _replace(full[Light(*task["lights"][0])], diameters, result)
+        _replace(full[Incidence(*task["lights"][0])], diameters, result)
     solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(
         len(t["diameters_um"]) for t in extra
     )
@@ -123,14 +123,14 @@ def _run(
     return made
 
 
-def _together(lights: list[Light], share: bool) -> list[list[Light]]:
+def _together(lights: list[Incidence], share: bool) -> list[list[Incidence]]:
     """Where lights of one wavelength and direction share their work, these in one task,
     else each in its own.
 
     Oblique light comes first: it takes several times as long as normal incidence, which
     then fills the end.
     """
-    groups: dict[object, list[Light]] = {}
+    groups: dict[object, list[Incidence]] = {}
     for one in sorted(lights, key=lambda light: -light.angle_rad):
         groups.setdefault(
             (one.wavelength_um, one.angle_rad) if share else one, []
@@ -138,7 +138,7 @@ def _together(lights: list[Light], share: bool) -> list[list[Light]]:
     return list(groups.values())
 
 
-def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
+def _poles(curves: dict[Incidence, ResponseCurve]) -> dict[Incidence, Array]:
     return {light: curve.resonances() for light, curve in curves.items()}
 
 
@@ -146,12 +146,14 @@ def _misses(row: Array, sweep: Sweep) -> Array:
     return np.asarray(row[2].real > sweep.bar)
 
 
-def _evaluate(curve: Curve, diameters: Array) -> Array:
+def _evaluate(curve: ResponseCurve, diameters: Array) -> Array:
     value, error = curve(diameters)
     return np.stack([value[:, 0], value[:, 1], error])
 
 
-def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> Array:
+def _diameters(
+    span: tuple[float, float], samples: int, curves: list[ResponseCurve]
+) -> Array:
     """Even samples, and more where t turns fast: around every resonance, on its own
     scale.
     """
@@ -173,7 +175,7 @@ def _points(
     engine: str,
     diameters: Array,
     full: Rows,
-    curves: dict[Light, Curve],
+    curves: dict[Incidence, ResponseCurve],
 ) -> list[Task]:
     """Tasks for the entries whose error bar is above the tolerance, but where a solve
     by itself is no better.
@@ -181,7 +183,7 @@ def _points(
     tasks = []
     for light, row in full.items():
         misses = _misses(row, sweep)
-        if light in curves and engines.at_the_finest(
+        if light in curves and engines.is_at_finest_discretization(
             cell, curves[light].nodes.error, sweep.bar * workers.SOLVE_SHARE
         ):
             misses &= curves[light].solver_error(diameters) <= sweep.bar
@@ -213,7 +215,7 @@ def _library(
     sweep: Sweep,
     effort: tuple[str, int],
     diameters: Array,
-    curves: dict[Light, Curve],
+    curves: dict[Incidence, ResponseCurve],
     full: Rows,
     normal: few_nodes.Normal,
 ) -> PillarLibrary:
@@ -226,7 +228,7 @@ def _library(
     t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
     resonances = []
     for i, j, k in np.ndindex(*shape[:3]):
-        light = few_nodes.light(
+        light = few_nodes.plane_wave(
             sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i], normal
         )
         row = full[light]

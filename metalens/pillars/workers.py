@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 
 from metalens import __version__
-from metalens.cell import Cell, Light, Response, materials
-from metalens.ground import config, executor, manifest, reading, store
-from metalens.ground.console import Console
+from metalens.cell import Cell, Incidence, Response, materials
+from metalens.core import config, executor, manifest, reading, store
+from metalens.core.console import Console
 from metalens.pillars import curve as reduced
-from metalens.pillars.curve import Curve, Nodes
-from metalens.pillars.engines import precise, smooth_all
+from metalens.pillars.curve import ResponseCurve, SolvedNodes
+from metalens.pillars.engines import (
+    solve_to_tolerance,
+    solvers_at_common_discretization,
+)
 
 SOLVE_SHARE, FIT_SHARE = (
     0.5,
@@ -28,14 +31,14 @@ Result = dict[str, Any]
 
 def curves_task(
     cell: Cell,
-    lights: Sequence[Light],
+    lights: Sequence[Incidence],
     span_um: tuple[float, float],
     *,
     tolerance: float,
     engine: str,
 ) -> Task:
     """Exact solves of one curve t(D) a light, chosen adaptively
-    (:func:`metalens.pillars.curve.explore`).
+    (:func:`metalens.pillars.curve.sample_adaptively`).
 
     Lights of one wavelength and direction share the mesh, and the homogeneous modes at
     the diameters that every curve
@@ -46,7 +49,7 @@ def curves_task(
 
 def points_task(
     cell: Cell,
-    light: Light,
+    light: Incidence,
     diameters_um: list[float],
     *,
     tolerance: float,
@@ -64,27 +67,27 @@ def jones_task(
     """Both polarisations of one pillar at normal incidence, at a fixed truncation; the
     result has a row an element.
     """
-    light = Light(wavelength_um)
+    light = Incidence(wavelength_um)
     return _task("jones", cell, [light], tolerance, "rcwa") | {
         "size_um": size_um,
         "harmonics": reach,
     }
 
 
-def work(task: Task) -> Result:
+def run_task(task: Task) -> Result:
     """Do one task; the result holds only JSON types."""
     cell = config.loads(task["cell"], Cell, where="task")
-    lights = [Light(*one) for one in task["lights"]]
+    lights = [Incidence(*one) for one in task["lights"]]
     if task["kind"] == "jones":
         return _both_polarizations(cell, task["size_um"], lights[0], task["harmonics"])
     about: dict[str, Any] = {"tolerance": task["tolerance"], "engine": task["engine"]}
     if task["kind"] == "points":
-        solve = precise(cell, lights[0], **about)
+        solve = solve_to_tolerance(cell, lights[0], **about)
         return _listed(task["diameters_um"], [solve(d) for d in task["diameters_um"]])
     low, high = task["span_um"]
     about["tolerance"] *= SOLVE_SHARE
-    solves = smooth_all(cell, lights, (low, high), **about)
-    for diameter in reduced.starts(
+    solves = solvers_at_common_discretization(cell, lights, (low, high), **about)
+    for diameter in reduced.starting_diameters(
         low, high
     ):  # every curve begins with them: one after the other they share modes
         for solve in solves:
@@ -106,7 +109,7 @@ def _explored(
     tolerance: float,
     known_um: list[float],
 ) -> Result:
-    nodes = reduced.explore(
+    nodes = reduced.sample_adaptively(
         solve, *span_um, tolerance=tolerance, cheaper_um=np.array(known_um)
     )
     order = nodes.diameter_um.tolist()
@@ -122,7 +125,7 @@ def _joined(parts: list[Result]) -> Result:
     return whole | {"counts": [len(part["diameter_um"]) for part in parts]}
 
 
-def curves(result: Result, *, tolerance: float) -> list[Curve]:
+def solve_curves(result: Result, *, tolerance: float) -> list[ResponseCurve]:
     """The curves of a task of curves, of this tolerance, one a light."""
     columns = [
         np.array(result["diameter_um"]),
@@ -135,12 +138,14 @@ def curves(result: Result, *, tolerance: float) -> list[Curve]:
             one[stop - result["counts"][place] : stop] for one in columns
         )
         end = result["converged"][place], result["reason"][place]
-        nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, *end)
-        made.append(reduced.curve(nodes, tolerance=FIT_SHARE * tolerance))
+        nodes = SolvedNodes(diameter, np.stack([t, r], 1), error, energy, *end)
+        made.append(reduced.fit_response_curve(nodes, tolerance=FIT_SHARE * tolerance))
     return made
 
 
-def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) -> Result:
+def _both_polarizations(
+    cell: Cell, size_um: float, light: Incidence, reach: int
+) -> Result:
     """Rows xx, xy, yx, yy: the polarisation that leaves, then that comes."""
     from metalens.rcwa import jones
 
@@ -157,7 +162,7 @@ def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) ->
     return _listed([size_um] * 4, made)
 
 
-def run(
+def run_tasks(
     tasks: list[Task], *, processes: int | None = None
 ) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task as it is done, on all cores.
@@ -166,11 +171,11 @@ def run(
         MetalensError: what a task raised, of the same class; WorkerError: a worker
             died.
     """
-    return executor.run(work, tasks, processes=processes)
+    return executor.run_parallel(run_task, tasks, processes=processes)
 
 
 def _task(
-    kind: str, cell: Cell, lights: Sequence[Light], tolerance: float, engine: str
+    kind: str, cell: Cell, lights: Sequence[Incidence], tolerance: float, engine: str
 ) -> Task:
     waves = [
         [one.wavelength_um, one.angle_rad, one.polarization, one.azimuth_rad]
@@ -229,7 +234,7 @@ def _entry(line: str) -> tuple[str, Result] | None:
     )
 
 
-class Journal:
+class SweepJournal:
     """Finished tasks as JSON lines beside the output, so that interrupted work goes on
     where it stopped.
 
@@ -248,11 +253,13 @@ class Journal:
     def __init__(self, path: Path | None, *about: Any) -> None:
         self._path = path
         self._known: dict[str, Result] = {}
-        self._read = {file: reading.stamp(file) for file in material_files(about)}
+        self._read = {file: reading.file_stamp(file) for file in material_files(about)}
         if path is not None:
             read = {str(file): reading.sha256(file) for file in self._read}
             title = json.dumps([__version__, *map(config.dumps, about), read])
-            self._known = dict(filter(None, map(_entry, manifest.journal(path, title))))
+            self._known = dict(
+                filter(None, map(_entry, manifest.open_journal(path, title)))
+            )
 
     def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
         """Results of the tasks in order; those in the journal are not computed again."""
@@ -262,7 +269,7 @@ class Journal:
             console.say(
                 f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before"
             )
-        stream = run([tasks[i] for i in left])
+        stream = run_tasks([tasks[i] for i in left])
         for i, result in console.track(stream, total=len(left), label=label):
             self._keep(keys[left[i]], result)
         return [self._known[key] for key in keys]

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.propagate.geometry import Case
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.propagate.geometry import PropagationCase
 from metalens.propagate.paths import from_source, to_sensor
 
 LENGTHS = (
@@ -43,7 +43,7 @@ CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 
 
 @dataclass(frozen=True, slots=True)
-class Blocks:
+class AxisBlocks:
     """Pillars along one axis in blocks of ``length``, ``nodes`` points in each.
 
     The last block is as long as the others and overlaps the one before it; every pillar
@@ -72,7 +72,9 @@ class Blocks:
     def places(self) -> Array:
         """(nodes,) positions of the nodes from the block's middle, in half-lengths."""
         return np.asarray(
-            legendre.nodes(self.nodes)[0] if self.nodes < self.length else self.along
+            legendre.gauss_legendre_nodes(self.nodes)[0]
+            if self.nodes < self.length
+            else self.along
         )
 
     @property
@@ -85,7 +87,9 @@ class Blocks:
         """(nodes, length): share of a pillar's light that each node gets."""
         if self.nodes == self.length:
             return np.eye(self.length)
-        return np.ascontiguousarray(legendre.interpolation(self.nodes, self.along).T)
+        return np.ascontiguousarray(
+            legendre.interpolation_matrix(self.nodes, self.along).T
+        )
 
     def middles_um(self, pitch_um: float) -> Array:
         """(block,) middles of the blocks from the lens axis."""
@@ -102,8 +106,8 @@ class Blocks:
 Kernel = Callable[[Any, Any], Array]
 
 
-def choose(
-    case: Case,
+def choose_blocks(
+    case: PropagationCase,
     reference: float,
     kernel: Kernel,
     tolerance: float,
@@ -111,7 +115,7 @@ def choose(
     *,
     nodes: int = NODES,
     more: int = 0,
-) -> tuple[Blocks, Blocks]:
+) -> tuple[AxisBlocks, AxisBlocks]:
     """(rows, columns) blocks that cost least.
 
     Args:
@@ -136,26 +140,33 @@ def choose(
 
 
 def _needed(
-    case: Case, axis: int, length: int, kernel: Kernel, tolerance: float, more: int
-) -> Blocks:
+    case: PropagationCase,
+    axis: int,
+    length: int,
+    kernel: Kernel,
+    tolerance: float,
+    more: int,
+) -> AxisBlocks:
     """Blocks of a length along an axis with as few nodes as the kernel needs at its
     ends and its middle.
     """
     if length < 4:
-        return Blocks(case.shape[axis], length, length)
+        return AxisBlocks(case.shape[axis], length, length)
     step_um = case.steps_um[axis]
-    bases = Blocks(case.shape[axis], length, length).middles_um(step_um)
+    bases = AxisBlocks(case.shape[axis], length, length).middles_um(step_um)
     middles = bases[[0, len(bases) // 2, -1], None, None]
     across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
-    line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * step_um
+    line = (
+        middles + legendre.gauss_legendre_nodes(PROBES)[0] * (length - 1) / 2 * step_um
+    )
     values = kernel(line, across) if axis == 0 else kernel(across, line)
-    count = max(legendre.needed(values, tolerance), 2) + more
-    return Blocks(
+    count = max(legendre.needed_node_count(values, tolerance), 2) + more
+    return AxisBlocks(
         case.shape[axis], length, length if count > PROBES else min(count, length)
     )
 
 
-def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
+def carrier_turns(case: PropagationCase, reference: float, x: Any, y: Any) -> Any:
     """Source path (of the reference depth) plus sensor path (to the window centre), in
     wavelengths.
     """
@@ -164,9 +175,11 @@ def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
     ) / case.wavelength_um
 
 
-def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
+def _carried(
+    case: PropagationCase, reference: float, length: int, itemsize: int
+) -> bool:
     """Whether polynomials over blocks of ``length`` rows are as exact as asked."""
-    rows = Blocks(case.shape[0], length, length)
+    rows = AxisBlocks(case.shape[0], length, length)
     picked = np.unique([0, rows.count // 4, rows.count // 2, rows.count - 1])
     x = case.pillars_um[1][:: max(1, case.shape[1] // 16)]
     y = rows.middles_um(case.steps_um[0])[picked, None, None]
@@ -178,7 +191,11 @@ def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
 
 
 def _powers(
-    case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int
+    case: PropagationCase,
+    reference: float,
+    rows: tuple[Any, float],
+    x: Array,
+    order: int,
 ) -> Array:
     """(block, order, x) power coefficients of the carrier in turns along the rows of
     blocks at ``rows`` middles.
@@ -209,14 +226,14 @@ def _to_powers(order: int) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Carrier:
+class ReferencePhase:
     """The known phase in turns, c(u) = Σ_n coefficients[n] uⁿ for u in [-1, 1] along
     the rows of a block.
     """
 
-    case: Case
+    case: PropagationCase
     reference: float
-    rows: Blocks
+    rows: AxisBlocks
     chunk: int
 
     @property

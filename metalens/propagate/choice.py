@@ -3,11 +3,11 @@
 import functools
 from dataclasses import dataclass
 
-from metalens.ground.errors import PropagationError
-from metalens.ground.threads import one_blas_thread
+from metalens.core.errors import PropagationError
+from metalens.core.threads import one_blas_thread
 from metalens.propagate import grids
-from metalens.propagate.geometry import Case, windows
-from metalens.propagate.nodes import MOST_NODES, Layout, layout
+from metalens.propagate.geometry import PropagationCase, split_window
+from metalens.propagate.nodes import MOST_NODES, WindowLayout, plan_layout
 
 # seconds on one core: per pillar and point, and per pillar, point and depth of the
 # exact sum; per pillar of the
@@ -19,21 +19,25 @@ _PLAN_SECONDS = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class MethodChoice:
     """method: ``exact``, ``windowed``, ``tiled`` or ``wide``; tiles: windows that are
     computed apart; seconds:
     expected, one core, planning included."""
 
     method: str
     reason: str
-    tiles: tuple[tuple[Case, ...], ...]
+    tiles: tuple[tuple[PropagationCase, ...], ...]
     seconds: float
 
 
 @functools.lru_cache(maxsize=1024)
-def choose(
-    case: Case, tolerance: float, *, differentiable: bool = False, moving: bool = False
-) -> Choice:
+def choose_method(
+    case: PropagationCase,
+    tolerance: float,
+    *,
+    differentiable: bool = False,
+    moving: bool = False,
+) -> MethodChoice:
     """The cheapest method that meets the tolerance.
 
     Args:
@@ -46,10 +50,10 @@ def choose(
     """
     pillars = case.shape[0] * case.shape[1]
     exact = exact_seconds(case)
-    apart = grids.seconds(case, tolerance) + _PLAN_SECONDS + 2 * pillars * _PILLAR
+    apart = grids.expected_cost(case, tolerance) + _PLAN_SECONDS + 2 * pillars * _PILLAR
     if not moving and apart < exact and grids.is_wide(case, tolerance):
         reason = f"wide window by Fourier transforms: {_told(apart)} s, exact sum {_told(exact)} s"
-        return Choice("wide", reason, ((case,),), apart)
+        return MethodChoice("wide", reason, ((case,),), apart)
     with one_blas_thread():
         cut = _windows(case, tolerance)
         found = [_layout(window, tolerance) for row in cut for window in row]
@@ -64,15 +68,15 @@ def choose(
         reason = (
             f"exact sum: {size} take {_told(exact)} s, windowed {_told(windowed)} s"
         )
-        return Choice("exact", reason, ((case,),), exact)
+        return MethodChoice("exact", reason, ((case,),), exact)
     times = f"{_told(windowed)} s, exact sum {_told(exact)} s"
     if len(found) > 1:
         why = f"the whole window would need over {MOST_NODES} nodes or a large table"
-        return Choice(
+        return MethodChoice(
             "tiled", f"windowed in {len(found)} tiles: {why}; {times}", cut, windowed
         )
     rows, columns = plans[0][1]
-    return Choice(
+    return MethodChoice(
         "windowed", f"windowed: {rows} x {columns} nodes, {times}", cut, windowed
     )
 
@@ -82,7 +86,7 @@ def _told(seconds: float) -> str:
     return f"{float(f'{seconds:.2g}'):g}"
 
 
-def exact_seconds(case: Case) -> float:
+def exact_seconds(case: PropagationCase) -> float:
     """Expected time of the exact sum."""
     each, depth = _EXACT
     pillars = case.shape[0] * case.shape[1]
@@ -93,17 +97,19 @@ def exact_seconds(case: Case) -> float:
     )
 
 
-def _points(case: Case) -> int:
+def _points(case: PropagationCase) -> int:
     return case.samples[0] * case.samples[1]
 
 
-def _windows(case: Case, tolerance: float) -> tuple[tuple[Case, ...], ...]:
+def _windows(
+    case: PropagationCase, tolerance: float
+) -> tuple[tuple[PropagationCase, ...], ...]:
     """The window, cut into equal parts until each can be planned with a useful number
     of nodes.
     """
     parts = 1
     while True:
-        rows = windows(case, parts)
+        rows = split_window(case, parts)
         if all(
             _layout(window, tolerance) is not None
             for window in (rows[0][0], rows[-1][-1])
@@ -116,8 +122,8 @@ def _windows(case: Case, tolerance: float) -> tuple[tuple[Case, ...], ...]:
         parts *= 2
 
 
-def _layout(case: Case, tolerance: float) -> Layout | None:
+def _layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
     try:
-        return layout(case, tolerance)
+        return plan_layout(case, tolerance)
     except PropagationError:
         return None

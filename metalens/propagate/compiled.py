@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numba.extending import overload
 
-from metalens.propagate.sincos import turns
+from metalens.propagate.sincos import sincos_turns
 
 EXACT = {
     "contract",
@@ -51,7 +51,7 @@ def _whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
     return _single if like.dtype == numba.float32 else _double
 
 
-def carried(table: Any, u: Any, j: Any, like: Any) -> Any:
+def reference_phase_at(table: Any, u: Any, j: Any, like: Any) -> Any:
     """Carrier of column j at row position u of a block; compiled loops choose while
     compiled.
     """
@@ -73,7 +73,7 @@ def _long(table, u, j, like):  # type: ignore[no-untyped-def]
     )
 
 
-@overload(carried, inline="always")
+@overload(reference_phase_at, inline="always")
 def _carried(table, u, j, like):  # type: ignore[no-untyped-def]
     return _short if like.dtype == numba.float32 else _long
 
@@ -82,16 +82,16 @@ def _carried(table, u, j, like):  # type: ignore[no-untyped-def]
 def _phasors(phase, table, u, re, im):  # type: ignore[no-untyped-def]
     """Cosine and sine of phase plus carrier along a row."""
     for j in range(phase.size):
-        t = whole_turns_off(phase[j], re) + carried(table, u, j, re)
-        re[j], im[j] = turns(t - np.rint(t), re)
+        t = whole_turns_off(phase[j], re) + reference_phase_at(table, u, j, re)
+        re[j], im[j] = sincos_turns(t - np.rint(t), re)
 
 
 @numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)
 def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
     """Transmission times the phasors along a row."""
     for j in range(phase.size):
-        t = whole_turns_off(phase[j], re) + carried(table, u, j, re)
-        c, s = turns(t - np.rint(t), re)
+        t = whole_turns_off(phase[j], re) + reference_phase_at(table, u, j, re)
+        c, s = sincos_turns(t - np.rint(t), re)
         re[j], im[j] = level[j] * c, level[j] * s
 
 
@@ -165,7 +165,7 @@ def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def gather(phase, level, table, u, shares, bases, first, out):  # type: ignore[no-untyped-def]
+def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ignore[no-untyped-def]
     """Light of some block rows at their nodes, added to ``out`` (block row · node,
     re/im, column node).
 
@@ -272,8 +272,10 @@ def _scaled(row, re, im, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def spread(phase, level, table, u, shares, bases, first, grad, out_phase, out_level):  # type: ignore[no-untyped-def]
-    """Gradients at the nodes, as ``out`` of :func:`gather`, to those of phase and
+def interpolate_to_pillars(  # type: ignore[no-untyped-def]
+    phase, level, table, u, shares, bases, first, grad, out_phase, out_level
+):
+    """Gradients at the nodes, as ``out`` of :func:`grid_pillars`, to those of phase and
     transmission; empty arrays: none.
     """
     (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]

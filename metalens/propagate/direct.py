@@ -10,16 +10,16 @@ from typing import Any
 import numba
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.threads import split
-from metalens.propagate.geometry import Case, check_aperture
-from metalens.propagate.layered import add_rays, media_arrays, product
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.threads import run_split
+from metalens.propagate.geometry import PropagationCase, check_aperture
+from metalens.propagate.layered import add_rays, complex_product, media_arrays
 from metalens.propagate.paths import from_source
-from metalens.propagate.sincos import turns64
+from metalens.propagate.sincos import sincos_turns64
 
 
-def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
+def field_exact(phase_rad: Array, transmission: Array, case: PropagationCase) -> Array:
     """Field on the window, every pillar a source of area p² (its cell; paper Eqs. 1-3
     in space, exp(-iωt)).
 
@@ -49,7 +49,7 @@ def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
 
 
 def field_at(
-    phase_rad: Array, transmission: Array, case: Case, points_um: Array
+    phase_rad: Array, transmission: Array, case: PropagationCase, points_um: Array
 ) -> Array:
     """As :func:`field_exact`, at (point, [x, y]) of the sensor plane; (depth, point)
     complex128.
@@ -65,7 +65,7 @@ def field_at(
         if open_.size == 0:
             continue
         columns = slice(open_[0], open_[-1] + 1)
-        light = leaving(
+        light = sum_field(
             np.asarray(phase_rad[rows], float)[:, columns],
             level[:, columns],
             case,
@@ -77,7 +77,11 @@ def field_at(
 
 
 def _add_rows(
-    light: Array, at_um: tuple[Array, Array], points: Array, case: Case, out: Array
+    light: Array,
+    at_um: tuple[Array, Array],
+    points: Array,
+    case: PropagationCase,
+    out: Array,
 ) -> None:
     """Add the light of pillar rows (depth, y, x) to ``out`` (depth, point)."""
     y, x = at_um
@@ -97,11 +101,15 @@ def _add_rows(
     def work(a: int, b: int) -> None:
         kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])
 
-    split(len(points), work)
+    run_split(len(points), work)
 
 
-def leaving(
-    phase_rad: Array, transmission: Array, case: Case, y_um: Array, x_um: Array
+def sum_field(
+    phase_rad: Array,
+    transmission: Array,
+    case: PropagationCase,
+    y_um: Array,
+    x_um: Array,
 ) -> Array:
     """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth:
     (depth, y, x) complex128.
@@ -124,15 +132,17 @@ def _accumulate(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-
                 r2 = (points[p, 0] - x[j]) ** 2 + across
                 r = np.sqrt(r2)
                 t = r * (k / (2 * np.pi))
-                c, s = turns64(t - np.rint(t))
+                c, s = sincos_turns64(t - np.rint(t))
                 scale = distance * area / (2 * np.pi * r2)
                 h_re[j] = scale * (c / r + k * s)
                 h_im[j] = scale * (s / r - k * c)
             for z in range(depths):
-                out[z, p] += product(re[z, i], im[z, i], h_re, h_im)
+                out[z, p] += complex_product(re[z, i], im[z, i], h_re, h_im)
 
 
-def transfer(case: Case, count: tuple[int, int], *, band_limited: bool) -> Array:
+def free_space_transfer(
+    case: PropagationCase, count: tuple[int, int], *, band_limited: bool
+) -> Array:
     """H(fy, fx) = exp(ik_z d) on the FFT grid of ``count`` (y, x) samples; evanescent
     waves decay.
 
@@ -159,7 +169,7 @@ def transfer(case: Case, count: tuple[int, int], *, band_limited: bool) -> Array
 def angular_spectrum(
     phase_rad: Array,
     transmission: Array,
-    case: Case,
+    case: PropagationCase,
     *,
     pad: int = 2,
     band_limited: bool = False,
@@ -189,23 +199,23 @@ def angular_spectrum(
         )
     columns, rows = _lattice(case, pad)
     count = (case.shape[0] * pad, case.shape[1] * pad)
-    h = transfer(case, count, band_limited=band_limited)
+    h = free_space_transfer(case, count, band_limited=band_limited)
     dtype = np.complex64 if single else np.complex128
     h = h.astype(dtype)
     y, x = case.pillars_um
     out = np.empty((len(case.inverse_depths_per_um), *case.samples), dtype)
     for z, inverse in enumerate(case.inverse_depths_per_um):
-        one = Case(
+        one = PropagationCase(
             **{n: getattr(case, n) for n in case.__slots__}
             | {"inverse_depths_per_um": (inverse,)}
         )
-        light = leaving(phase_rad, transmission, one, y, x)[0].astype(dtype)
+        light = sum_field(phase_rad, transmission, one, y, x)[0].astype(dtype)
         field = np.fft.ifft2(np.fft.fft2(light, count) * h)
         out[z] = field[np.ix_(rows, columns)]
     return out
 
 
-def _lattice(case: Case, pad: int) -> tuple[Array, Array]:
+def _lattice(case: PropagationCase, pad: int) -> tuple[Array, Array]:
     """(x,), (y,) indices of the window samples in the padded grid, whose origin is the
     first pillar.
     """

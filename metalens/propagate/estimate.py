@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.threads import one_blas_thread, split
-from metalens.propagate.geometry import Case
-from metalens.propagate.layered import curved, media_arrays, sum_nodes, sum_rays
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.threads import one_blas_thread, run_split
+from metalens.propagate.geometry import PropagationCase
+from metalens.propagate.layered import media_arrays, node_phases, sum_nodes, sum_rays
 from metalens.propagate.operators import depth_factors
-from metalens.propagate.paths import kernel, reference_depth
+from metalens.propagate.paths import rayleigh_sommerfeld_kernel, reference_depth
 from metalens.propagate.pillars import Pupils
 
 MORE = 8
@@ -52,7 +52,7 @@ NORMALISED, SPARSE = 0.03, 0.5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sample:
+class ErrorSample:
     """One wavelength of a result to be judged.
 
     weight: of its intensity; moments: (m + MORE, n + MORE) complex128 of the lens, or
@@ -66,7 +66,7 @@ class Sample:
     squares add up; None for the light of one map.
     """
 
-    case: Case
+    case: PropagationCase
     weight: float
     moments: Array
     noise: float
@@ -80,7 +80,7 @@ class Sample:
         return len(self.case.inverse_depths_per_um), *self.case.samples
 
 
-def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
+def relative_error(windows: list[list[ErrorSample]], seen: list[Array]) -> float:
     """Estimate of the relative L2 error of the normalised PSFs (all depths of one
     direction and lens together).
 
@@ -107,7 +107,9 @@ def relative_error(windows: list[list[Sample]], seen: list[Array]) -> float:
 
 
 def pupil_error(
-    windows: list[list[Sample]], seen: list[Array], pupils: Callable[[Case], Pupils]
+    windows: list[list[ErrorSample]],
+    seen: list[Array],
+    pupils: Callable[[PropagationCase], Pupils],
 ) -> float:
     """Estimate of the relative L2 error of factors that are those of a window's middle
     all over it.
@@ -144,10 +146,10 @@ def pupil_error(
 
 
 def _changed(
-    sample: Sample,
+    sample: ErrorSample,
     given: tuple[Array, Array, Array],
     at: tuple[Array, int, int],
-    pupils: Callable[[Case], Pupils],
+    pupils: Callable[[PropagationCase], Pupils],
 ) -> Array:
     """(depth,) intensity with a point's own factors less that held; given: light and
     places of the nodes; at: indices
@@ -161,7 +163,10 @@ def _changed(
     (coarse_e, onto_e), (coarse_x, onto_x) = _coarse(e), _coarse(x)
     waves = (
         onto_e
-        @ (light[:, None] * kernel(case, x, e[:, None], X, Y, inverse))
+        @ (
+            light[:, None]
+            * rayleigh_sommerfeld_kernel(case, x, e[:, None], X, Y, inverse)
+        )
         @ onto_x.T
     )
     signs, factors = pupils(there)(coarse_e, coarse_x)
@@ -182,13 +187,13 @@ def _coarse(places_um: Array) -> tuple[Array, Array]:
     if len(places_um) <= FACTORS or not high > low:
         return places_um, np.eye(len(places_um))
     at = (2 * places_um - low - high) / (high - low)
-    return np.asarray(legendre.mapped(FACTORS, low, high)), np.asarray(
-        legendre.interpolation(FACTORS, at)
+    return np.asarray(legendre.mapped_nodes(FACTORS, low, high)), np.asarray(
+        legendre.interpolation_matrix(FACTORS, at)
     ).T
 
 
 def _looked_at(
-    windows: list[list[Sample]], seen: list[Array], count: tuple[int, int]
+    windows: list[list[ErrorSample]], seen: list[Array], count: tuple[int, int]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """(depth, pixel) light of sum 1 and (depth,) its sums before, of the (depth,)
     indices that are looked at, and
@@ -211,7 +216,7 @@ def _looked_at(
         normalised.mean(0, dtype=float, keepdims=True), 0.0
     )  # a flux may run back where it is dark
     near = _near(mean[0], [samples[0].shape[-2:] for samples in windows])
-    points, chance = draw(mean, order, count[0], edges, near)
+    points, chance = draw_pixels(mean, order, count[0], edges, near)
     return (
         normalised,
         energy,
@@ -253,7 +258,7 @@ def _squares(normalised: Array) -> Array:
     return np.asarray(np.einsum("ij,ij->i", normalised, normalised, dtype=float))
 
 
-def _effort(windows: list[list[Sample]]) -> tuple[int, int]:
+def _effort(windows: list[list[ErrorSample]]) -> tuple[int, int]:
     """(points, depths) that are looked at: fewer where a point takes the sum over very
     many nodes.
     """
@@ -282,7 +287,7 @@ def _within(count: int, parts: int) -> Array:
 
 
 @functools.lru_cache(maxsize=16)
-def scan(shape: tuple[int, ...]) -> Array:
+def morton_scan(shape: tuple[int, ...]) -> Array:
     """(pixel,) flat indices of a window (…, y, x) along a curve that stays near itself
     (Morton's).
     """
@@ -294,10 +299,13 @@ def scan(shape: tuple[int, ...]) -> Array:
 
 
 def _orders(shapes: list[tuple[int, ...]]) -> Array:
-    """:func:`scan` of several windows, one after the other."""
+    """:func:`morton_scan` of several windows, one after the other."""
     firsts = np.cumsum([0, *(shape[-2] * shape[-1] for shape in shapes)])
     return np.concatenate(
-        [first + scan(shape) for first, shape in zip(firsts[:-1], shapes, strict=True)]
+        [
+            first + morton_scan(shape)
+            for first, shape in zip(firsts[:-1], shapes, strict=True)
+        ]
     )
 
 
@@ -312,7 +320,7 @@ def _near(mean: Array, shapes: list[tuple[int, ...]]) -> Array:
     )
 
 
-def draw(
+def draw_pixels(
     normalised: Array,
     order: Array,
     count: int,
@@ -325,7 +333,7 @@ def draw(
     Args:
         normalised: (depth, pixel) of sum 1; the chance follows it, its root times
             ``edges``, and ``near`` if given.
-        order: (pixel,) as :func:`scan`, so that the sample is even over the window.
+        order: (pixel,) as :func:`morton_scan`, so that the sample is even over the window.
         count: of points in all depths together.
     """
     depths, pixels = normalised.shape
@@ -347,7 +355,9 @@ def draw(
     return points, np.take_along_axis(density, points, 1)
 
 
-def _direct_light(windows: list[list[Sample]], depths: Array, points: Array) -> Array:
+def _direct_light(
+    windows: list[list[ErrorSample]], depths: Array, points: Array
+) -> Array:
     """(depth, n) direct intensity at the drawn pixels (n,), wavelengths added."""
     out = np.zeros((len(depths), len(points)))
     first = 0
@@ -364,7 +374,7 @@ def _direct_light(windows: list[list[Sample]], depths: Array, points: Array) -> 
     return np.asarray(out)
 
 
-def _at_nodes(sample: Sample) -> tuple[Array, Array, Array]:
+def _at_nodes(sample: ErrorSample) -> tuple[Array, Array, Array]:
     """Light (component, row, column) on nodes of the lens, and their places."""
     (m, n), (e, x), light = sample.moments.shape[-2:], _places(sample), sample.moments
     if sample.nodes_um is None:
@@ -380,17 +390,17 @@ def _at_nodes(sample: Sample) -> tuple[Array, Array, Array]:
     )
 
 
-def _places(sample: Sample) -> tuple[Array, Array]:
+def _places(sample: ErrorSample) -> tuple[Array, Array]:
     """(e,), (x,) of its nodes on the lens."""
     if sample.nodes_um is not None:
         return sample.nodes_um
     (m, n), (hy, hx) = sample.moments.shape[-2:], sample.case.half_size_um
-    return np.asarray(legendre.mapped(m, -hy, hy)), np.asarray(
-        legendre.mapped(n, -hx, hx)
+    return np.asarray(legendre.mapped_nodes(m, -hy, hy)), np.asarray(
+        legendre.mapped_nodes(n, -hx, hx)
     )
 
 
-def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
+def _direct(sample: ErrorSample, depths: Array, at: tuple[Array, Array]) -> Array:
     """(component, depth, point) field at (y, x) indices, summed over the finer nodes;
     one kernel serves them all.
     """
@@ -414,7 +424,7 @@ def _direct(sample: Sample, depths: Array, at: tuple[Array, Array]) -> Array:
             (*case.centre_um, (k, *media_arrays(case.behind, k, case.reach_um))),
         )
         more = ()
-    split(
+    run_split(
         len(points),
         lambda a, b: total(re, im, e, x, points[a:b], numbers, *more, out[:, a:b]),
     )
@@ -431,7 +441,7 @@ def _lit(light: Array) -> Array:
 
 
 def _of_depths(
-    case: Case,
+    case: PropagationCase,
     light: Array,
     at_um: tuple[Array, Array, Array],
     numbers: Array,
@@ -442,7 +452,7 @@ def _of_depths(
     and columns, and what :func:`_lit` found."""
     e, x, spans = at_um
     out = np.zeros((2, len(e), len(inverse), len(x)))
-    turn: Any = curved
+    turn: Any = node_phases
     if case.front:
         angle = depth_factors(
             case, e[:, None], x, case.tangents, inverse[:, None, None]
@@ -450,7 +460,7 @@ def _of_depths(
         turned = (light * np.exp(1j * angle)).swapaxes(0, 1)
         out[:] = turned.real, turned.imag
     else:
-        split(
+        run_split(
             len(e),
             lambda a, b: turn(
                 light[a:b],

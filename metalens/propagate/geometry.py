@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Media
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class PropagationCase:
     """Geometry of one propagation; hashable, so that plans can be kept.
 
     shape: (y, x) sites of the map; pitch_um: from column to column; row_um: from row to
@@ -133,22 +133,27 @@ class Case:
     def pillars_um(self) -> tuple[Array, Array]:
         """(y,), (x,) positions of the pillar rows and columns."""
         y, x = (
-            axis(n, step) for n, step in zip(self.shape, self.steps_um, strict=True)
+            axis_positions(n, step)
+            for n, step in zip(self.shape, self.steps_um, strict=True)
         )
         return y, x
 
     @property
     def window_um(self) -> tuple[Array, Array]:
         """(y,), (x,) positions of the window samples from the window centre."""
-        return axis(self.samples[0], self.step_um), axis(self.samples[1], self.step_um)
+        return axis_positions(self.samples[0], self.step_um), axis_positions(
+            self.samples[1], self.step_um
+        )
 
 
-def axis(count: int, step: float) -> Array:
+def axis_positions(count: int, step: float) -> Array:
     """(count,) positions about the centre of the row."""
     return (np.arange(count) - (count - 1) / 2) * step
 
 
-def windows(case: Case, parts: int) -> tuple[tuple[Case, ...], ...]:
+def split_window(
+    case: PropagationCase, parts: int
+) -> tuple[tuple[PropagationCase, ...], ...]:
     """The window cut into rows of parts, at most ``parts`` along each axis, equal to
     within one sample.
     """
@@ -156,9 +161,9 @@ def windows(case: Case, parts: int) -> tuple[tuple[Case, ...], ...]:
     return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
 
 
-def tiles(
-    case: Case, parts: int
-) -> tuple[tuple[list[int], list[int]], tuple[tuple[Case, ...], ...]]:
+def window_tiles(
+    case: PropagationCase, parts: int
+) -> tuple[tuple[list[int], list[int]], tuple[tuple[PropagationCase, ...], ...]]:
     """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size:
     neighbours may overlap.
     """
@@ -178,7 +183,9 @@ def tiles(
     )
 
 
-def _part(case: Case, row: tuple[int, int], column: tuple[int, int]) -> Case:
+def _part(
+    case: PropagationCase, row: tuple[int, int], column: tuple[int, int]
+) -> PropagationCase:
     """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
     (my, mx), (x, y) = case.samples, case.centre_um
     centre = (
@@ -194,7 +201,7 @@ def _cut(count: int, parts: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
 
 
-def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:
+def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> None:
     """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or
     infinity.
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import media
-from metalens.propagate.geometry import Case
-from metalens.propagate.paths import cosines, from_source, reference_depth
+from metalens.propagate.geometry import PropagationCase
+from metalens.propagate.paths import from_source, ray_cosines, reference_depth
 
 RAYS = 33  # along an axis, whose reach the quadratic follows
 SPARE = 1.2  # grid of the lens over the least that the kernel's band asks for
@@ -35,7 +35,7 @@ STEEPEST = 0.93  # |p| of a ray, fading included, in units of the rarest index
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class WideAxis:
     """One axis of a wide window.
 
     count, first_um, step_um: of the even grid over the lens, which stands over by
@@ -69,7 +69,7 @@ class Axis:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class QuadraticFit:
     """The quadratic along one axis: p0, A, D of the module; most: largest |p - p0| of a
     ray to the window; extra: what
     the quadratic leaves of its reach; steepest: |p| of any ray."""
@@ -83,7 +83,9 @@ class Fit:
 
 
 @functools.lru_cache(maxsize=256)
-def axes(case: Case, tolerance: float) -> tuple[Axis, Axis] | None:
+def wide_axes(
+    case: PropagationCase, tolerance: float
+) -> tuple[WideAxis, WideAxis] | None:
     """(y, x) grids for a window; None where its rays are too steep, or too unlike a
     quadratic, for the method.
     """
@@ -123,11 +125,13 @@ def axes(case: Case, tolerance: float) -> tuple[Axis, Axis] | None:
     return None if made[0] is None or made[1] is None else (made[0], made[1])
 
 
-def _rarest(case: Case) -> float:
+def _rarest(case: PropagationCase) -> float:
     return 1.0 if case.behind is None else case.behind.layers[0][0]
 
 
-def _beyond(case: Case, fits: tuple[Fit, Fit], guards: list[float]) -> list[float]:
+def _beyond(
+    case: PropagationCase, fits: tuple[QuadraticFit, QuadraticFit], guards: list[float]
+) -> list[float]:
     """What the quadratic leaves of the reach of the light that is faded out, along y
     and x.
     """
@@ -148,9 +152,9 @@ def _beyond(case: Case, fits: tuple[Fit, Fit], guards: list[float]) -> list[floa
     return found
 
 
-def seconds(case: Case, tolerance: float) -> float:
+def expected_cost(case: PropagationCase, tolerance: float) -> float:
     """Expected time on one core, without the pillars; inf where the method does not do."""
-    found = axes(case, tolerance)
+    found = wide_axes(case, tolerance)
     if found is None:
         return math.inf
     y, x = found
@@ -165,11 +169,11 @@ def seconds(case: Case, tolerance: float) -> float:
     )
 
 
-def is_wide(case: Case, tolerance: float) -> bool:
+def is_wide(case: PropagationCase, tolerance: float) -> bool:
     """Whether the method is the quickest without a look at the others, whose plans take
     long for such windows.
     """
-    found = axes(case, tolerance)
+    found = wide_axes(case, tolerance)
     if found is None:
         return False
     waves = (
@@ -179,7 +183,9 @@ def is_wide(case: Case, tolerance: float) -> bool:
     return min(*waves, *(axis.count - 2 * axis.taps for axis in found)) > WIDE
 
 
-def _fitted(case: Case, half: list[float]) -> tuple[Fit, Fit] | None:
+def _fitted(
+    case: PropagationCase, half: list[float]
+) -> tuple[QuadraticFit, QuadraticFit] | None:
     """Along y and x, for rays to ``half`` about the window's middle."""
     unit = np.cos(np.pi * (np.arange(RAYS) + 0.5) / RAYS)
     centre = case.centre_um[::-1]
@@ -187,7 +193,9 @@ def _fitted(case: Case, half: list[float]) -> tuple[Fit, Fit] | None:
         c + unit * (w + h)
         for c, w, h in zip(centre, half, case.half_size_um, strict=True)
     )
-    both = [np.asarray(cosines(case, *at)) for at in ((y[:, None], x), (x, y[:, None]))]
+    both = [
+        np.asarray(ray_cosines(case, *at)) for at in ((y[:, None], x), (x, y[:, None]))
+    ]
     steepest = float(np.sqrt((both[0] ** 2 + both[1] ** 2).max()))
     if steepest > STEEPEST * _rarest(case):
         return None
@@ -197,7 +205,7 @@ def _fitted(case: Case, half: list[float]) -> tuple[Fit, Fit] | None:
         slope, level = np.polyfit((p - p0).ravel(), reach.ravel(), 1)
         left = float(np.abs(reach - level - slope * (p - p0)).max())
         out.append(
-            Fit(
+            QuadraticFit(
                 p0,
                 float(level),
                 float(slope),
@@ -210,8 +218,12 @@ def _fitted(case: Case, half: list[float]) -> tuple[Fit, Fit] | None:
 
 
 def _axis(
-    case: Case, i: int, fit: Fit, faded: tuple[float, float, float], tolerance: float
-) -> Axis | None:
+    case: PropagationCase,
+    i: int,
+    fit: QuadraticFit,
+    faded: tuple[float, float, float],
+    tolerance: float,
+) -> WideAxis | None:
     """The grids of an axis; faded: width in p of what is faded out, half of it in
     standard deviations, and how far
     that light goes astray."""
@@ -238,7 +250,7 @@ def _axis(
             if count <= first:
                 low = -(count - 1) / 2 * least / first
                 grid = count, low, least / first, taps, over, first, size, fine, every
-                return Axis(
+                return WideAxis(
                     *grid,
                     fit.middle,
                     fit.reach_um,
@@ -269,7 +281,7 @@ def _smooth(n: int) -> bool:
     return n == 1
 
 
-def _band(case: Case, i: int, extra: float) -> float:
+def _band(case: PropagationCase, i: int, extra: float) -> float:
     """Largest |d path / d x| along an axis of the kernel without its carrier, over
     lens, window and depths.
     """
@@ -279,7 +291,7 @@ def _band(case: Case, i: int, extra: float) -> float:
     Y, X = (Y + np.sign(Y) * extra, X) if i == 0 else (Y, X + np.sign(X) * extra)
     far = [(case.centre_um[1] - y, Y), (case.centre_um[0] - x, X)]
     away, beside = far[i], far[1 - i]
-    turned = cosines(case, away[0] + away[1], beside[0] + beside[1]) - cosines(
+    turned = ray_cosines(case, away[0] + away[1], beside[0] + beside[1]) - ray_cosines(
         case, away[0], beside[0]
     )
     tiny = np.array([-0.5, 0.5])[:, None, None] * 1e-3
@@ -295,12 +307,12 @@ def _band(case: Case, i: int, extra: float) -> float:
     return max(float(np.abs(turned).max()) + steep, 1e-6)
 
 
-def grid_um(axis: Axis) -> Array:
+def grid_um(axis: WideAxis) -> Array:
     """(count,) places of the even grid over the lens."""
     return axis.first_um + axis.step_um * np.arange(axis.count)
 
 
-def spread_weights(axis: Axis, places_um: Array) -> Array:
+def spread_weights(axis: WideAxis, places_um: Array) -> Array:
     """(place, grid) sinc under Kaiser's window: f(x) = Σ_m weight f(x_m) for what the
     kernel's band holds.
     """

@@ -5,10 +5,10 @@ nodes, also through films.
 import numba
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.lens import Media, saddle
+from metalens.core.arrays import Array
+from metalens.lens import Media, saddle_correction
 from metalens.lens.media import NEWTON as STEPS
-from metalens.propagate.sincos import turns64
+from metalens.propagate.sincos import sincos_turns64
 
 SETTLED = 1e-9  # a step of Newton's method, relative, after which its square is left
 
@@ -20,7 +20,7 @@ def media_arrays(
     the faces lie between, and C of
     :mod:`metalens.lens.waves` up to a reach: (middle, half) of s, then (real,
     imaginary) coefficients."""
-    layers, made = media.layers, saddle(media, wavenumber, reach_um)
+    layers, made = media.layers, saddle_correction(media, wavenumber, reach_um)
     series = np.stack([[made.middle, *made.real], [made.half, *made.imaginary]], -1)
     return (
         np.array([n * n for n, _ in layers]),
@@ -33,7 +33,7 @@ def media_arrays(
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
+def complex_product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
     """Σ ab of complex rows given by their parts."""
     real, imaginary = 0.0, 0.0
     for j in range(a_re.size):
@@ -45,7 +45,7 @@ def product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
+def solve_rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
     """w = p² to ``work[0]`` of the rays of a row of reach², by Newton's method as in
     :func:`metalens.lens.media.square` from tan² ``s`` in the rarest medium, which is
     put right.
@@ -79,7 +79,7 @@ def rays(reach2, n2, t, s, work):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
+def ray_path_lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
     """Optical paths of a row of rays."""
     far[:] = 0.0
     for i in range(n2.size):
@@ -90,7 +90,7 @@ def lengths(w, n2, t, far):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def levels(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
+def ray_amplitudes(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
     """√(passed / spread) of a row of rays."""
     g, along, in_s, in_p = out, work[1], work[2], work[3]
     g[:], along[:], in_s[:], in_p[:] = 0.0, 0.0, 1.0, 1.0
@@ -112,7 +112,7 @@ def levels(w, n2, t, order, out, work):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def beside(w, n2, series, work):  # type: ignore[no-untyped-def]
+def ray_corrections(w, n2, series, work):  # type: ignore[no-untyped-def]
     """Real and imaginary part of C of a row of rays, to ``work[1]`` and ``work[2]``."""
     real, imaginary, u = work[1], work[2], work[3]
     real[:], imaginary[:] = 0.0, 0.0
@@ -135,13 +135,13 @@ def _film_row(reach2, less, numbers, s, work, re, im):  # type: ignore[no-untype
     ``less``."""
     k, n2, t, order, series = numbers
     w, level, far = work[0], work[4], work[5]
-    rays(reach2, n2, t, s, work)
-    lengths(w, n2, t, far)
-    levels(w, n2, t, order, level, work)
-    beside(w, n2, series, work)
+    solve_rays(reach2, n2, t, s, work)
+    ray_path_lengths(w, n2, t, far)
+    ray_amplitudes(w, n2, t, order, level, work)
+    ray_corrections(w, n2, series, work)
     for j in range(w.size):
         turn = (far[j] - less[j]) * (k / (2 * np.pi))
-        cosine, sine = turns64(turn - np.rint(turn))
+        cosine, sine = sincos_turns64(turn - np.rint(turn))
         near = k / (2 * np.pi) * level[j]
         ahead, aside = (
             near * work[1, j] / (k * far[j]),
@@ -168,7 +168,7 @@ def add_rays(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-def
             reach2[:] = (points[p, 0] - x) ** 2 + (points[p, 1] - y[i]) ** 2
             _film_row(reach2, nothing, films, s, work, h_re, h_im)
             for z in range(re.shape[0]):
-                out[z, p] += area * product(re[z, i], im[z, i], h_re, h_im)
+                out[z, p] += area * complex_product(re[z, i], im[z, i], h_re, h_im)
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
@@ -186,14 +186,14 @@ def sum_rays(re, im, e, x, points, numbers, out):  # type: ignore[no-untyped-def
     )
     for i in range(e.size):
         reach2[:] = (cx - x) ** 2 + (cy - e[i]) ** 2
-        rays(reach2, films[1], films[2], s, work)
-        lengths(work[0], films[1], films[2], middle[i])
+        solve_rays(reach2, films[1], films[2], s, work)
+        ray_path_lengths(work[0], films[1], films[2], middle[i])
     for p in range(points.shape[0]):
         for i in range(e.size):
             reach2[:] = (cx + points[p, 0] - x) ** 2 + (cy + points[p, 1] - e[i]) ** 2
             _film_row(reach2, middle[i], films, s, work, h_re, h_im)
             for z in range(re.shape[1]):
-                out[z, p] += product(re[i, z], im[i, z], h_re, h_im)
+                out[z, p] += complex_product(re[i, z], im[i, z], h_re, h_im)
 
 
 @numba.njit(inline="always")
@@ -205,7 +205,7 @@ def _source(x, y, numbers, inverse):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def curved(light, e, x, numbers, inverse, spans, re, im):  # type: ignore[no-untyped-def]
+def node_phases(light, e, x, numbers, inverse, spans, re, im):  # type: ignore[no-untyped-def]
     """Light on the nodes (row, column) with the phase of every depth less the
     reference's, to (row, depth, column);
     of each row the columns spans[row, 0] to spans[row, 1], where there is light."""
@@ -216,7 +216,7 @@ def curved(light, e, x, numbers, inverse, spans, re, im):  # type: ignore[no-unt
         for z in range(inverse.size):
             for j in range(spans[i, 0], spans[i, 1]):
                 t = (_source(x[j], e[i], numbers, inverse[z]) - near[j]) / numbers[6]
-                c, s = turns64(t - np.rint(t))
+                c, s = sincos_turns64(t - np.rint(t))
                 a, b = light[i, j].real, light[i, j].imag
                 re[i, z, j], im[i, z, j] = a * c - b * s, a * s + b * c
 
@@ -235,7 +235,7 @@ def _kernel_row(X, Y, dx, dy, w, numbers, re, im):  # type: ignore[no-untyped-de
         r = np.sqrt(w[j] * w[j] + q)
         both = 1 / (r * (r + w[j]))
         t = q * both * r / wavelength
-        c, s = turns64(t - np.rint(t))
+        c, s = sincos_turns64(t - np.rint(t))
         near = both * (r + w[j])
         scale = distance / (2 * np.pi) * near * near
         re[j], im[j] = scale * (c * near + k * s), scale * (s * near - k * c)
@@ -270,4 +270,6 @@ def sum_nodes(re, im, e, x, points, numbers, spans, out):  # type: ignore[no-unt
                 h_im[a:b],
             )
             for z in range(re.shape[1]):
-                out[z, p] += product(re[i, z, a:b], im[i, z, a:b], h_re[a:b], h_im[a:b])
+                out[z, p] += complex_product(
+                    re[i, z, a:b], im[i, z, a:b], h_re[a:b], h_im[a:b]
+                )

@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.propagate.geometry import Case, tiles
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.propagate.geometry import PropagationCase, window_tiles
 from metalens.propagate.paths import (
-    correction,
     cosine_y,
     direction_range,
-    kernel,
-    probe,
+    plane_wave_residual,
+    probe_positions,
+    rayleigh_sommerfeld_kernel,
 )
 
 MOST_NODES = 400
@@ -38,7 +38,7 @@ PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
 
 
 @dataclass(frozen=True, slots=True)
-class Sizes:
+class NodeCounts:
     """Counts chosen for a case and tolerance.
 
     nodes: (y, x) Legendre nodes over the lens; directions: direction cosines p along x.
@@ -57,19 +57,19 @@ class Sizes:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class WindowLayout:
     """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
     sizes: of every tile;
     seconds: expected for all tiles on one core."""
 
     nodes: tuple[int, int]
     parts: int
-    sizes: Sizes
+    sizes: NodeCounts
     seconds: float
 
 
 @functools.lru_cache(maxsize=1024)
-def layout(case: Case, tolerance: float) -> Layout | None:
+def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
     """How the window is cut so that it costs least; None where no cut brings the tables
     down to some 100 MB.
 
@@ -82,22 +82,22 @@ def layout(case: Case, tolerance: float) -> Layout | None:
     for parts in PARTS:
         if parts > max(case.samples):
             break
-        rows = tiles(case, parts)[1]
+        rows = window_tiles(case, parts)[1]
         corners = {
             _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
         }
-        found = _largest([sizes(tile, tolerance) for tile in corners])
+        found = _largest([node_counts(tile, tolerance) for tile in corners])
         passed_on = nodes[0] * nodes[1] * (1e-8 + 2e-10 * found.nodes[0])
         each = _seconds(rows[0][0], found, len(case.inverse_depths_per_um)) + passed_on
         seconds = 1e-3 + each * sum(map(len, rows))
         if found.table <= MOST_TABLE and (best is None or seconds < best.seconds):
-            best = Layout(nodes, parts, found, seconds)
+            best = WindowLayout(nodes, parts, found, seconds)
         elif best is not None:
             break
     return best
 
 
-def _alike(tile: Case) -> Case:
+def _alike(tile: PropagationCase) -> PropagationCase:
     """The tile, or its mirror image, which needs the same counts, where the source is
     straight ahead along an axis.
     """
@@ -108,16 +108,16 @@ def _alike(tile: Case) -> Case:
     return replace(tile, centre_um=(x, y))
 
 
-def _largest(found: list[Sizes]) -> Sizes:
+def _largest(found: list[NodeCounts]) -> NodeCounts:
     """Counts that do for all."""
     pairs = [
         tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1))
         for name in ("nodes", "window", "lens")
     ]
-    return Sizes(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
+    return NodeCounts(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
 
 
-def _seconds(case: Case, found: Sizes, depths: int) -> float:
+def _seconds(case: PropagationCase, found: NodeCounts, depths: int) -> float:
     """Expected time of one tile on one core: light on its own nodes, products along y
     and x.
     """
@@ -129,7 +129,7 @@ def _seconds(case: Case, found: Sizes, depths: int) -> float:
     return 2e-5 + products + 5e-9 * b * ny * nx
 
 
-def lens_nodes(case: Case, tolerance: float) -> tuple[int, int]:
+def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
     """(y, x) nodes over the lens that the kernel needs."""
     high_y, high_x = case.half_size_um
     rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
@@ -138,7 +138,7 @@ def lens_nodes(case: Case, tolerance: float) -> tuple[int, int]:
     )
 
 
-def sizes(case: Case, tolerance: float) -> Sizes:
+def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
     """The counts that a tile needs.
 
     Raises:
@@ -147,7 +147,7 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     share = tolerance / 4
     high_y = case.half_size_um[0]
     nodes = lens_nodes(case, share)
-    low, high = direction_range(case, legendre.mapped(nodes[0], -high_y, high_y))
+    low, high = direction_range(case, legendre.mapped_nodes(nodes[0], -high_y, high_y))
     middle, reach = (low + high) / 2, (high - low) / 2
     directions = _count(
         lambda t: _over_directions(case, middle + reach * t), share, "directions"
@@ -168,13 +168,15 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     lens_e = _count(
         lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows"
     )
-    return Sizes(nodes, directions, (window_y, window_x), (lens_e, lens_p))
+    return NodeCounts(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
 def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
     count = 32
     while count <= 1.5 * MOST_NODES:
-        found = legendre.needed(lines(legendre.nodes(count)[0]), tolerance)
+        found = legendre.needed_node_count(
+            lines(legendre.gauss_legendre_nodes(count)[0]), tolerance
+        )
         if found <= min(count, MOST_NODES):
             return max(found, 2)
         count *= 2
@@ -184,31 +186,40 @@ def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
     )
 
 
-def _over_lens(case: Case, x: Array | None, y: Array | None) -> Array:
+def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array:
     """(line, node) of the kernel along lens columns (x given) or rows (y given)."""
     (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
     inverse = np.array(
         [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
     )
     other = np.array([-0.9, 0.0, 0.9])
-    grid = np.meshgrid(other, probe() * wx, probe() * wy, inverse, indexing="ij")
+    grid = np.meshgrid(
+        other, probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
+    )
     o, X, Y, v = (g.reshape(-1, 1) for g in grid)
-    return kernel(case, o * hx if x is None else x, o * hy if y is None else y, X, Y, v)
+    return rayleigh_sommerfeld_kernel(
+        case, o * hx if x is None else x, o * hy if y is None else y, X, Y, v
+    )
 
 
-def _over_directions(case: Case, p: Array) -> Array:
+def _over_directions(case: PropagationCase, p: Array) -> Array:
     """(line, direction) of the window kernel along p at fixed lens rows."""
     (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
     grid = np.meshgrid(
-        np.array([-0.9, 0.0, 0.9]) * hy, probe() * wx, probe() * wy, indexing="ij"
+        np.array([-0.9, 0.0, 0.9]) * hy,
+        probe_positions() * wx,
+        probe_positions() * wy,
+        indexing="ij",
     )
     e, X, Y = (g.reshape(-1, 1) for g in grid)
-    residual = correction(case, p, e, X, Y)
+    residual = plane_wave_residual(case, p, e, X, Y)
     q = cosine_y(case, p, e)
     return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
 
 
-def _over_window(case: Case, span: tuple[float, float], **line: Array) -> Array:
+def _over_window(
+    case: PropagationCase, span: tuple[float, float], **line: Array
+) -> Array:
     """(line, node) of the correction along one of X, Y, p, e, the others on a few
     probes.
     """
@@ -216,14 +227,14 @@ def _over_window(case: Case, span: tuple[float, float], **line: Array) -> Array:
     low, high = span
     middle, reach = (low + high) / 2, (high - low) / 2
     probes = {
-        "X": probe() * wx,
-        "Y": probe() * wy,
-        "p": middle + reach * probe(),
-        "e": probe() * hy,
+        "X": probe_positions() * wx,
+        "Y": probe_positions() * wy,
+        "p": middle + reach * probe_positions(),
+        "e": probe_positions() * hy,
     }
     names = [n for n in probes if n not in line]
     grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
     at: dict[str, Any] = {
         n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)
     } | line
-    return correction(case, at["p"], at["e"], at["X"], at["Y"])
+    return plane_wave_residual(case, at["p"], at["e"], at["X"], at["Y"])

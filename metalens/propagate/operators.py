@@ -7,24 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.propagate.geometry import Case
-from metalens.propagate.nodes import Sizes
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.propagate.geometry import PropagationCase
+from metalens.propagate.nodes import NodeCounts
 from metalens.propagate.paths import (
     chief_path,
-    correction,
     cosine_y,
-    cosines,
     direction_range,
     from_source,
+    kernel_derivatives,
+    plane_wave_residual,
+    ray_cosines,
     reference_depth,
-    slopes,
 )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Depths:
+class DepthBasis:
     """Fields on the lens nodes that span the curvatures of all depths.
 
     basis: (b, e, x); coefficients: (depth, b); strength: (b,).
@@ -36,7 +36,7 @@ class Depths:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Operators:
+class TileOperators:
     """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column
     nodes, p = directions.
 
@@ -52,15 +52,21 @@ class Operators:
     strength: Array
 
 
-def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> Any:
+def depth_factors(
+    case: PropagationCase, e: Any, x: Any, tangents: Any, inverse: Any
+) -> Any:
     """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands."""
     reference = from_source(case, x, e, case.tangents, reference_depth(case))
     return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
 
 
 def depth_basis(
-    case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False
-) -> Depths:
+    case: PropagationCase,
+    nodes_um: tuple[Array, Array],
+    tolerance: float,
+    *,
+    moving: bool = False,
+) -> DepthBasis:
     """Few fields that span the curvatures of all depths.
 
     With ``moving`` they also span the derivatives in inverse depth and tangents.
@@ -68,7 +74,12 @@ def depth_basis(
     the nodes; truncated at ``tolerance`` root mean square.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
-    weight = np.sqrt(np.outer(legendre.nodes(len(e))[1], legendre.nodes(len(x))[1]))
+    weight = np.sqrt(
+        np.outer(
+            legendre.gauss_legendre_nodes(len(e))[1],
+            legendre.gauss_legendre_nodes(len(x))[1],
+        )
+    )
     inverse = np.array(case.inverse_depths_per_um)
     count = 48
     # until the rank says that no depth lies between the nodes: they need pi a period,
@@ -76,7 +87,7 @@ def depth_basis(
     while True:
         few = len(inverse) > count
         training = (
-            np.clip(legendre.mapped(count, inverse.min(), inverse.max()), 0, None)
+            np.clip(legendre.mapped_nodes(count, inverse.min(), inverse.max()), 0, None)
             if few
             else inverse
         )
@@ -104,13 +115,13 @@ def depth_basis(
         coefficients[start : start + 16] = (
             fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
         )
-    return Depths(
+    return DepthBasis(
         np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
     )
 
 
 def _tangents(
-    case: Case, e: Array, x: Array, inverse: Array, fields: Array
+    case: PropagationCase, e: Array, x: Array, inverse: Array, fields: Array
 ) -> list[Array]:
     """Derivatives of the depth fields in inverse depth and the tangents, each of the
     fields' own norm; complex step.
@@ -133,7 +144,7 @@ def _tangents(
     return out
 
 
-def pairs(strength: Array, size: Array, tolerance: float) -> Array:
+def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
     """(2, n) pairs (correction term, depth field) whose joint strength matters; the
     rest sums below tolerance.
     """
@@ -144,27 +155,34 @@ def pairs(strength: Array, size: Array, tolerance: float) -> Array:
     return np.stack(np.unravel_index(kept, (len(strength), len(size))))
 
 
-def operators(
-    case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None
-) -> Operators:
+def build_operators(
+    case: PropagationCase,
+    chosen: NodeCounts,
+    tolerance: float,
+    *,
+    slope: int | None = None,
+) -> TileOperators:
     """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
     window centre x, y instead.
     """
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um
-    e, x = legendre.mapped(ny, -high_y, high_y), legendre.mapped(nx, -high_x, high_x)
+    e, x = (
+        legendre.mapped_nodes(ny, -high_y, high_y),
+        legendre.mapped_nodes(nx, -high_x, high_x),
+    )
     low, high = direction_range(case, e)
-    p = legendre.mapped(m, low, high)
+    p = legendre.mapped_nodes(m, low, high)
     far = (e - case.centre_um[1])[:, None]
-    towards = cosines(case, x - case.centre_um[0], far)
+    towards = ray_cosines(case, x - case.centre_um[0], far)
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = cosine_y(case, p[:, None], e[None, :])
     lens_terms, window_terms, strength = _low_rank(
         case, chosen, tolerance / 2, (low, high), slope
     )
-    return Operators(
-        to_directions=legendre.interpolation(
+    return TileOperators(
+        to_directions=legendre.interpolation_matrix(
             m, (2 * towards - low - high) / (high - low)
         ),
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
@@ -176,8 +194,8 @@ def operators(
 
 
 def _low_rank(
-    case: Case,
-    chosen: Sizes,
+    case: PropagationCase,
+    chosen: NodeCounts,
     tolerance: float,
     span: tuple[float, float],
     slope: int | None,
@@ -187,24 +205,27 @@ def _low_rank(
     """
     (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
     (my, mx), (me, mp) = chosen.window, chosen.lens
-    Y, X = legendre.mapped(my, -wy, wy), legendre.mapped(mx, -wx, wx)
-    e, p = legendre.mapped(me, -hy, hy), legendre.mapped(mp, *span)
+    Y, X = legendre.mapped_nodes(my, -wy, wy), legendre.mapped_nodes(mx, -wx, wx)
+    e, p = legendre.mapped_nodes(me, -hy, hy), legendre.mapped_nodes(mp, *span)
     at = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
-    table = correction(case, *at)
+    table = plane_wave_residual(case, *at)
     if slope is not None:
-        table = table * slopes(case, *at)[slope]
+        table = table * kernel_derivatives(case, *at)[slope]
     left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
     y_um, x_um = case.window_um
     Iy, Ix = (
-        legendre.interpolation(my, y_um / wy),
-        legendre.interpolation(mx, x_um / wx),
+        legendre.interpolation_matrix(my, y_um / wy),
+        legendre.interpolation_matrix(mx, x_um / wx),
     )
     window_terms = np.einsum(
         "Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True
     )
-    e_um = legendre.nodes(chosen.nodes[0])[0]
-    p_um = legendre.nodes(chosen.directions)[0]
-    Ie, Ip = legendre.interpolation(me, e_um), legendre.interpolation(mp, p_um)
+    e_um = legendre.gauss_legendre_nodes(chosen.nodes[0])[0]
+    p_um = legendre.gauss_legendre_nodes(chosen.directions)[0]
+    Ie, Ip = (
+        legendre.interpolation_matrix(me, e_um),
+        legendre.interpolation_matrix(mp, p_um),
+    )
     lens_terms = np.einsum(
         "Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True
     )

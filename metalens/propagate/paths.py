@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.paths import longer, sensor_path
-from metalens.lens import media, saddle
-from metalens.propagate.geometry import Case
+from metalens.core.arrays import Array
+from metalens.core.paths import hypot_minus_length, sensor_path
+from metalens.lens import media, saddle_correction
+from metalens.propagate.geometry import PropagationCase
 
 SOME = 32  # pillars along an axis whose rays tell what films leave out
 
 
-def reference_depth(case: Case) -> float:
+def reference_depth(case: PropagationCase) -> float:
     """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the
     range.
     """
@@ -37,7 +37,9 @@ def reference_depth(case: Case) -> float:
     return (min(inverse) + max(inverse)) / 2
 
 
-def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
+def from_source(
+    case: PropagationCase, x: Any, y: Any, tangents: Any, inverse: Any
+) -> Any:
     """Optical path from a source to (x, y), less its path to the lens centre, um; numpy
     or torch operands.
 
@@ -47,7 +49,7 @@ def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
 
 
 def to_sensor(
-    case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None
+    case: PropagationCase, x: Any, y: Any, centre: tuple[float, float] | None = None
 ) -> Any:
     """Optical path from (x, y) on the lens to a point of the sensor, by default the
     middle of the window, less that
@@ -61,7 +63,7 @@ def to_sensor(
     return media.longer(pairs, media.square(pairs, reach2), reach2, more)[1]
 
 
-def chief_path(case: Case) -> float:
+def chief_path(case: PropagationCase) -> float:
     """Optical path from the lens centre to the window centre, um: the phase that all
     methods share.
     """
@@ -72,7 +74,9 @@ def chief_path(case: Case) -> float:
     return float(media.whole_path(pairs, media.square(pairs, reach2)))
 
 
-def beyond(case: Case, x: Any, y: Any, X: Any, Y: Any) -> tuple[Any, Any]:
+def ray_to_offset(
+    case: PropagationCase, x: Any, y: Any, X: Any, Y: Any
+) -> tuple[Any, Any]:
     """(amplitude, path) from lens (x, y) to the window offset (X, Y); the path less
     that to the window's centre.
     """
@@ -81,24 +85,26 @@ def beyond(case: Case, x: Any, y: Any, X: Any, Y: Any) -> tuple[Any, Any]:
     if case.behind is None:
         k, d = case.wavenumber, case.sensor_distance_um
         r_w = np.sqrt(dx * dx + dy * dy + d * d)
-        away = longer(r_w, more)
+        away = hypot_minus_length(r_w, more)
         r = r_w + away
         return d / (2 * np.pi * r * r) * (1 / r - 1j * k), away
     reach2 = dx * dx + dy * dy
     w0 = media.square(case.behind.layers, reach2)
     w, away = media.longer(case.behind.layers, w0, reach2, more)
-    return amplitude(case, case.behind.layers, w), away
+    return ray_amplitude(case, case.behind.layers, w), away
 
 
-def amplitude(case: Case, pairs: media.Pairs, w: Any) -> Any:
+def ray_amplitude(case: PropagationCase, pairs: media.Pairs, w: Any) -> Any:
     """Complex amplitude of the module's heading for the ray of w = p², the phase kL
     taken off.
     """
-    real, ahead, aside = amplitudes(case, pairs, w)
+    real, ahead, aside = ray_amplitude_parts(case, pairs, w)
     return -1j * real * (ahead + 1j * aside)
 
 
-def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any, Any]:
+def ray_amplitude_parts(
+    case: PropagationCase, pairs: media.Pairs, w: Any
+) -> tuple[Any, Any, Any]:
     """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the
     ray of w = p²; for complex
     steps in w and in thicknesses, on which C itself counts as not depending."""
@@ -110,12 +116,12 @@ def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any, Any]:
     turn = 1 / (k * media.whole_path(pairs, w))
     if case.behind is None:
         return level, 1 + 0 * turn, turn
-    ahead, aside = saddle(case.behind, k, case.reach_um).at(w)
+    ahead, aside = saddle_correction(case.behind, k, case.reach_um).at(w)
     return level, 1 - turn * aside, turn * ahead
 
 
-def apart(case: Case, w: Array) -> tuple[Array, Array]:
-    """Amplitudes of s and of p light behind films over :func:`amplitude`, of rays of w
+def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]:
+    """Amplitudes of s and of p light behind films over :func:`ray_amplitude`, of rays of w
     = p²; complex.
     """
     behind, k = case.behind, case.wavenumber
@@ -124,10 +130,13 @@ def apart(case: Case, w: Array) -> tuple[Array, Array]:
     powers = media.passed_apart(behind.order, w)
     turn, (ahead, aside) = (
         1 / (k * media.whole_path(behind.layers, w)),
-        saddle(behind, k, case.reach_um).at(w),
+        saddle_correction(behind, k, case.reach_um).at(w),
     )
     found = []
-    every = saddle(behind, k, case.reach_um, "s"), saddle(behind, k, case.reach_um, "p")
+    every = (
+        saddle_correction(behind, k, case.reach_um, "s"),
+        saddle_correction(behind, k, case.reach_um, "p"),
+    )
     for own, power in zip(every, powers, strict=True):
         own_ahead, own_aside = own.at(w)
         waves = (1 - turn * own_aside + 1j * turn * own_ahead) / (
@@ -137,7 +146,7 @@ def apart(case: Case, w: Array) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
-def films_error(case: Case, level: Array) -> float:
+def films_error(case: PropagationCase, level: Array) -> float:
     """Relative L2 error of PSFs by what the kernel leaves out of the plane waves
     through films; 0 in one medium.
 
@@ -159,11 +168,11 @@ def films_error(case: Case, level: Array) -> float:
         )
     )
     w = media.square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
-    error = saddle(case.behind, case.wavenumber, case.reach_um).error(w)
+    error = saddle_correction(case.behind, case.wavenumber, case.reach_um).error(w)
     return 2 * float(np.sqrt((light * error**2).sum() / light.sum()))
 
 
-def cosines(case: Case, across: Any, far: Any) -> Any:
+def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
     """p along x of the rays to the window centre from lens points ``across``, ``far``
     beside it: n sin θ cos φ.
     """
@@ -173,7 +182,7 @@ def cosines(case: Case, across: Any, far: Any) -> Any:
     return across / media.bend(pairs, media.square(pairs, across * across + far * far))
 
 
-def cosine_y(case: Case, p: Any, e: Any) -> Any:
+def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
     """q along y of the ray from lens row e with p along x to the window centre."""
     far = e - case.centre_um[1]
     if case.behind is None:
@@ -184,7 +193,9 @@ def cosine_y(case: Case, p: Any, e: Any) -> Any:
     return far / media.bend(pairs, media.square(pairs, far * far, p * p))
 
 
-def residual(case: Case, p: Any, e: Any, X: Any, Y: Any) -> tuple[Any, Any]:
+def residual_path(
+    case: PropagationCase, p: Any, e: Any, X: Any, Y: Any
+) -> tuple[Any, Any]:
     """(amplitude, path difference + pX + qY) of the ray (p, e), without cancellation."""
     far = e - case.centre_um[1]
     if case.behind is None:
@@ -197,10 +208,12 @@ def residual(case: Case, p: Any, e: Any, X: Any, Y: Any) -> tuple[Any, Any]:
         return d / (2 * np.pi * r * r) * (1 / r - 1j * k), path
     w0, g, more = _from_ray(case, p, far, X, Y)
     w, away = media.longer(case.behind.layers, w0, (p * g) ** 2 + far * far, more)
-    return amplitude(case, case.behind.layers, w), away + p * X + far / g * Y
+    return ray_amplitude(case, case.behind.layers, w), away + p * X + far / g * Y
 
 
-def _from_ray(case: Case, p: Any, far: Any, X: Any, Y: Any) -> tuple[Any, Any, Any]:
+def _from_ray(
+    case: PropagationCase, p: Any, far: Any, X: Any, Y: Any
+) -> tuple[Any, Any, Any]:
     """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x
     from ``far`` rows away.
     """
@@ -210,7 +223,7 @@ def _from_ray(case: Case, p: Any, far: Any, X: Any, Y: Any) -> tuple[Any, Any, A
     return w0, g, X * X + Y * Y - 2 * (g * p * X + far * Y)
 
 
-def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
+def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
     """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x
     and y, at fixed pillar.
     """
@@ -228,8 +241,8 @@ def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
     return out
 
 
-def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
-    """As :func:`slopes` through films: the cover takes what the distance gains; by
+def _slopes(case: PropagationCase, p: Any, far: Any, X: Any, Y: Any) -> Array:
+    """As :func:`kernel_derivatives` through films: the cover takes what the distance gains; by
     complex steps.
     """
     h = 1e-30
@@ -250,7 +263,7 @@ def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
         else:
             moved = moved + 2j * h * (across, down)[step - 1]
         w = media.square(pairs, moved)
-        level, ahead, aside = amplitudes(case, pairs, w)
+        level, ahead, aside = ray_amplitude_parts(case, pairs, w)
         rate = level.imag / level.real + (ahead.imag + 1j * aside.imag) / (
             ahead.real + 1j * aside.real
         )
@@ -258,44 +271,46 @@ def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
     return np.stack(np.broadcast_arrays(*out))
 
 
-def probe() -> Array:
+def probe_positions() -> Array:
     """Positions along an axis at which a smooth function is looked at."""
     return np.array([-1.0, 0.0, 1.0])
 
 
-def kernel(case: Case, x: Any, y: Any, X: Any, Y: Any, inverse: Any) -> Array:
+def rayleigh_sommerfeld_kernel(
+    case: PropagationCase, x: Any, y: Any, X: Any, Y: Any, inverse: Any
+) -> Array:
     """K of the module's heading, without the pillar's area, at lens (x, y) and window
     offset (X, Y).
     """
-    level, away = beyond(case, x, y, X, Y)
+    level, away = ray_to_offset(case, x, y, X, Y)
     path = away + from_source(case, x, y, case.tangents, inverse)
     path = path - from_source(case, x, y, case.tangents, reference_depth(case))
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
 
 
-def direction_range(case: Case, rows_um: Array) -> tuple[float, float]:
+def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float]:
     """(least, largest) p = n sin θ cos φ over the lens, for the row nodes given; never
     of zero width.
     """
     high_x = case.half_size_um[1]
     edge = np.array([-high_x, high_x]) - case.centre_um[0]
     far = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
-    p = cosines(case, edge, np.array([[np.abs(far).min()], [np.abs(far).max()]]))
+    p = ray_cosines(case, edge, np.array([[np.abs(far).min()], [np.abs(far).max()]]))
     low, high = float(p.min()), float(p.max())
     spare = max(1e-9, 1e-6 * (high - low))
     most = 1.0 if case.behind is None else case.behind.layers[0][0]
     return max(low - spare, -most + 1e-15), min(high + spare, most - 1e-15)
 
 
-def correction(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
+def plane_wave_residual(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
     """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w
     + pX + qY)).
     """
-    level, path = residual(case, p, e, X, Y)
+    level, path = residual_path(case, p, e, X, Y)
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
 
 
-def over_blocks(case: Case) -> Callable[[Any, Any], Array]:
+def over_blocks(case: PropagationCase) -> Callable[[Any, Any], Array]:
     """The kernel at (y, x) of the lens for the corners and the middle of the window and
     the extreme depths.
     """
@@ -305,6 +320,8 @@ def over_blocks(case: Case) -> Callable[[Any, Any], Array]:
     )
     X, Y, v = (
         g.reshape(-1, 1, 1, 1)
-        for g in np.meshgrid(probe() * wx, probe() * wy, inverse, indexing="ij")
+        for g in np.meshgrid(
+            probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
+        )
     )
-    return lambda y, x: kernel(case, x, y, X, Y, v)
+    return lambda y, x: rayleigh_sommerfeld_kernel(case, x, y, X, Y, v)

@@ -17,22 +17,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.threads import split
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.threads import run_split
 from metalens.propagate.blocks import (
     CHUNK,
     NODES,
     ORDER,
     SHARE,
-    Blocks,
-    Carrier,
+    AxisBlocks,
     Kernel,
+    ReferencePhase,
     carrier_turns,
-    choose,
+    choose_blocks,
 )
-from metalens.propagate.compiled import gather, spread
-from metalens.propagate.geometry import Case
+from metalens.propagate.compiled import grid_pillars, interpolate_to_pillars
+from metalens.propagate.geometry import PropagationCase
 
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
 # factors on the light of several
@@ -46,7 +46,7 @@ DEVICE_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Moments:
+class PillarMoments:
     """How pillars are reduced.
 
     blocks: of rows and columns; carrier: the phase that is taken off; table: its
@@ -57,8 +57,8 @@ class Moments:
     moments that have a share.
     """
 
-    blocks: tuple[Blocks, Blocks]
-    carrier: Carrier
+    blocks: tuple[AxisBlocks, AxisBlocks]
+    carrier: ReferencePhase
     table: Any
     rows: torch.Tensor
     columns: torch.Tensor
@@ -84,8 +84,8 @@ class Moments:
         return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
 
-def moments(
-    case: Case,
+def plan_moments(
+    case: PropagationCase,
     reference: float,
     weights: tuple[Callable[[Array], Array], ...],
     kernel: Kernel,
@@ -95,21 +95,21 @@ def moments(
     device: torch.device | None = None,
     nodes: int = NODES,
     more: int = 0,
-) -> Moments:
+) -> PillarMoments:
     """Blocks, and what light at their nodes is worth in each moment.
 
     Args:
         weights: of the rows and of the columns, (place,) um to (place, m): polynomials,
             or shares of an even grid.
-        kernel, nodes, more: as :func:`metalens.propagate.blocks.choose`.
+        kernel, nodes, more: as :func:`metalens.propagate.blocks.choose_blocks`.
     """
     itemsize = torch.finfo(dtype).bits // 8
-    blocks = choose(
+    blocks = choose_blocks(
         case, reference, kernel, tolerance / SHARE, itemsize, nodes=nodes, more=more
     )
     rows, columns = blocks
     width = columns.length
-    wave = Carrier(
+    wave = ReferencePhase(
         case,
         reference,
         rows,
@@ -125,7 +125,7 @@ def moments(
     polynomials = [
         torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found
     ]
-    return Moments(
+    return PillarMoments(
         blocks,
         wave,
         table,
@@ -160,8 +160,8 @@ def _in(bands: Bands, start: int, stop: int) -> Bands:
     return [(at, to) for at, to in cut if at.start < at.stop]
 
 
-def reduce(
-    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments
+def reduce_to_moments(
+    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: PillarMoments
 ) -> tuple[torch.Tensor, float]:
     """(m, n) complex moments of a lens, and the sum of squares of its transmission.
 
@@ -187,7 +187,7 @@ def reduce(
     return torch.complex(parts[0], parts[1]), float(power)
 
 
-def mixed(
+def mix_components(
     light: torch.Tensor, pupils: Pupils | None, places_um: tuple[Array, Array]
 ) -> list[tuple[float, torch.Tensor]]:
     """Sign and light of every component, from the light of every map (map, e, x) at
@@ -210,7 +210,7 @@ class _Reduce(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments
+        ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: PillarMoments
     ) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.save_for_backward(phase, level)
         ctx.plan = plan
@@ -238,7 +238,7 @@ class _Reduce(torch.autograd.Function):
         return out_phase, out_level, None
 
 
-def _table(plan: Moments, panel: slice, dtype: Any) -> Any:
+def _table(plan: PillarMoments, panel: slice, dtype: Any) -> Any:
     """Carrier polynomials of a panel."""
     return (
         plan.carrier.table(panel.start, panel.stop, dtype)
@@ -247,7 +247,7 @@ def _table(plan: Moments, panel: slice, dtype: Any) -> Any:
     )
 
 
-def _fixed(plan: Moments, dtype: Any) -> tuple[Array, Any, Any]:
+def _fixed(plan: PillarMoments, dtype: Any) -> tuple[Array, Any, Any]:
     """What both loops know of the blocks: positions of the rows, shares of the nodes,
     first pillars.
     """
@@ -260,13 +260,13 @@ def _fixed(plan: Moments, dtype: Any) -> tuple[Array, Any, Any]:
 
 
 def _gather(
-    phase: torch.Tensor, level: torch.Tensor, plan: Moments
+    phase: torch.Tensor, level: torch.Tensor, plan: PillarMoments
 ) -> tuple[torch.Tensor, float]:
     """Moments by the compiled loops."""
     maps = phase.detach().numpy(), level.detach().numpy()
     (rows, columns), (m, n) = plan.blocks, plan.counts
     out = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
-    kernel: Any = gather
+    kernel: Any = grid_pillars
     powers: list[float] = []
     along, shares, (row_bases, column_bases) = _fixed(plan, out.numpy().dtype)
     # block rows at once, where maps of another dtype are copied
@@ -300,7 +300,7 @@ def _gather(
                 part = view[i * rows.nodes : end * rows.nodes]
                 powers.append(kernel(*few, table[i:end], along, shares, bases, 0, part))
 
-        split(count, work)
+        run_split(count, work)
         sums = torch.zeros((count * rows.nodes * 2, n), dtype=out.dtype)
         for at, to in plan.bands[1]:
             sums[:, to].addmm_(nodes.flatten(0, 1)[:, at], plan.columns[at, to])
@@ -314,7 +314,7 @@ def _gather(
 
 def _spread(
     maps: tuple[torch.Tensor, torch.Tensor],
-    plan: Moments,
+    plan: PillarMoments,
     grad: torch.Tensor,
     out: tuple[Any, Any],
 ) -> None:
@@ -326,7 +326,7 @@ def _spread(
     targets = tuple(none if t is None else t.numpy() for t in out)
     rows, (m, n) = plan.blocks[0], plan.counts
     inner = grad.movedim(0, 1).reshape(m, 2 * n)
-    kernel: Any = spread
+    kernel: Any = interpolate_to_pillars
     fixed = _fixed(plan, phase.dtype)
     for panel in plan.panels:
         table = _table(plan, panel, phase.dtype)
@@ -338,10 +338,10 @@ def _spread(
             part = nodes[a * rows.nodes : b * rows.nodes]
             kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
 
-        split(panel.stop - panel.start, work)
+        run_split(panel.stop - panel.start, work)
 
 
-def _given(plan: Moments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
+def _given(plan: PillarMoments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
     """Gradients (m, re/im · n) of the moments to those of the nodes of a panel (row
     node, re/im, column node).
     """
@@ -356,7 +356,7 @@ def _given(plan: Moments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
     return nodes.view(-1, 2, columns.count * columns.nodes)
 
 
-def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
+def _phasors(phase: torch.Tensor, plan: PillarMoments, start: int) -> torch.Tensor:
     """(y, x) complex phasors of some rows, for devices without compiled loops."""
     wave = plan.carrier
     y, x = (torch.tensor(v, device=phase.device) for v in wave.case.pillars_um)
@@ -369,7 +369,7 @@ def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
 
 
 def _gather_plain(
-    phase: torch.Tensor, level: torch.Tensor, plan: Moments
+    phase: torch.Tensor, level: torch.Tensor, plan: PillarMoments
 ) -> tuple[torch.Tensor, float]:
     """Moments by plain tensor operations, for devices without compiled loops: every
     pillar is a node.
@@ -390,7 +390,7 @@ def _gather_plain(
 
 def _spread_plain(
     maps: tuple[torch.Tensor, torch.Tensor],
-    plan: Moments,
+    plan: PillarMoments,
     grad: torch.Tensor,
     out: tuple[Any, Any],
 ) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numba.extending import overload
 from numpy.polynomial import Chebyshev, Polynomial
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 def _fit(series: Any, degree: int) -> Array:
@@ -43,7 +43,7 @@ _S8, _C8 = tuple(float(v) for v in SINE[8]), tuple(float(v) for v in COSINE[8])
 
 
 @numba.njit(inline="always")
-def turns64(t):  # type: ignore[no-untyped-def]
+def sincos_turns64(t):  # type: ignore[no-untyped-def]
     """(cos 2πt, sin 2πt) in float64 for t in [-1/2, 1/2]."""
     u = t * t
     s = _S8[5] + u * (_S8[6] + u * (_S8[7] + u * (_S8[8] + u * (_S8[9] + u * _S8[10]))))
@@ -58,7 +58,7 @@ def turns64(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def turns32(t):  # type: ignore[no-untyped-def]
+def sincos_turns32(t):  # type: ignore[no-untyped-def]
     """(cos 2πt, sin 2πt) in float32 for t in [-1/2, 1/2]."""
     x = np.float32(t)
     u = x * x
@@ -71,15 +71,15 @@ def turns32(t):  # type: ignore[no-untyped-def]
     return c * c - s * s, np.float32(2) * s * c
 
 
-def turns(t: Any, like: Any) -> Any:
+def sincos_turns(t: Any, like: Any) -> Any:
     """(cos 2πt, sin 2πt) in the precision of the array ``like``; compiled loops choose
     while they are compiled.
     """
-    return turns32(t) if like.dtype == np.float32 else turns64(t)
+    return sincos_turns32(t) if like.dtype == np.float32 else sincos_turns64(t)
 
 
-@overload(turns, inline="always")
+@overload(sincos_turns, inline="always")
 def _turns(t, like):  # type: ignore[no-untyped-def]
     if like.dtype == numba.float32:
-        return lambda t, like: turns32(t)
-    return lambda t, like: turns64(t)
+        return lambda t, like: sincos_turns32(t)
+    return lambda t, like: sincos_turns64(t)

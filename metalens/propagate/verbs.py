@@ -15,28 +15,28 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Media, media
-from metalens.propagate.choice import Choice, choose
+from metalens.propagate.choice import MethodChoice, choose_method
 from metalens.propagate.direct import angular_spectrum as _angular_spectrum
 from metalens.propagate.direct import field_at, field_exact
-from metalens.propagate.geometry import Case
+from metalens.propagate.geometry import PropagationCase
 
 __all__ = [
-    "Case",
-    "Choice",
+    "MethodChoice",
+    "PropagationCase",
     "angular_spectrum",
-    "case",
-    "choose",
+    "choose_method",
     "exact",
     "field_at",
     "field_exact",
+    "make_case",
     "windowed",
 ]
 
 
-def case(
+def make_case(
     shape: Sequence[int],
     *,
     pitch_um: float,
@@ -50,7 +50,7 @@ def case(
     layers: Layers | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,
-) -> Case:
+) -> PropagationCase:
     """Geometry of one propagation.
 
     Args:
@@ -76,16 +76,17 @@ def case(
             films without a gap and rays beyond their critical angle, a stop in front.
     """
     step_um, cells = window_of(window_um, samples)
-    ax, ay = angles(angle_rad)
+    ax, ay = to_angle_pair(angle_rad)
     tangents = float(np.tan(ax)), float(np.tan(ay))
     depths = _depths(depths_um, offset_um)
     d = sensor_distance_um
     films = _films(layers, float(d), float(wavelength_um))
     meets = [
-        chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i])
+        chief_ray_offset(films.get("behind"), float(d), tangents, i)
+        + float(offset_um[i])
         for i in (0, 1)
     ]
-    made = Case(
+    made = PropagationCase(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
         wavelength_um=float(wavelength_um),
@@ -114,10 +115,10 @@ def _films(
         )
     if layers is None or layers.plain or not sensor_distance_um > 0:
         return {}
-    return around(layers, sensor_distance_um, wavelength_um)
+    return film_settings(layers, sensor_distance_um, wavelength_um)
 
 
-def _check_rays(case: Case) -> None:
+def _check_rays(case: PropagationCase) -> None:
     """Refuse rays that no face lets through: where films fill the whole gap, those that
     its cover cannot hold.
     """
@@ -178,7 +179,7 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
     return step, (down, across)
 
 
-def around(
+def film_settings(
     layers: Layers, sensor_distance_um: float, wavelength_um: float
 ) -> dict[str, Any]:
     """``front`` and ``behind`` of a :class:`Case` with these films.
@@ -195,7 +196,7 @@ def around(
     return {"front": films, "behind": layers.after(sensor_distance_um, wavelength_um)}
 
 
-def chief(
+def chief_ray_offset(
     behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int
 ) -> Any:
     """Where the chief ray of these tangents (in air) meets the sensor, along x (axis 0)
@@ -218,7 +219,7 @@ def chief(
     return media.bend(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
 
 
-def angles(angle_rad: Any) -> tuple[float, float]:
+def to_angle_pair(angle_rad: Any) -> tuple[float, float]:
     """(x, y) field angle from a number or a pair.
 
     Raises:
@@ -248,7 +249,7 @@ def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
         phase_rad: (y, x) phase of every pillar.
         transmission: (y, x) magnitude |T| of every pillar.
         geometry: pitch, wavelength, distances, angle and window by name, as
-            :func:`case`.
+            :func:`make_case`.
 
     Returns:
         (depth, y, x) complex128 field; its square is the irradiance for unit irradiance
@@ -266,7 +267,7 @@ def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
     0.003765
     """
     phase, level = np.asarray(phase_rad), np.asarray(transmission)
-    return field_exact(phase, level, case(phase.shape, **geometry))
+    return field_exact(phase, level, make_case(phase.shape, **geometry))
 
 
 def angular_spectrum(
@@ -283,10 +284,10 @@ def angular_spectrum(
 
     Args:
         pad, band_limited, single: padding factor, band limit, complex64.
-        geometry: as :func:`case`; the window must lie on the pillars' lattice.
+        geometry: as :func:`make_case`; the window must lie on the pillars' lattice.
     """
     phase, level = np.asarray(phase_rad), np.asarray(transmission)
-    one = case(phase.shape, **geometry)
+    one = make_case(phase.shape, **geometry)
     return _angular_spectrum(
         phase, level, one, pad=pad, band_limited=band_limited, single=single
     )
@@ -302,7 +303,7 @@ def windowed(
         phase_rad, transmission: (y, x) torch tensors or numpy arrays, float32 or
             float64.
         tolerance: relative error of the field that the node counts are chosen for.
-        geometry: as :func:`case`.
+        geometry: as :func:`make_case`.
 
     Returns:
         (depth, y, x) complex, of the kind that came in.
@@ -317,7 +318,7 @@ def windowed(
     """
     import torch
 
-    from metalens.propagate.window import field_windowed, plan
+    from metalens.propagate.window import field_windowed, plan_window
 
     if not 0 < tolerance < 1:
         raise PropagationError(
@@ -325,7 +326,9 @@ def windowed(
         )
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
-    made = plan(case(phase.shape, **geometry), tolerance, torch.float64, phase.device)
+    made = plan_window(
+        make_case(phase.shape, **geometry), tolerance, torch.float64, phase.device
+    )
     field, _, _ = field_windowed(phase.double(), level.double(), made)
     field = field.to(torch.complex(phase.new_zeros(()), phase.new_zeros(())).dtype)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

@@ -27,12 +27,12 @@ import numpy as np
 import scipy.special
 import torch
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import media
-from metalens.propagate.geometry import Case
-from metalens.propagate.grids import Axis, axes, grid_um, spread_weights
+from metalens.propagate.geometry import PropagationCase
+from metalens.propagate.grids import WideAxis, grid_um, spread_weights, wide_axes
 from metalens.propagate.operators import depth_basis
 from metalens.propagate.paths import (
     from_source,
@@ -40,7 +40,13 @@ from metalens.propagate.paths import (
     reference_depth,
     to_sensor,
 )
-from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
+from metalens.propagate.pillars import (
+    PillarMoments,
+    Pupils,
+    mix_components,
+    plan_moments,
+    reduce_to_moments,
+)
 
 BAND_BYTES = 3e6  # of the depths that are mixed at once
 EVERY = (
@@ -59,9 +65,9 @@ class WidePlan:
     left: of the light of all depths that fewer fields may leave out, root mean square.
     """
 
-    case: Case
-    axes: tuple[Axis, Axis]
-    moments: Moments
+    case: PropagationCase
+    axes: tuple[WideAxis, WideAxis]
+    moments: PillarMoments
     fields: torch.Tensor
     coefficients: torch.Tensor
     chirp: torch.Tensor
@@ -92,19 +98,19 @@ class WidePlan:
 
 
 def wide_plan(
-    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device
+    case: PropagationCase, tolerance: float, dtype: torch.dtype, device: torch.device
 ) -> WidePlan:
     """A new plan.
 
     Raises:
         PropagationError: rays too steep, or too unlike a quadratic, for the method.
     """
-    found = axes(case, tolerance)
+    found = wide_axes(case, tolerance)
     if found is None:
         raise PropagationError(
             "rays to this window are too steep for Fourier transforms; see propagate.choose"
         )
-    pillars = moments(
+    pillars = plan_moments(
         case,
         reference_depth(case),
         tuple(functools.partial(spread_weights, axis) for axis in found),
@@ -128,22 +134,26 @@ def wide_plan(
 
 
 def _depth_fields(
-    case: Case, found: tuple[Axis, Axis], tolerance: float
+    case: PropagationCase, found: tuple[WideAxis, WideAxis], tolerance: float
 ) -> tuple[Iterator[Array], Array]:
     """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth,
     b) coefficients.
     """
     grids = [grid_um(axis) for axis in found]
     counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
-    e, x = (legendre.mapped(n, g[0], g[-1]) for n, g in zip(counts, grids, strict=True))
+    e, x = (
+        legendre.mapped_nodes(n, g[0], g[-1])
+        for n, g in zip(counts, grids, strict=True)
+    )
     depths = depth_basis(case, (e, x), tolerance)
     to = [
-        legendre.interpolation(n, g / g[-1]) for n, g in zip(counts, grids, strict=True)
+        legendre.interpolation_matrix(n, g / g[-1])
+        for n, g in zip(counts, grids, strict=True)
     ]
     return (to[0] @ one @ to[1].T for one in depths.basis), depths.coefficients
 
 
-def _coarse(case: Case, i: int, grid: Array) -> int:
+def _coarse(case: PropagationCase, i: int, grid: Array) -> int:
     """Legendre nodes that hold the phase of the extreme depths along an axis: two a
     turn, and some.
     """
@@ -157,7 +167,7 @@ def _coarse(case: Case, i: int, grid: Array) -> int:
     return 24 + math.ceil(6 * turns)
 
 
-def _lens_phase(case: Case, found: tuple[Axis, Axis]) -> Array:
+def _lens_phase(case: PropagationCase, found: tuple[WideAxis, WideAxis]) -> Array:
     """(y, x) what the light of the grid is multiplied by before the first transform,
     all constants included.
     """
@@ -183,7 +193,7 @@ def _lens_phase(case: Case, found: tuple[Axis, Axis]) -> Array:
     return np.asarray(scale * ramp * np.exp(1j * k * (total - away + start)))
 
 
-def _phase_path(case: Case, w: Any) -> Any:
+def _phase_path(case: PropagationCase, w: Any) -> Any:
     """Φ = Σ t √(n² - w), um."""
     pairs = (
         [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
@@ -191,7 +201,9 @@ def _phase_path(case: Case, w: Any) -> Any:
     return sum(t * (n * n - w) ** 0.5 for n, t in pairs)
 
 
-def _behind(case: Case, found: tuple[Axis, Axis]) -> tuple[Array, Array]:
+def _behind(
+    case: PropagationCase, found: tuple[WideAxis, WideAxis]
+) -> tuple[Array, Array]:
     """(Y, X) chirp of the window behind the first transform, and transfer of what the
     quadratic leaves.
     """
@@ -235,7 +247,7 @@ def _behind(case: Case, found: tuple[Axis, Axis]) -> tuple[Array, Array]:
     return chirps[0][:, None] * chirps[1], transfer
 
 
-def _fade(axis: Axis, past: Array) -> Array:
+def _fade(axis: WideAxis, past: Array) -> Array:
     """1 for rays to the window, 0 past the end of the band, by the integral of a
     Gaussian between.
     """
@@ -257,9 +269,9 @@ def light_wide(
     on their light; None for the
     |U|² of one map.
     """
-    found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
+    found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
     gathered, total = torch.stack([g for g, _ in found]), None
-    for sign, light in mixed(gathered, pupils, plan.nodes_um):
+    for sign, light in mix_components(gathered, pupils, plan.nodes_um):
         mixture, coefficients = (
             (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
         )

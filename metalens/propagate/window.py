@@ -12,22 +12,28 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.threads import one_blas_thread
+from metalens.core import legendre
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.threads import one_blas_thread
 from metalens.propagate.estimate import MORE
-from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.nodes import Layout, layout
+from metalens.propagate.geometry import PropagationCase, window_tiles
+from metalens.propagate.nodes import WindowLayout, plan_layout
 from metalens.propagate.operators import (
-    Depths,
+    DepthBasis,
+    build_operators,
     depth_basis,
     depth_factors,
-    operators,
-    pairs,
+    significant_pairs,
 )
 from metalens.propagate.paths import over_blocks, reference_depth, to_sensor
-from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
+from metalens.propagate.pillars import (
+    PillarMoments,
+    Pupils,
+    mix_components,
+    plan_moments,
+    reduce_to_moments,
+)
 from metalens.propagate.wide import WidePlan, wide_plan
 
 SMOOTH = (
@@ -39,7 +45,7 @@ BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cac
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Plan:
+class WindowPlan:
     """Everything that depends on the geometry alone, ready for many lenses.
 
     The moments go ``MORE`` orders beyond what the method uses, for the error estimate.
@@ -49,11 +55,11 @@ class Plan:
     window's centre to the tile's own on the nodes of the whole window.
     """
 
-    case: Case
+    case: PropagationCase
     tolerance: float
-    layout: Layout
-    depths: Depths
-    moments: Moments
+    layout: WindowLayout
+    depths: DepthBasis
+    moments: PillarMoments
     tensors: dict[str, torch.Tensor]
     slopes: dict[int, dict[str, torch.Tensor]] = dataclasses.field(default_factory=dict)
 
@@ -90,7 +96,7 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Moving:
+class MovingGeometry:
     """Geometry that carries gradients, float64 tensors: tangents (2,), inverse depths
     (depth,), sensor distance (),
     window centre (2,). Values must be those of the plan's case."""
@@ -101,25 +107,25 @@ class Moving:
     centre: torch.Tensor
 
 
-Kept = TypeVar("Kept", Plan, WidePlan)
+Kept = TypeVar("Kept", WindowPlan, WidePlan)
 _kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
 _lock = threading.Lock()
 
 
-def plan(
-    case: Case,
+def plan_window(
+    case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,
     device: torch.device,
     moving: bool = False,
     *,
     smooth: bool = False,
-) -> Plan:
+) -> WindowPlan:
     """Plan a windowed propagation; those used last are kept, as many as fit in
     ``KEPT_BYTES``.
 
     Args:
-        moving: for use with :class:`Moving`. smooth: with factors (``Pupils``) on the
+        moving: for use with :class:`MovingGeometry`. smooth: with factors (``Pupils``) on the
             light of the nodes.
 
     Raises:
@@ -132,7 +138,7 @@ def plan(
 
 
 def plan_wide(
-    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device
+    case: PropagationCase, tolerance: float, dtype: torch.dtype, device: torch.device
 ) -> WidePlan:
     """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
 
@@ -163,16 +169,16 @@ def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
 
 
 def _planned(
-    case: Case,
+    case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,
     device: torch.device,
     *,
     moving: bool,
     smooth: bool,
-) -> Plan:
+) -> WindowPlan:
     """A new plan."""
-    found = layout(case, tolerance)
+    found = plan_layout(case, tolerance)
     if found is None:
         raise PropagationError(
             "the window is too large for one plan; see propagate.choose, or make it smaller"
@@ -181,10 +187,10 @@ def _planned(
     ny, nx = (n + lens for n in found.nodes)
     found = dataclasses.replace(found, nodes=(ny, nx))
     reference = reference_depth(case)
-    pillars = moments(
+    pillars = plan_moments(
         case,
         reference,
-        polynomials(case, (ny + MORE, nx + MORE)),
+        legendre_bases(case, (ny + MORE, nx + MORE)),
         over_blocks(case),
         tolerance=tolerance,
         dtype=dtype,
@@ -197,18 +203,18 @@ def _planned(
     tensors = _shared(case, found, depths, dtype, device) | _stacked(
         case, found, depths, tolerance, (dtype, device)
     )
-    return Plan(case, tolerance, found, depths, pillars, tensors)
+    return WindowPlan(case, tolerance, found, depths, pillars, tensors)
 
 
-def polynomials(
-    case: Case, counts: tuple[int, int]
+def legendre_bases(
+    case: PropagationCase, counts: tuple[int, int]
 ) -> tuple[Callable[[Array], Array], ...]:
     """Legendre polynomials over the rows and over the columns of the lens, as weights
     of :func:`moments`.
     """
 
     def over(count: int, half_um: float) -> Callable[[Array], Array]:
-        return lambda places_um: legendre.values(count, places_um / half_um)
+        return lambda places_um: legendre.legendre_values(count, places_um / half_um)
 
     return tuple(over(n, h) for n, h in zip(counts, case.half_size_um, strict=True))
 
@@ -217,15 +223,19 @@ def _complex(dtype: torch.dtype) -> torch.dtype:
     return torch.complex64 if dtype == torch.float32 else torch.complex128
 
 
-def _nodes_um(case: Case, counts: tuple[int, int]) -> tuple[Array, Array]:
+def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Array]:
     hy, hx = case.half_size_um
-    return np.asarray(legendre.mapped(counts[0], -hy, hy)), np.asarray(
-        legendre.mapped(counts[1], -hx, hx)
+    return np.asarray(legendre.mapped_nodes(counts[0], -hy, hy)), np.asarray(
+        legendre.mapped_nodes(counts[1], -hx, hx)
     )
 
 
 def _shared(
-    case: Case, found: Layout, depths: Depths, dtype: torch.dtype, device: torch.device
+    case: PropagationCase,
+    found: WindowLayout,
+    depths: DepthBasis,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> dict[str, torch.Tensor]:
     """Moments to the nodes of the window, those to the nodes of the tiles, and the
     depths.
@@ -235,9 +245,11 @@ def _shared(
         ("rows", "columns"), found.nodes, found.sizes.nodes, strict=True
     ):
         arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
-        arrays[f"{name}_to_tile"] = legendre.interpolation(few, legendre.nodes(all_)[0])
+        arrays[f"{name}_to_tile"] = legendre.interpolation_matrix(
+            few, legendre.gauss_legendre_nodes(all_)[0]
+        )
     e, x = _nodes_um(case, found.nodes)
-    parts = [part for row in tiles(case, found.parts)[1] for part in row]
+    parts = [part for row in window_tiles(case, found.parts)[1] for part in row]
     away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
     return {
@@ -247,9 +259,9 @@ def _shared(
 
 
 def _stacked(
-    case: Case,
-    found: Layout,
-    depths: Depths,
+    case: PropagationCase,
+    found: WindowLayout,
+    depths: DepthBasis,
     tolerance: float,
     kind: tuple[torch.dtype, torch.device],
     slope: int | None = None,
@@ -257,11 +269,13 @@ def _stacked(
     """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any
     of them needs; ``fields`` are
     the depth fields of the pairs."""
-    parts = [part for row in tiles(case, found.parts)[1] for part in row]
-    made = [operators(part, found.sizes, tolerance, slope=slope) for part in parts]
+    parts = [part for row in window_tiles(case, found.parts)[1] for part in row]
+    made = [
+        build_operators(part, found.sizes, tolerance, slope=slope) for part in parts
+    ]
     most = max(len(one.strength) for one in made)
     strength = np.max([_padded(one.strength, most) for one in made], axis=0)
-    kept = pairs(strength, depths.strength, tolerance / 2)
+    kept = significant_pairs(strength, depths.strength, tolerance / 2)
     arrays = {
         name: np.stack([getattr(one, name) for one in made])
         for name in ("along_y", "along_x")
@@ -285,7 +299,7 @@ def _padded(array: Array, count: int) -> Array:
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
-def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
+def _slope(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
     """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2);
     kept with the plan.
     """
@@ -300,8 +314,8 @@ def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
 def field_windowed(
     phase_rad: torch.Tensor,
     transmission: torch.Tensor,
-    plan: Plan,
-    moving: Moving | None = None,
+    plan: WindowPlan,
+    moving: MovingGeometry | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, float]:
     """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of
     squares of its transmission.
@@ -309,14 +323,14 @@ def field_windowed(
     Differentiable in phase and transmission (y, x), and in ``moving`` where given
     (first derivatives).
     """
-    gathered, power = reduce(phase_rad, transmission, plan.moments)
+    gathered, power = reduce_to_moments(phase_rad, transmission, plan.moments)
     return from_moments(gathered, plan, moving), gathered.detach(), power
 
 
 def light_windowed(
     maps: tuple[torch.Tensor, torch.Tensor],
-    plan: Plan,
-    moving: Moving | None,
+    plan: WindowPlan,
+    moving: MovingGeometry | None,
     pupils: Pupils | None,
 ) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
     """Light on the window, (depth, y, x); the moments of every map; the sums of squares
@@ -326,9 +340,9 @@ def light_windowed(
     made ``smooth``; None for the
     |U|² of one map.
     """
-    found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
+    found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
     gathered, powers = torch.stack([g for g, _ in found]), [power for _, power in found]
-    parts = mixed(_on_nodes(gathered, plan), pupils, plan.whole_um)
+    parts = mix_components(_on_nodes(gathered, plan), pupils, plan.whole_um)
     lit = [(sign, _from_nodes(light, plan, moving)) for sign, light in parts]
     total = functools.reduce(
         torch.add,
@@ -342,13 +356,13 @@ def _power(field: torch.Tensor) -> torch.Tensor:
 
 
 def from_moments(
-    gathered: torch.Tensor, plan: Plan, moving: Moving | None = None
+    gathered: torch.Tensor, plan: WindowPlan, moving: MovingGeometry | None = None
 ) -> torch.Tensor:
     """(depth, y, x) field on the window from the moments of a lens."""
     return _from_nodes(_on_nodes(gathered, plan), plan, moving)
 
 
-def _on_nodes(gathered: torch.Tensor, plan: Plan) -> torch.Tensor:
+def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     """(…, e, x) light on the nodes of the whole window from moments (…, m, n)."""
     ny, nx = plan.layout.nodes
     return (
@@ -358,19 +372,23 @@ def _on_nodes(gathered: torch.Tensor, plan: Plan) -> torch.Tensor:
     )
 
 
-def _from_nodes(light: torch.Tensor, plan: Plan, moving: Moving | None) -> torch.Tensor:
+def _from_nodes(
+    light: torch.Tensor, plan: WindowPlan, moving: MovingGeometry | None
+) -> torch.Tensor:
     """(depth, y, x) field on the window from the light on its nodes."""
     t = plan.tensors
     fewer = t["rows_to_tile"].T @ (light * t["turn"]) @ t["columns_to_tile"]
     coefficients = t["coefficients"] if moving is None else _coefficients(plan, moving)
     given = fewer[:, None] * t["basis"]
-    field = _at_depths(zoom(given, t), coefficients)
+    field = _at_depths(zoom_to_tiles(given, t), coefficients)
     if moving is not None:
         for axis, value in enumerate(
             (moving.distance, moving.centre[0], moving.centre[1])
         ):
             if value.requires_grad:
-                rate = _at_depths(zoom(given, _slope(plan, axis)), coefficients)
+                rate = _at_depths(
+                    zoom_to_tiles(given, _slope(plan, axis)), coefficients
+                )
                 field = (
                     field + (value - value.detach()) * rate
                 )  # adds nothing but the derivative
@@ -382,11 +400,11 @@ def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor
     return (fields @ coefficients.T).permute(0, 3, 2, 1)
 
 
-def _joined(field: torch.Tensor, plan: Plan) -> torch.Tensor:
+def _joined(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where
     the next one begins.
     """
-    (rows, columns), _ = tiles(plan.case, plan.layout.parts)
+    (rows, columns), _ = window_tiles(plan.case, plan.layout.parts)
     (my, mx), n = plan.case.samples, len(columns)
     heights, widths = np.diff([*rows, my]).tolist(), np.diff([*columns, mx]).tolist()
     bands = [
@@ -398,7 +416,7 @@ def _joined(field: torch.Tensor, plan: Plan) -> torch.Tensor:
     return torch.cat(bands, -2)
 
 
-def _coefficients(plan: Plan, moving: Moving) -> torch.Tensor:
+def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
     """(depth, b) of the depth basis, differentiable in the source's position."""
     device = moving.tangents.device
     e, x = (torch.tensor(v, device=device) for v in plan.nodes_um)
@@ -408,14 +426,17 @@ def _coefficients(plan: Plan, moving: Moving) -> torch.Tensor:
         plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse
     )
     weight = torch.tensor(
-        np.outer(legendre.nodes(ny)[1], legendre.nodes(nx)[1]), device=device
+        np.outer(
+            legendre.gauss_legendre_nodes(ny)[1], legendre.gauss_legendre_nodes(nx)[1]
+        ),
+        device=device,
     )
     basis = torch.tensor(plan.depths.basis, device=device)
     found = (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
     return found.to(plan.tensors["coefficients"].dtype)
 
 
-def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
+def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
     """Light on the lens nodes, a field for every tile and basis function (tile, b, e,
     x), to (tile, X, Y, b).
     """

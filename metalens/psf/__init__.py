@@ -8,7 +8,7 @@ sees; ``save`` and ``load`` keep a stack as a file.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.psf import among as among
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from metalens.psf.budget import Budget as Budget
     from metalens.psf.budget import LeftOut as LeftOut
     from metalens.psf.budget import Polarisation as Polarisation
-    from metalens.psf.budget import aperture as aperture
     from metalens.psf.budget import scalar_error as scalar_error
+    from metalens.psf.budget import sine_aperture as sine_aperture
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
@@ -28,33 +28,33 @@ if TYPE_CHECKING:
     from metalens.psf.metrics import DiffractionLimit as DiffractionLimit
     from metalens.psf.metrics import FocusMetrics as FocusMetrics
     from metalens.psf.metrics import blur_um as blur_um
-    from metalens.psf.metrics import brightest as brightest
     from metalens.psf.metrics import diffraction_limit as diffraction_limit
     from metalens.psf.metrics import encircled_power as encircled_power
+    from metalens.psf.metrics import find_peak as find_peak
     from metalens.psf.metrics import fwhm as fwhm
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import all_maps as all_maps
     from metalens.psf.of_lens import from_lens as from_lens
-    from metalens.psf.of_lens import incidence as incidence
+    from metalens.psf.of_lens import library_incidence as library_incidence
+    from metalens.psf.of_lens import mean_over_polarizations as mean_over_polarizations
     from metalens.psf.of_lens import passed_um2 as passed_um2
-    from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
     from metalens.psf.record import PsfStack as PsfStack
     from metalens.psf.record import SourceShape as SourceShape
     from metalens.psf.record import load as load
     from metalens.psf.record import save as save
-    from metalens.psf.spectrum import Nodes as Nodes
     from metalens.psf.spectrum import Source as Source
+    from metalens.psf.spectrum import SpectralNodes as SpectralNodes
     from metalens.psf.stack import psf_stack as psf_stack
-    from metalens.psf.vector import Mixed as Mixed
+    from metalens.psf.vector import VectorPupil as VectorPupil
     from metalens.psf.vector import beyond_faces as beyond_faces
+    from metalens.psf.vector import dominant_components as dominant_components
     from metalens.psf.vector import of_flux as of_flux
-    from metalens.psf.vector import strongest as strongest
-    from metalens.psf.vector import turned as turned
+    from metalens.psf.vector import transmitted_polarization as transmitted_polarization
     from metalens.psf.z_scan import FocusScan as FocusScan
     from metalens.psf.z_scan import focus_scan as focus_scan
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Budget": "budget",
@@ -64,9 +64,9 @@ __getattr__, __dir__, __all__ = attach(
         "FocusMetrics": "metrics",
         "FocusScan": "z_scan",
         "LeftOut": "budget",
-        "Mixed": "vector",
+        "VectorPupil": "vector",
         "NEIGHBOURS": "budget",
-        "Nodes": "spectrum",
+        "SpectralNodes": "spectrum",
         "Polarisation": "budget",
         "PsfStack": "record",
         "Source": "spectrum",
@@ -74,10 +74,10 @@ __getattr__, __dir__, __all__ = attach(
         "View": "of_lens",
         "all_maps": "of_lens",
         "among": "",
-        "aperture": "budget",
+        "sine_aperture": "budget",
         "beyond_faces": "vector",
         "blur_um": "metrics",
-        "brightest": "metrics",
+        "find_peak": "metrics",
         "diffraction_limit": "metrics",
         "encircled_power": "metrics",
         "export": "",
@@ -86,8 +86,8 @@ __getattr__, __dir__, __all__ = attach(
         "focus_scan": "z_scan",
         "from_lens": "of_lens",
         "fwhm": "metrics",
-        "incidence": "of_lens",
-        "unpolarised": "of_lens",
+        "library_incidence": "of_lens",
+        "mean_over_polarizations": "of_lens",
         "load": "record",
         "of_flux": "vector",
         "on_pixels": "pixels",
@@ -97,7 +97,7 @@ __getattr__, __dir__, __all__ = attach(
         "save": "record",
         "scalar_error": "budget",
         "spectrum": "",
-        "strongest": "vector",
-        "turned": "vector",
+        "dominant_components": "vector",
+        "transmitted_polarization": "vector",
     },
 )

@@ -1,5 +1,5 @@
 """Pillars among unlike neighbours: the factor C of solved rows
-(:class:`metalens.lens.Neighbours`) on a lens's maps.
+(:class:`metalens.lens.NeighbourRows`) on a lens's maps.
 
     C(s, α),  s = λ |∇φ| / 2π,  α the azimuth of ∇φ          slope of the lens's own phase at every pillar
     J = C_along g gᵀ + C_across (1 - g gᵀ),  g = ∇φ/|∇φ|      on the field of the light that comes (x, y)
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from metalens.lens import Neighbours
+from metalens.lens import NeighbourRows
 
 # pillars to each side over which phasors are averaged: single pillars err, slopes of
 # lenses hardly change
@@ -24,7 +24,7 @@ ROWS = 256  # of pillars at a time
 _FLAT = 1e-8  # (rad/um)² below which a slope has no azimuth
 
 
-class Jones(NamedTuple):
+class NeighbourJonesFactors(NamedTuple):
     """Complex factors on the field of every pillar, (…, y, x); yx is xy."""
 
     xx: Tensor
@@ -32,7 +32,7 @@ class Jones(NamedTuple):
     xy: Tensor
 
 
-def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
+def phase_slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     """(…, y, x) slopes along x and y of the phase of complex t, rad/um, from the pairs
     of pillars around each.
 
@@ -70,37 +70,39 @@ def _around(pairs: Tensor, *, along: int) -> Tensor:
     return pairs
 
 
-def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
+def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> Tensor:
     """(…, y, x) complex: mean of C over both polarisations at every pillar of complex
     t.
     """
     parts = []
     for inner, some in _shares(light):
-        s, aside, _ = _turned(*slopes(some, pitch_um), neighbours)
+        s, aside, _ = _turned(*phase_slopes(some, pitch_um), neighbours)
         parts.append(neighbours.of_both(s, aside)[..., inner, :])
     return torch.cat(parts, -2)
 
 
-def scalar(
-    phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float
+def apply_scalar_coupling(
+    phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
 ) -> tuple[Tensor, Tensor]:
     """(phase, transmission) of (…, y, x) maps times that mean."""
-    factor = mean(torch.polar(level, phase), neighbours, pitch_um)
+    factor = mean_coupling(torch.polar(level, phase), neighbours, pitch_um)
     return phase + torch.angle(factor), level * factor.abs()
 
 
-def jones(
-    phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float
-) -> Jones:
+def apply_jones_coupling(
+    phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
+) -> NeighbourJonesFactors:
     """J of (…, y, x) maps, complex."""
     parts = []
     for inner, some in _shares(torch.polar(level, phase)):
-        s, aside, (cosine2, both) = _turned(*slopes(some, pitch_um), neighbours)
+        s, aside, (cosine2, both) = _turned(*phase_slopes(some, pitch_um), neighbours)
         along, across = (neighbours.of_field(field, s, aside) for field in (0, 1))
         apart = along - across
         found = across + apart * cosine2, along - apart * cosine2, apart * both
         parts.append([one[..., inner, :] for one in found])
-    return Jones(*(torch.cat(one, -2) for one in zip(*parts, strict=True)))
+    return NeighbourJonesFactors(
+        *(torch.cat(one, -2) for one in zip(*parts, strict=True))
+    )
 
 
 def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
@@ -118,7 +120,7 @@ def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
 
 
 def _turned(
-    across: Tensor, down: Tensor, neighbours: Neighbours
+    across: Tensor, down: Tensor, neighbours: NeighbourRows
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Sine by which light is turned, sin² 2α, and (cos² α, cos α sin α)."""
     square = across * across + down * down

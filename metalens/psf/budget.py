@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import jv
 
-from metalens.ground.arrays import Array
-from metalens.lens import CURVED, Lens, Neighbours, media
+from metalens.core.arrays import Array
+from metalens.lens import CURVED, Lens, NeighbourRows, media
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
@@ -56,7 +56,7 @@ class LeftOut:
     angle: relative change of t over sin² of the incidence. of: whose numbers they are.
     """
 
-    neighbours: Neighbours | tuple[complex, complex] = NEIGHBOURS
+    neighbours: NeighbourRows | tuple[complex, complex] = NEIGHBOURS
     angle: float = ANGLE
     of: str = ""
 
@@ -167,7 +167,7 @@ def _together(*terms: float) -> float:
     return math.hypot(*(term for term in terms if not math.isnan(term)))
 
 
-def worst(budgets: list[Budget]) -> Budget:
+def worst_of_budgets(budgets: list[Budget]) -> Budget:
     """The largest of every term."""
     names = [f.name for f in fields(Budget)]
     return Budget(**{n: _largest([getattr(b, n) for b in budgets]) for n in names})
@@ -239,7 +239,7 @@ def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
     return _together(scalar_error(aperture, uneven), budget.polarisation)
 
 
-def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
+def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Half the spread in sin θ of the rays from the lens to the chief ray's place on
     the sensor.
     """
@@ -253,7 +253,7 @@ def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
-def uneven(lens: Lens, angle_rad: tuple[float, float]) -> float:
+def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Standard deviation over its mean of 1/cos θ of the rays from the lens to the
     chief ray's place on the sensor.
     """
@@ -303,7 +303,7 @@ class _Seen:
 
 def _neighbours(
     aperture: float,
-    known: Neighbours | tuple[complex, complex],
+    known: NeighbourRows | tuple[complex, complex],
     polarisation: Polarisation,
     seen: _Seen,
 ) -> float:

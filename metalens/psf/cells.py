@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from metalens.ground.errors import PropagationError
-from metalens.propagate import Case, cosines
+from metalens.core.errors import PropagationError
+from metalens.propagate import PropagationCase, ray_cosines
 
 MOST = 6000  # fine samples along an axis
 BORDER = 2  # points around the window, for its differences
@@ -26,7 +26,7 @@ FINER = (2, 4, 8)  # points in Nyquist's step that are tried
 
 
 @dataclass(frozen=True, slots=True)
-class Cells:
+class PixelCells:
     """points: along each axis of a cell, 1 where samples are close enough; case: with
     the finer window.
 
@@ -36,22 +36,22 @@ class Cells:
     """
 
     points: int
-    case: Case
+    case: PropagationCase
     left: tuple[float, float] = (0.0, 0.0)
 
 
-def nyquist_um(case: Case) -> float:
+def nyquist_um(case: PropagationCase) -> float:
     """Largest step at which samples of |U|² on the window fold nothing."""
     (hy, hx), (cx, cy) = case.half_size_um, case.centre_um
     band = 0.0
     for half, centre, beside, away in ((hx, cx, hy, cy), (hy, cy, hx, cx)):
         far = max(abs(away) - beside, 0.0)
-        p = cosines(case, np.array([-half, half]) - centre, np.array([far, far]))
+        p = ray_cosines(case, np.array([-half, half]) - centre, np.array([far, far]))
         band = max(band, float(p[1] - p[0]) / case.wavelength_um)
     return 1 / (2 * band)
 
 
-def cells(case: Case, finer: int = FINER[0]) -> Cells:
+def plan_pixel_cells(case: PropagationCase, finer: int = FINER[0]) -> PixelCells:
     """How a window is sampled: as it is, or ``finer`` points in Nyquist's step.
 
     Raises:
@@ -60,7 +60,7 @@ def cells(case: Case, finer: int = FINER[0]) -> Cells:
     """
     limit = nyquist_um(case)
     if case.step_um <= limit * (1 + 1e-9):
-        return Cells(1, case)
+        return PixelCells(1, case)
     points = finer * math.ceil(case.step_um / limit)
     count = max(case.samples) * points + 2 * BORDER
     if count > MOST:
@@ -70,7 +70,7 @@ def cells(case: Case, finer: int = FINER[0]) -> Cells:
         )
     down, across = (n * points + 2 * BORDER for n in case.samples)
     fine = replace(case, step_um=case.step_um / points, samples=(down, across))
-    return Cells(points, fine, _left(math.sin(math.pi / (2 * finer))))
+    return PixelCells(points, fine, _left(math.sin(math.pi / (2 * finer))))
 
 
 def _left(s: float) -> tuple[float, float]:
@@ -81,7 +81,9 @@ def _left(s: float) -> tuple[float, float]:
     return (1 - second - fourth - s / math.asin(s)) / fourth, fourth / second
 
 
-def integrated(light: torch.Tensor, fine: Cells) -> tuple[torch.Tensor, float]:
+def integrate_cells(
+    light: torch.Tensor, fine: PixelCells
+) -> tuple[torch.Tensor, float]:
     """(…, y, x) means over the cells of fine samples with a border of two, and the
     error of the integration.
 

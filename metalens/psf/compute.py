@@ -10,29 +10,29 @@ from typing import Any
 import numpy as np
 import torch
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.propagate import (
     SHARE,
-    Case,
-    Choice,
-    Moving,
+    ErrorSample,
+    MethodChoice,
+    MovingGeometry,
+    PropagationCase,
     Pupils,
-    Sample,
     check_aperture,
     chief_path,
-    choose,
+    choose_method,
     field_exact,
     light_wide,
     light_windowed,
-    mixed,
+    mix_components,
     paths,
-    plan,
     plan_wide,
+    plan_window,
     pupil_error,
     relative_error,
 )
-from metalens.psf.vector import Mixing, has_faces, s_and_p
+from metalens.psf.vector import PolarizationMixing, has_faces, s_and_p
 
 FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
 # times the light of random phases below which float32 loses what is left of the sum
@@ -73,7 +73,7 @@ KEPT = {
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Result:
+class IntensityResult:
     """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and
     why it stopped.
 
@@ -102,16 +102,16 @@ class Result:
         return math.hypot(self.error, self.sampling, self.source)
 
 
-def intensity(
+def compute_intensity(
     phase: torch.Tensor,
     level: torch.Tensor,
-    cases: list[Case],
+    cases: list[PropagationCase],
     weights: list[float],
     *,
     tolerance: float,
     moving: Any = None,
-    mixing: Mixing | None = None,
-) -> Result:
+    mixing: PolarizationMixing | None = None,
+) -> IntensityResult:
     """|U|² on the window, wavelengths added with their weights.
 
     Args:
@@ -128,12 +128,12 @@ def intensity(
     case. Dim and tiny windows are summed in float64, since the estimate knows rounding
     as noise of a mean size only.
     """
-    lit = Lit(phase, level, cases, weights, mixing)
+    lit = IntensityRequest(phase, level, cases, weights, mixing)
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
     if (
         not needs_grad and phase.device.type == "cpu"
     ):  # at the setting that the windowed method begins with
-        choices = [choose(case, max(tolerance / 2, FINEST)) for case in cases]
+        choices = [choose_method(case, max(tolerance / 2, FINEST)) for case in cases]
         if all(choice.method == "exact" for choice in choices):
             return _exact(lit, choices[0].reason)
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
@@ -157,7 +157,7 @@ def intensity(
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
-    return Result(
+    return IntensityResult(
         result.intensity.to(phase.dtype),
         error,
         result.reason,
@@ -167,18 +167,20 @@ def intensity(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lit:
-    """What :func:`intensity` is asked of."""
+class IntensityRequest:
+    """What :func:`compute_intensity` is asked of."""
 
     phase: torch.Tensor
     level: torch.Tensor
-    cases: list[Case]
+    cases: list[PropagationCase]
     weights: list[float]
-    mixing: Mixing | None = None
+    mixing: PolarizationMixing | None = None
 
     def each(
         self,
-    ) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor], Case, float, Pupils | None]]:
+    ) -> Iterator[
+        tuple[tuple[torch.Tensor, torch.Tensor], PropagationCase, float, Pupils | None]
+    ]:
         """(maps of one, case, weight, components) of every wavelength."""
         count = 1 if self.mixing is None else self.mixing.maps
         for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
@@ -200,7 +202,7 @@ class Lit:
         return max(paths.films_error(case, level) for case, level in each)
 
     @property
-    def judged(self) -> Callable[[Case], Pupils] | None:
+    def judged(self) -> Callable[[PropagationCase], Pupils] | None:
         """Factors on the light of single points that it is compared with: of both
         polarisations by their own rays, or
         of s and p apart where a scalar meets faces of films."""
@@ -208,7 +210,9 @@ class Lit:
             return self.mixing.pupils
         return s_and_p if has_faces(self.cases[0]) else None
 
-    def power(self, case: Case, powers: list[float], level: torch.Tensor) -> float:
+    def power(
+        self, case: PropagationCase, powers: list[float], level: torch.Tensor
+    ) -> float:
         """What the pillars of a wavelength let through, from the sums of squares of its
         maps.
         """
@@ -217,7 +221,7 @@ class Lit:
         )
 
 
-def _exact(lit: Lit, reason: str) -> Result:
+def _exact(lit: IntensityRequest, reason: str) -> IntensityResult:
     total: Any = 0.0
     power, noise, samples = 0.0, 0.0, []
     for (phase, level), case, weight, pupils in lit.each():
@@ -233,17 +237,19 @@ def _exact(lit: Lit, reason: str) -> Result:
                 * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
             )
             continue
-        for sign, light in mixed(
+        for sign, light in mix_components(
             torch.polar(level.double(), phase.double()), pupils, case.pillars_um
         ):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
     error = math.hypot(EXACT[lit.phase.dtype], lit.films, _noisy_sum(total, noise))
-    found = Result(torch.as_tensor(total).to(lit.phase.dtype), error, reason, power)
+    found = IntensityResult(
+        torch.as_tensor(total).to(lit.phase.dtype), error, reason, power
+    )
     return _from_middle(found, lit, [samples], [total])
 
 
-def _turned(phase: torch.Tensor, level: torch.Tensor, case: Case) -> float:
+def _turned(phase: torch.Tensor, level: torch.Tensor, case: PropagationCase) -> float:
     """Rounding of a pillar's phase in float64, rad: of the paths to it and on to the
     window, and of its own phase.
     """
@@ -263,10 +269,10 @@ def _noisy_sum(light: Array, noise: float) -> float:
 
 def _of_pillars(
     maps: tuple[torch.Tensor, torch.Tensor],
-    case: Case,
+    case: PropagationCase,
     weight: float,
     pupils: Pupils | None,
-) -> Sample:
+) -> ErrorSample:
     """What a sum over all pillars took of a wavelength, to be judged."""
     y, x = case.pillars_um
     path = paths.from_source(
@@ -276,14 +282,17 @@ def _of_pillars(
     light = torch.polar(
         maps[1].double(), maps[0].double() + torch.as_tensor(turn)
     ).numpy()
-    return Sample(
+    return ErrorSample(
         case, weight, light, 0.0, 1, (y, x), None if pupils is None else pupils(y, x)
     )
 
 
 def _from_middle(
-    result: Result, lit: Lit, samples: list[list[Sample]], seen: list[Any]
-) -> Result:
+    result: IntensityResult,
+    lit: IntensityRequest,
+    samples: list[list[ErrorSample]],
+    seen: list[Any],
+) -> IntensityResult:
     """With what rays to the window's middle leave out of both polarisations; of a
     scalar behind films, what it does.
     """
@@ -294,16 +303,18 @@ def _from_middle(
     )
 
 
-def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Result:
+def _windowed(
+    lit: IntensityRequest, dtype: torch.dtype, tolerance: float, moving: Any
+) -> IntensityResult:
     """One try with sums of a dtype: every wavelength and window, then the estimate from
     all of them.
     """
-    choice = choose(
+    choice = choose_method(
         lit.cases[0], tolerance, differentiable=True, moving=moving is not None
     )
     if choice.method == "wide":
         return _wide(lit, dtype, tolerance, choice)
-    samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
+    samples: list[list[ErrorSample]] = [[] for row in choice.tiles for _ in row]
     seen: list[Any] = [0.0] * len(samples)
     total: Any = 0
     given = 0.0
@@ -312,7 +323,7 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
         for row in _windows(case, choice, tolerance):
             parts = []
             for window in row:
-                made = plan(
+                made = plan_window(
                     window,
                     tolerance,
                     dtype,
@@ -331,7 +342,9 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
                 )
                 moments = gathered.cpu().numpy().astype(complex)
                 samples[index].append(
-                    Sample(window, weight, moments, noise, made.layout.parts, pupils=at)
+                    ErrorSample(
+                        window, weight, moments, noise, made.layout.parts, pupils=at
+                    )
                 )
                 here = weight * light
                 parts.append(here)
@@ -365,7 +378,9 @@ def _noisy(powers: list[float], at: Any) -> float:
     return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
 
 
-def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Result:
+def _wide(
+    lit: IntensityRequest, dtype: torch.dtype, tolerance: float, choice: MethodChoice
+) -> IntensityResult:
     """One try of a wide window by Fourier transforms, as :func:`_windowed`."""
     total: Any = None
     power, samples = 0.0, []
@@ -376,7 +391,7 @@ def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Res
         at = None if pupils is None else pupils(*made.nodes_um)
         noise = _phasor(dtype, tolerance, made) * _incoherent(_noisy(powers, at), case)
         given = gathered.cpu().numpy().astype(complex)
-        samples.append(Sample(case, weight, given, noise, 1, made.nodes_um, at))
+        samples.append(ErrorSample(case, weight, given, noise, 1, made.nodes_um, at))
         light = light if weight == 1 else light * weight
         total = light if total is None else total + light
         power += weight * lit.power(case, powers, maps[1])
@@ -386,18 +401,18 @@ def _wide(lit: Lit, dtype: torch.dtype, tolerance: float, choice: Choice) -> Res
     return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
 
 
-def _few_seen(result: Result, tolerance: float) -> Result:
+def _few_seen(result: IntensityResult, tolerance: float) -> IntensityResult:
     """With what an estimate from few of many samples may miss."""
     return replace(result, error=math.hypot(SCATTER * result.error, MISSED * tolerance))
 
 
 def _judged(
     total: torch.Tensor,
-    samples: list[list[Sample]],
+    samples: list[list[ErrorSample]],
     seen: list[Any],
-    given: tuple[list[Case], list[float], float],
-    choice: Choice,
-) -> Result:
+    given: tuple[list[PropagationCase], list[float], float],
+    choice: MethodChoice,
+) -> IntensityResult:
     """The result of a try with its estimate; seen: intensity of each part of the
     window; given: cases, weights, sum of
     squares of the transmission.
@@ -422,14 +437,14 @@ def _judged(
         for case, weight in zip(cases, weights, strict=True)
     )
     error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
-    return Result(total, error, choice.reason, light, brightness=brightness)
+    return IntensityResult(total, error, choice.reason, light, brightness=brightness)
 
 
 def _windows(
-    case: Case, choice: Choice, tolerance: float
-) -> tuple[tuple[Case, ...], ...]:
+    case: PropagationCase, choice: MethodChoice, tolerance: float
+) -> tuple[tuple[PropagationCase, ...], ...]:
     """Windows of a wavelength that are computed apart: cut as at the first wavelength."""
-    found = choose(case, tolerance, differentiable=True).tiles
+    found = choose_method(case, tolerance, differentiable=True).tiles
     if [len(row) for row in found] == [len(row) for row in choice.tiles]:
         return found
     return tuple(
@@ -440,7 +455,7 @@ def _windows(
 
 def _check(
     maps: tuple[torch.Tensor, torch.Tensor],
-    case: Case,
+    case: PropagationCase,
     power: float,
     moments: torch.Tensor,
 ) -> None:
@@ -467,7 +482,9 @@ def _check(
         )
 
 
-def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
+def _shifted(
+    moving: MovingGeometry | None, case: PropagationCase, tile: PropagationCase
+) -> MovingGeometry | None:
     """Moving geometry seen from a tile of the window."""
     if moving is None or tile.centre_um == case.centre_um:
         return moving
@@ -479,7 +496,7 @@ def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
     )
 
 
-def _incoherent(power: float, case: Case) -> float:
+def _incoherent(power: float, case: PropagationCase) -> float:
     """Magnitude of the field at the window centre if all pillars added with random
     phases.
     """

@@ -9,17 +9,23 @@ from typing import Any
 
 import torch
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers, media
-from metalens.propagate import Case, Moving
+from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import extended
-from metalens.psf.among import Jones
+from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import Polarisation
-from metalens.psf.cells import FINER, MOST, Cells, cells, integrated
-from metalens.psf.compute import Result, intensity
+from metalens.psf.cells import (
+    FINER,
+    MOST,
+    PixelCells,
+    integrate_cells,
+    plan_pixel_cells,
+)
+from metalens.psf.compute import IntensityResult, compute_intensity
 from metalens.psf.extended import Extent
-from metalens.psf.vector import Mixing, apart_maps
+from metalens.psf.vector import PolarizationMixing, apart_maps
 
 # of the fields of all depths that are computed at once; each share has a plan of its
 # own
@@ -36,7 +42,7 @@ STRICTER = (
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class DirectionRequest:
     """What is asked of a direction, as in :func:`metalens.psf.psf_stack`.
 
     Raises:
@@ -48,7 +54,7 @@ class Wanted:
     polarisation: Polarisation
     integrate: bool
     source: Extent | None
-    fields: Jones | None = None
+    fields: NeighbourJonesFactors | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.tolerance < 1:
@@ -62,19 +68,19 @@ class Wanted:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Light:
+class LensMaps:
     """Maps (wavelength, y, x) of one lens, and the cases and weights of the
     wavelengths; with ``mixing`` both
     polarisations of so many maps a wavelength. layers: whose stop lays its shadow on
     the maps."""
 
     maps: tuple[torch.Tensor, torch.Tensor]
-    cases: list[Case]
+    cases: list[PropagationCase]
     weights: list[float]
-    mixing: Mixing | None
+    mixing: PolarizationMixing | None
     layers: Layers | None = None
 
-    def at(self, like: Case) -> list[Case]:
+    def at(self, like: PropagationCase) -> list[PropagationCase]:
         """The cases with the direction, depths and window of another."""
         alike = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
         return [
@@ -82,7 +88,7 @@ class Light:
             for c in self.cases
         ]
 
-    def shaded(self, cases: list[Case]) -> tuple[torch.Tensor, torch.Tensor]:
+    def shaded(self, cases: list[PropagationCase]) -> tuple[torch.Tensor, torch.Tensor]:
         """The maps as the light of these cases meets them, each of their first depth."""
         if self.layers is None or self.layers.stop is None:
             return self.maps
@@ -99,7 +105,7 @@ class Light:
         ] * shadow.abs().to(self.maps[1])
 
 
-def _shadow(case: Case, layers: Layers) -> Array:
+def _shadow(case: PropagationCase, layers: Layers) -> Array:
     """(y, x) complex amplitude of the light of a case's first depth at each pillar,
     over that without the stop.
     """
@@ -112,14 +118,14 @@ def _shadow(case: Case, layers: Layers) -> Array:
     )
 
 
-def direction(
+def compute_direction(
     maps: tuple[torch.Tensor, torch.Tensor],
-    cases: list[Case],
+    cases: list[PropagationCase],
     weights: list[float],
-    wanted: Wanted,
-    moving: Moving | None,
+    wanted: DirectionRequest,
+    moving: MovingGeometry | None,
     layers: Layers | None = None,
-) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
+) -> tuple[torch.Tensor, list[IntensityResult], torch.Tensor]:
     """(…, depth, y, x) intensity of every lens, the results it is made of, and (…) the
     sum of squares of what its
     pillars let through the faces behind them.
@@ -134,12 +140,14 @@ def direction(
         )
     mixing = None
     if wanted.polarisation != "scalar":
-        mixing = Mixing(wanted.polarisation == "flux", wanted.fields is not None)
+        mixing = PolarizationMixing(
+            wanted.polarisation == "flux", wanted.fields is not None
+        )
         maps = maps if wanted.fields is None else apart_maps(maps, wanted.fields)
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
     found = [
-        _lens(Light(pair, cases, weights, mixing, layers), wanted, moving)
+        _lens(LensMaps(pair, cases, weights, mixing, layers), wanted, moving)
         for pair in lenses
     ]
     light, results = (
@@ -153,18 +161,22 @@ def direction(
 
 
 def _lens(
-    given: Light, wanted: Wanted, moving: Moving | None
-) -> tuple[torch.Tensor, Result]:
+    given: LensMaps, wanted: DirectionRequest, moving: MovingGeometry | None
+) -> tuple[torch.Tensor, IntensityResult]:
     """(depth, y, x) intensity of one lens, cells as fine as they must be, and its
     result with all errors.
     """
     shortest = min(given.cases, key=lambda case: case.wavelength_um)
     for finer in FINER:
-        fine = cells(shortest, finer) if wanted.integrate else Cells(1, shortest)
+        fine = (
+            plan_pixel_cells(shortest, finer)
+            if wanted.integrate
+            else PixelCells(1, shortest)
+        )
         wide = (
             fine.case
             if wanted.source is None
-            else extended.widened(fine.case, wanted.source)[0]
+            else extended.widen_case(fine.case, wanted.source)[0]
         )
         if max(wide.samples) > MOST and fine.points > 1:
             raise PropagationError(
@@ -197,7 +209,9 @@ def _stacked(parts: list[torch.Tensor]) -> torch.Tensor:
     return parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(parts)
 
 
-def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:
+def _few(
+    wide: PropagationCase, given: LensMaps, moving: MovingGeometry | None
+) -> Iterator[PropagationCase]:
     """The case with as many of its depths as fit in ``HELD_BYTES``; all of them where
     gradients hold them anyway.
     """
@@ -217,8 +231,12 @@ def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:
 
 
 def _depths(
-    given: Light, fine: Cells, some: Case, wanted: Wanted, moving: Moving | None
-) -> tuple[torch.Tensor, Result]:
+    given: LensMaps,
+    fine: PixelCells,
+    some: PropagationCase,
+    wanted: DirectionRequest,
+    moving: MovingGeometry | None,
+) -> tuple[torch.Tensor, IntensityResult]:
     """(depth, y, x) intensity on the window at some depths."""
     if wanted.source is None:
         result = _intensity(given, some, wanted.tolerance, moving)
@@ -226,29 +244,36 @@ def _depths(
     else:
         light, result = _blurred(given, fine, some, wanted.source, wanted.tolerance)
     if fine.points > 1:
-        light, sampling = integrated(light, fine)
+        light, sampling = integrate_cells(light, fine)
         result = replace(result, sampling=sampling)
     return light, replace(result, intensity=light)
 
 
 def _intensity(
-    given: Light, case: Case, tolerance: float, moving: Moving | None
-) -> Result:
+    given: LensMaps,
+    case: PropagationCase,
+    tolerance: float,
+    moving: MovingGeometry | None,
+) -> IntensityResult:
     about: dict[str, Any] = {
         "tolerance": tolerance,
         "moving": moving,
         "mixing": given.mixing,
     }
     cases = given.at(case)
-    return intensity(*given.shaded(cases), cases, given.weights, **about)
+    return compute_intensity(*given.shaded(cases), cases, given.weights, **about)
 
 
 def _blurred(
-    given: Light, fine: Cells, some: Case, source: Extent, tolerance: float
-) -> tuple[torch.Tensor, Result]:
+    given: LensMaps,
+    fine: PixelCells,
+    some: PropagationCase,
+    source: Extent,
+    tolerance: float,
+) -> tuple[torch.Tensor, IntensityResult]:
     """As :func:`_depths` for a source of finite size, on the samples of the cells."""
 
-    def point(case: Case) -> Result:
+    def point(case: PropagationCase) -> IntensityResult:
         return _intensity(given, case, tolerance / STRICTER, None)
 
     result = point(some)
@@ -256,16 +281,16 @@ def _blurred(
         (some.samples[0] - fine.case.samples[0]) // 2,
         (some.samples[1] - fine.case.samples[1]) // 2,
     )
-    light, edge = extended.blurred(result.intensity, some, source, more)
+    light, edge = extended.blur_by_source(result.intensity, some, source, more)
     with torch.no_grad():
-        unlike = extended.unlike(
+        unlike = extended.shift_invariance_error(
             result.intensity, some, source, lambda case: point(case).intensity
         )
     reason = f"{result.reason}; blurred by a {source.shape} source"
     return light, replace(result, source=math.hypot(edge, unlike), reason=reason)
 
 
-def _together(results: list[Result]) -> Result:
+def _together(results: list[IntensityResult]) -> IntensityResult:
     """Of all depths: the largest of every error."""
     first = max(results, key=lambda result: result.error)
     if len(results) == 1:
@@ -279,7 +304,7 @@ def _together(results: list[Result]) -> Result:
     )
 
 
-def _passed(case: Case) -> float:
+def _passed(case: PropagationCase) -> float:
     """Power that the faces behind the lens let through along the chief ray."""
     if case.behind is None:
         return 1.0

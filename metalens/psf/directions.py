@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, sparse, special
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.paths import source_path
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.paths import source_path
 from metalens.lens import Lens
-from metalens.psf.of_lens import incidence
+from metalens.psf.of_lens import library_incidence
 
 MOST_SITES = 25_000_000  # 5000 x 5000: 1.5 GB
 # radius of the circle that is counted as one beam, wavelength / aperture width: 98 % of
@@ -34,7 +34,7 @@ _ROWS = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Beam:
+class DiffractedBeam:
     """Light about one direction. sine_x, sine_y: its centre, direction cosines; share:
     of the transmitted light.
     """
@@ -75,7 +75,7 @@ class FarField:
     share: Array
     sines: Array
     rings: Array
-    beams: tuple[Beam, ...]
+    beams: tuple[DiffractedBeam, ...]
     beam_sine: float
     beam_holds: float
     beyond: float
@@ -163,7 +163,7 @@ def _behind(
         raise PropagationError(
             "films in front of the lens: its far field is of plane waves; give sources_mm = inf"
         )
-    seen = 0.0 if lens.pairs is not None else incidence(lens, angle_rad)
+    seen = 0.0 if lens.pairs is not None else library_incidence(lens, angle_rad)
     d, k = lens.diameters, 2 * math.pi / wavelength_um
     tangents = tuple(math.tan(a) for a in angle_rad)
     level = lens.transmission(wavelength_um, seen)
@@ -273,7 +273,7 @@ def _overlap(axis: Array, square: float, count: int) -> sparse.csr_array:
 
 def _beams(
     plain: "_Sum", power: Array, p: tuple[Array, Array], radius: float, held: float
-) -> tuple[Beam, ...]:
+) -> tuple[DiffractedBeam, ...]:
     """Brightest spots one after the other, the circle of each taken out before the next
     is looked for.
 
@@ -297,7 +297,7 @@ def _beams(
             break
         if inner >= SPOT * total:
             found.append(
-                Beam(
+                DiffractedBeam(
                     *plain.peak(p[0][j], p[1][i], p[0][1] - p[0][0], p[1][1] - p[1][0]),
                     total / held,
                 )

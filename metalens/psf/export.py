@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.store import write_bytes
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.store import write_bytes
 from metalens.psf.record import PsfStack, save
 
 SUFFIXES = (".h5", ".tif", ".tiff", ".mat", ".fits")
@@ -20,7 +20,7 @@ _NAMES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
 _NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 
 
-def check(path: str | Path) -> None:
+def check_psf_format(path: str | Path) -> None:
     """Refuse a file name that says no known format.
 
     Raises:
@@ -32,7 +32,7 @@ def check(path: str | Path) -> None:
         )
 
 
-def write(path: str | Path, stack: PsfStack) -> None:
+def export_psf(path: str | Path, stack: PsfStack) -> None:
     """Write a stack in the format that the name's ending says; same stack, same bytes.
 
     ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32
@@ -49,15 +49,18 @@ def write(path: str | Path, stack: PsfStack) -> None:
     Raises:
         PropagationError: another ending.
     """
-    check(path)
+    check_psf_format(path)
     suffix = Path(path).suffix.lower()
     if suffix == ".h5":
         save(path, stack)
     else:
-        write_bytes(path, {".mat": matlab, ".fits": fits}.get(suffix, tiff)(stack))
+        write_bytes(
+            path,
+            {".mat": write_matlab, ".fits": write_fits}.get(suffix, write_tiff)(stack),
+        )
 
 
-def tiff(stack: PsfStack) -> bytes:
+def write_tiff(stack: PsfStack) -> bytes:
     """TIFF file of all PSFs."""
     import tifffile
 
@@ -92,7 +95,7 @@ def tiff(stack: PsfStack) -> bytes:
     return file.getvalue()
 
 
-def matlab(stack: PsfStack) -> bytes:
+def write_matlab(stack: PsfStack) -> bytes:
     """MATLAB 5 file; the header holds no date."""
     from scipy.io import savemat
 
@@ -109,7 +112,7 @@ def matlab(stack: PsfStack) -> bytes:
     )
 
 
-def fits(stack: PsfStack) -> bytes:
+def write_fits(stack: PsfStack) -> bytes:
     """FITS file of all PSFs; needs astropy (extra ``fits``)."""
     from astropy.io import fits as library
 

@@ -23,10 +23,10 @@ import torch
 from scipy.special import j1, jv
 
 from metalens import propagate
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.lens import media
-from metalens.propagate import Case
+from metalens.propagate import PropagationCase
 from metalens.psf.cells import MOST, nyquist_um
 from metalens.psf.record import SourceShape
 
@@ -97,7 +97,7 @@ def _sinc_slope(u: Any) -> Array:
     )
 
 
-def images(case: Case, extent: Extent) -> Array:
+def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
     """(depth, 2, 2) M of the module's heading times the size: sizes of the source to um
     on the sensor, [x, y].
 
@@ -110,7 +110,7 @@ def images(case: Case, extent: Extent) -> Array:
     )
 
 
-def _turn(case: Case, extent: Extent, inverse: float) -> Array:
+def _turn(case: PropagationCase, extent: Extent, inverse: float) -> Array:
     """(2, 2) change of the tangents by one size of the source along x and y."""
     if extent.size_rad:
         return -extent.size_rad * np.eye(2)
@@ -124,15 +124,21 @@ def _turn(case: Case, extent: Extent, inverse: float) -> Array:
     )
 
 
-def _met(case: Case, tangents: tuple[float, float]) -> list[float]:
+def _met(case: PropagationCase, tangents: tuple[float, float]) -> list[float]:
     """(x, y) where the chief ray meets the sensor."""
     return [
-        float(propagate.chief(case.behind, case.sensor_distance_um, tangents, i))
+        float(
+            propagate.chief_ray_offset(
+                case.behind, case.sensor_distance_um, tangents, i
+            )
+        )
         for i in (0, 1)
     ]
 
 
-def _place(case: Case, tangents: tuple[float, float], depth_um: float) -> list[float]:
+def _place(
+    case: PropagationCase, tangents: tuple[float, float], depth_um: float
+) -> list[float]:
     """(x, y) of the source of these tangents (in air) on its plane, through the films
     in front.
     """
@@ -144,7 +150,7 @@ def _place(case: Case, tangents: tuple[float, float], depth_um: float) -> list[f
     return [-away * tangents[0], -away * tangents[1]]
 
 
-def _slopes(of: Any, case: Case) -> Array:
+def _slopes(of: Any, case: PropagationCase) -> Array:
     """(2, 2) derivatives of a place [x, y] by the tangents of the case [x, y], to 1e-9."""
     h = 1e-4
     tx, ty = case.tangents
@@ -152,7 +158,9 @@ def _slopes(of: Any, case: Case) -> Array:
     return np.array([np.subtract(of(a), of(b)) / (2 * h) for a, b in pairs]).T
 
 
-def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
+def widen_case(
+    fine: PropagationCase, extent: Extent
+) -> tuple[PropagationCase, tuple[int, int]]:
     """The case with the samples around its window that the source blurs into it, and
     how many (y, x) on each side.
 
@@ -167,7 +175,7 @@ def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
             "the cells be integrated, or give more samples"
         )
     guard = GUARD * math.ceil(limit / fine.step_um)
-    far = reach(fine, extent)
+    far = source_image_reach(fine, extent)
     more = far[0] + guard, far[1] + guard
     samples = fine.samples[0] + 2 * more[0], fine.samples[1] + 2 * more[1]
     if max(samples) > MOST:
@@ -178,8 +186,8 @@ def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
     return replace(fine, samples=samples), more
 
 
-def blurred(
-    light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, int]
+def blur_by_source(
+    light: torch.Tensor, case: PropagationCase, extent: Extent, more: tuple[int, int]
 ) -> tuple[torch.Tensor, float]:
     """(depth, y, x) light on the window from that on the widened one, and what is wrong
     at its edges, relative L2.
@@ -187,7 +195,8 @@ def blurred(
     whole = _filtered(light, case, extent, 0)
     with torch.no_grad():
         down, across = (
-            (n - far) // 2 for n, far in zip(more, reach(case, extent), strict=True)
+            (n - far) // 2
+            for n, far in zip(more, source_image_reach(case, extent), strict=True)
         )
         inner = torch.zeros_like(light)
         inner[..., down:-down, across:-across] = light[..., down:-down, across:-across]
@@ -196,12 +205,14 @@ def blurred(
     return _cropped(whole, more).clamp_min(0), edge
 
 
-def reach(case: Case, extent: Extent) -> tuple[int, int]:
+def source_image_reach(case: PropagationCase, extent: Extent) -> tuple[int, int]:
     """(y, x) samples that the image of the source reaches from its middle, at the depth
     where that is most.
     """
     x, y = np.ceil(
-        np.abs(images(case, extent)).sum(2).max(0) * REACH[extent.shape] / case.step_um
+        np.abs(source_to_image_matrices(case, extent)).sum(2).max(0)
+        * REACH[extent.shape]
+        / case.step_um
     )
     return int(y), int(x)
 
@@ -211,7 +222,7 @@ def _cropped(light: torch.Tensor, more: tuple[int, int]) -> torch.Tensor:
 
 
 def _filtered(
-    light: torch.Tensor, case: Case, extent: Extent, which: int
+    light: torch.Tensor, case: PropagationCase, extent: Extent, which: int
 ) -> torch.Tensor:
     """Light through ŵ (which 0), or through √(|ŵ|² + |∇ŵ|²/(2πσ)²) (which 1)."""
     shape = [scipy.fft.next_fast_len(n, real=True) for n in light.shape[-2:]]
@@ -220,7 +231,7 @@ def _filtered(
         np.fft.rfftfreq(shape[1], case.step_um),
     )
     filters = []
-    for m in images(case, extent):
+    for m in source_to_image_matrices(case, extent):
         level, slope = extent.transform(
             m[0, 0] * fx + m[1, 0] * fy, m[0, 1] * fx + m[1, 1] * fy
         )
@@ -234,11 +245,11 @@ def _filtered(
     return found[..., : light.shape[-2], : light.shape[-1]]
 
 
-def unlike(
+def shift_invariance_error(
     light: torch.Tensor,
-    case: Case,
+    case: PropagationCase,
     extent: Extent,
-    probe: Callable[[Case], torch.Tensor],
+    probe: Callable[[PropagationCase], torch.Tensor],
 ) -> float:
     """Relative L2 error of taking the PSF as alike over the source, at the nearest and
     the farthest depth.
@@ -272,7 +283,7 @@ def unlike(
     return max(found)
 
 
-def _moved(case: Case, turn: Array) -> Case:
+def _moved(case: PropagationCase, turn: Array) -> PropagationCase:
     """The case of a source whose tangents are changed; the window follows its chief
     ray.
     """

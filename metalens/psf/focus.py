@@ -9,22 +9,22 @@ import numpy as np
 import torch
 
 from metalens import propagate
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import Lens
-from metalens.psf.budget import aperture
+from metalens.psf.budget import sine_aperture
 from metalens.psf.metrics import (
     SPOT_FWHM,
     FocusMetrics,
     Point,
-    brightest,
     diffraction_limit,
     encircled_power,
+    find_peak,
     half_maximum,
     mtf50,
 )
 from metalens.psf.of_lens import all_maps, passed_um2
 from metalens.psf.record import PsfStack
-from metalens.psf.spectrum import Nodes
+from metalens.psf.spectrum import SpectralNodes
 
 BLOCK = 8  # pillars along a side over which the distance to the focus counts as one
 
@@ -86,9 +86,9 @@ def _of_one(
     d = lens.diameters
     # a round aperture of the same area as the cells that the light reaches
     part = math.sqrt(area_um2 / math.pi) / (d.radius_um + d.pitch_um / 2)
-    sine = min(part, 1.0) * aperture(lens, angle)
+    sine = min(part, 1.0) * sine_aperture(lens, angle)
     limit = diffraction_limit(sine, float(stack.weights @ stack.wavelengths_um))
-    peak = brightest(light)
+    peak = find_peak(light)
     width, slope = half_maximum(light, peak)
     fwhm_um = width * step
     power = energy_um2 / area_um2
@@ -160,7 +160,9 @@ def in_phase_irradiance(
 
     Accuracy: the distance to the focus is taken as one over 8 x 8 pillars: 1e-4.
     """
-    nodes = Nodes(np.asarray(stack.wavelengths_um), np.asarray(stack.weights), 0.0)
+    nodes = SpectralNodes(
+        np.asarray(stack.wavelengths_um), np.asarray(stack.weights), 0.0
+    )
     level = all_maps(lens, nodes, angle_rad, torch.float32, scalar=True)[0][1].numpy()
     d = lens.diameters
     level = level * np.abs(stop_shadow(lens, angle_rad, depth_um))
@@ -168,7 +170,7 @@ def in_phase_irradiance(
     for one, wave, weight in zip(
         level, nodes.wavelengths_um.tolist(), nodes.weights.tolist(), strict=True
     ):
-        case = propagate.case(
+        case = propagate.make_case(
             one.shape,
             **d.grid._asdict(),
             wavelength_um=wave,
@@ -184,7 +186,7 @@ def in_phase_irradiance(
             _blocks(a[None])[0] / _blocks(np.ones((1, len(a))))[0]
             for a in case.pillars_um
         )
-        strength, _ = propagate.paths.beyond(case, x, y[:, None], 0.0, 0.0)
+        strength, _ = propagate.paths.ray_to_offset(case, x, y[:, None], 0.0, 0.0)
         total += weight * (case.area_um2 * float((sums * np.abs(strength)).sum())) ** 2
     return total
 

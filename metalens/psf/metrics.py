@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage, optimize, special
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
 from metalens.psf.record import PsfStack
 
 Normalisation = Literal["sum", "l2", "none"]
@@ -40,7 +40,9 @@ def mtf(stack: PsfStack, *, frequencies_per_um: Array) -> Array:
     return np.asarray(np.abs(np.stack(lines, axis=-2)))
 
 
-def encircled(stack: PsfStack, *, radii_um: Array, of_window: bool = True) -> Array:
+def encircled_energy(
+    stack: PsfStack, *, radii_um: Array, of_window: bool = True
+) -> Array:
     """Share of the light within circles about the centroid of each PSF: (…, depth,
     radius).
 
@@ -216,7 +218,7 @@ def diffraction_limit(
     )
 
 
-def brightest(light: Array) -> tuple[float, float, float]:
+def find_peak(light: Array) -> tuple[float, float, float]:
     """(row, column, value) of the peak of (y, x) samples, by a quintic spline."""
     spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
     start = np.array(np.unravel_index(int(light.argmax()), light.shape), float)
@@ -238,7 +240,7 @@ def fwhm(light: Array, step_um: float) -> float:
     Of the mean over all directions about the peak; nan where it does not fall to one
     half within the window.
     """
-    return half_maximum(light, brightest(light))[0] * step_um
+    return half_maximum(light, find_peak(light))[0] * step_um
 
 
 def half_maximum(light: Array, peak: tuple[float, float, float]) -> tuple[float, float]:

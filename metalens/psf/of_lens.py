@@ -10,29 +10,29 @@ import numpy as np
 import torch
 
 from metalens import propagate
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.ground.store import Provenance
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.core.store import Provenance
 from metalens.lens import Lens, answers, media
 from metalens.propagate import paths
 from metalens.psf import among
 from metalens.psf import spectrum as spectra
-from metalens.psf.among import Jones
+from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import (
     RINGS,
     SPOKES,
     Budget,
     LeftOut,
     Polarisation,
-    aperture,
+    obliquity_variation,
     scalar_error,
-    uneven,
+    sine_aperture,
     with_model,
-    worst,
+    worst_of_budgets,
 )
-from metalens.psf.extended import Extent, reach
+from metalens.psf.extended import Extent, source_image_reach
 from metalens.psf.record import PsfStack
-from metalens.psf.spectrum import Measured, Nodes, Source
+from metalens.psf.spectrum import MeasuredSpectrum, Source, SpectralNodes
 from metalens.psf.stack import psf_stack
 
 PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
@@ -84,7 +84,7 @@ def from_lens(
     view: View,
     *,
     tolerance: float = 1e-4,
-    spectrum: Nodes | Source | Measured | None = None,
+    spectrum: SpectralNodes | Source | MeasuredSpectrum | None = None,
     provenance: Provenance | None = None,
     polarisation: Polarisation = "scalar",
     left_out: LeftOut | None = None,
@@ -131,29 +131,34 @@ def from_lens(
         "own": left_out or _left_out_of(lens),
     }
     how["provenance"] = provenance or Provenance()
-    if isinstance(spectrum, Source | Measured):
+    if isinstance(spectrum, Source | MeasuredSpectrum):
         return _over_spectrum(lens, view, spectrum, **how)
     return _at_wavelengths(
         lens,
         view,
-        spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0),
+        spectrum or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0),
         **how,
     )
 
 
 def _over_spectrum(
-    lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any
+    lens: Lens,
+    view: View,
+    source: Source | MeasuredSpectrum,
+    *,
+    tolerance: float,
+    **how: Any,
 ) -> PsfStack:
     """PSFs of a spectrum: wavelengths for the paths to where few of them say that its
     light falls, in the window; more
     where the light of all of them says so."""
     within = lens.proxy.wavelengths_um
 
-    def psfs(nodes: Nodes, tolerance: float, **other: Any) -> PsfStack:
+    def psfs(nodes: SpectralNodes, tolerance: float, **other: Any) -> PsfStack:
         return _at_wavelengths(
             lens,
             view,
-            spectra.known(nodes, source, within),
+            spectra.nodes_inside_library(nodes, source, within),
             tolerance=tolerance,
             **how | other,
         )
@@ -162,9 +167,11 @@ def _over_spectrum(
     middle = max(
         float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans
     )
-    nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
+    nodes = spectra.spectral_nodes(source, path_um=middle, tolerance=tolerance / 2)
     if len(nodes.weights) > 2 * PILOT:
-        few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
+        few = SpectralNodes(
+            *spectra.gauss_rule(*spectra.spectrum_points(source), PILOT), 0.0
+        )
         pilot = psfs(few, max(tolerance, PILOT_ERROR), polarisation="scalar")
         nodes = _nodes_for(source, spans, pilot, tolerance / 2 * SPARE)
     for last in range(TRIES):
@@ -177,18 +184,21 @@ def _over_spectrum(
             break
         nodes = _nodes_for(source, spans, stack, tolerance / 2)
     return dataclasses.replace(
-        stack, reason=stack.reason + spectra.beyond(source, within)
+        stack, reason=stack.reason + spectra.outside_library_text(source, within)
     )
 
 
 def _nodes_for(
-    source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float
-) -> Nodes:
+    source: Source | MeasuredSpectrum,
+    spans: list[Array],
+    stack: PsfStack,
+    tolerance: float,
+) -> SpectralNodes:
     """Wavelengths for the paths of every direction (:func:`paths_um`) to where the
     light of PSFs lies.
     """
     found = [
-        spectra.nodes(
+        spectra.spectral_nodes(
             source,
             path_um=span.ravel(),
             light=light_shares(light, span.shape[1:]).ravel(),
@@ -200,7 +210,10 @@ def _nodes_for(
 
 
 def paths_um(
-    lens: Lens, view: View, angle_rad: tuple[float, float], source: Source | Measured
+    lens: Lens,
+    view: View,
+    angle_rad: tuple[float, float],
+    source: Source | MeasuredSpectrum,
 ) -> Array:
     """(depth, y, x) largest difference of optical path through two pillars to places of
     the window, first to last.
@@ -218,10 +231,10 @@ def paths_um(
         "sensor_distance_um": lens.sensor_distance_um,
     }
     about["layers"] = lens.layers.open
-    case = propagate.case(
+    case = propagate.make_case(
         lens.diameters.diameter_um.shape, angle_rad=angle_rad, **given, **about
     )
-    more = (0, 0) if view.source is None else reach(case, view.source)
+    more = (0, 0) if view.source is None else source_image_reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
     turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
     x, y = (radius * np.cos(turn)).ravel(), (radius * np.sin(turn)).ravel()
@@ -247,7 +260,7 @@ def paths_um(
 
 
 def _delay_um(
-    lens: Lens, angle_rad: tuple[float, float], source: Source | Measured
+    lens: Lens, angle_rad: tuple[float, float], source: Source | MeasuredSpectrum
 ) -> float:
     """Largest difference of the pillars' delays, d(phase)/dk, over some rows and three
     wavelengths of a spectrum.
@@ -255,11 +268,11 @@ def _delay_um(
     low, high = lens.proxy.wavelengths_um
     if lens.pairs is not None or not high > low:
         return 0.0
-    um, share = spectra.points(source)
+    um, share = spectra.spectrum_points(source)
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
     there, tilt, found = (
         np.asarray(lens.diameters.diameter_um[rows]) > 0,
-        incidence(lens, angle_rad),
+        library_incidence(lens, angle_rad),
         [],
     )
     for quantile in (0.05, 0.5, 0.95):
@@ -293,7 +306,7 @@ def _quadrature_error(
     view: View,
     angle_rad: tuple[float, float],
     stack: PsfStack,
-    nodes: Nodes,
+    nodes: SpectralNodes,
 ) -> float:
     """Error of wavelengths that stand for a spectrum, by the paths to where the light
     of a direction fell.
@@ -302,13 +315,15 @@ def _quadrature_error(
         return nodes.error
     span = paths_um(lens, view, angle_rad, nodes.source)
     share = light_shares(stack.intensity[0], span.shape[1:])
-    return float(np.sqrt(share.ravel() @ spectra.missed(nodes, span.ravel()) ** 2))
+    return float(
+        np.sqrt(share.ravel() @ spectra.quadrature_error(nodes, span.ravel()) ** 2)
+    )
 
 
 def _at_wavelengths(
     lens: Lens,
     view: View,
-    nodes: Nodes,
+    nodes: SpectralNodes,
     *,
     tolerance: float,
     polarisation: Polarisation,
@@ -322,7 +337,7 @@ def _at_wavelengths(
     kept: tuple[float, bool] | None = None
     for angle in view.angles_rad:
         counted = _decided_polarisation(lens, angle, polarisation, tolerance)
-        response = incidence(lens, angle), counted == "scalar"
+        response = library_incidence(lens, angle), counted == "scalar"
         if (
             kept != response
         ):  # without angles in the library all directions share the maps
@@ -356,7 +371,11 @@ def _at_wavelengths(
         else ""
     )
     return _with_budget(
-        _concatenated(parts, provenance), worst(budgets), tolerance, held, own
+        _concatenated(parts, provenance),
+        worst_of_budgets(budgets),
+        tolerance,
+        held,
+        own,
     )
 
 
@@ -374,7 +393,7 @@ def _with_budget(
     )
 
 
-def unpolarised(x: PsfStack, y: PsfStack) -> PsfStack:
+def mean_over_polarizations(x: PsfStack, y: PsfStack) -> PsfStack:
     """PSFs of light without polarisation: the mean irradiance of those of light along x
     and along y, as one stack.
     """
@@ -401,7 +420,7 @@ def _budget(
     lens: Lens,
     angle: tuple[float, float],
     stack: PsfStack,
-    nodes: Nodes,
+    nodes: SpectralNodes,
     counted: Polarisation,
     left_out: LeftOut,
 ) -> Budget:
@@ -409,8 +428,8 @@ def _budget(
     made = stack.budget or Budget(stack.error)
     return with_model(
         dataclasses.replace(made, spectrum=nodes.error),
-        aperture=aperture(lens, angle),
-        uneven=uneven(lens, angle),
+        aperture=sine_aperture(lens, angle),
+        uneven=obliquity_variation(lens, angle),
         polarisation=counted,
         incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
         has_angles=lens.proxy.max_angle_rad > 0,
@@ -444,13 +463,16 @@ def _decided_polarisation(
     if polarisation == "auto":
         return (
             "flux"
-            if scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance
+            if scalar_error(
+                sine_aperture(lens, angle), obliquity_variation(lens, angle)
+            )
+            > tolerance
             else "scalar"
         )
     return polarisation
 
 
-def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
+def library_incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Angle in rad at which the pillars are asked for light from a direction: 0 where
     their library has no angles.
     """
@@ -463,12 +485,12 @@ def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
 
 def all_maps(
     lens: Lens,
-    nodes: Nodes,
+    nodes: SpectralNodes,
     angle_rad: tuple[float, float],
     dtype: torch.dtype,
     *,
     scalar: bool,
-) -> tuple[tuple[torch.Tensor, torch.Tensor], Jones | None]:
+) -> tuple[tuple[torch.Tensor, torch.Tensor], NeighbourJonesFactors | None]:
     """(wavelength, y, x) phase and transmission of every pillar for light from a
     direction, with the mean factor of
     unlike neighbours; or that factor on both fields beside them."""
@@ -477,14 +499,16 @@ def all_maps(
     for wave, one, other in zip(
         nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True
     ):
-        answers.fill(lens, (float(wave), incidence(lens, angle_rad)), one, other)
+        answers.fill_response(
+            lens, (float(wave), library_incidence(lens, angle_rad)), one, other
+        )
     if lens.neighbours is None:
         return (phase, level), None
     if scalar:
-        return among.scalar(
+        return among.apply_scalar_coupling(
             phase, level, lens.neighbours, lens.diameters.pitch_um
         ), None
-    return (phase, level), among.jones(
+    return (phase, level), among.apply_jones_coupling(
         phase, level, lens.neighbours, lens.diameters.pitch_um
     )
 
@@ -497,7 +521,7 @@ def passed_um2(
 
     Σ |T S|² a at the design wavelength: S the shadow of a stop, a the area of a site.
     """
-    nodes = Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    nodes = SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
     level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][
         0

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.image import integrate
 from metalens.psf.record import PsfStack
 

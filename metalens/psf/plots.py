@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.report import canvas, png
+from metalens.core.arrays import Array
+from metalens.core.report import figure_png, make_figure
 from metalens.psf import metrics as psf_metrics
 from metalens.psf.metrics import DiffractionLimit
 from metalens.psf.pixels import on_pixels
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PIXEL_UM = 3.0
 
 
-def pictures(
+def psf_pictures(
     stack: PsfStack,
     *,
     limit: DiffractionLimit | None = None,
@@ -31,17 +31,17 @@ def pictures(
     limit: of the aperture, for the ideal MTF and its cut-off.
     """
     plain = stack.numpy()
-    found = {"montage": montage(plain), "mtf": transfer(plain, limit=limit)}
+    found = {"montage": plot_montage(plain), "mtf": plot_mtf(plain, limit=limit)}
     if scan is not None:
         found["zscan"] = along_z(scan)
     if len(plain.depths_um) > 1:
-        found["xz"] = slices(plain)
+        found["xz"] = plot_slices(plain)
     if (
         len(plain.depths_um) > 1
         and np.isfinite(plain.depths_um).all()
         and np.diff(plain.depths_um).all()
     ):
-        found["information"] = information(plain)
+        found["information"] = plot_information(plain)
     return found
 
 
@@ -61,13 +61,13 @@ def _depth_name(depth_um: float) -> str:
     return "∞" if np.isinf(depth_um) else f"{depth_um * 1e-3:.3g} mm"
 
 
-def slices(stack: PsfStack) -> bytes:
+def plot_slices(stack: PsfStack) -> bytes:
     """x against depth through the centre row, one panel an angle, brightest value of
     each depth at full scale.
     """
     light, depths = _by_angle(stack), stack.depths_um
     order = np.argsort(depths)
-    figure, axes = canvas(
+    figure, axes = make_figure(
         1, len(light), size=(2.2 + 2.6 * len(light), 3.4), squeeze=False, sharey=True
     )
     for panel, psf, angle in zip(axes[0], light, stack.angles_rad, strict=True):
@@ -88,10 +88,10 @@ def slices(stack: PsfStack) -> bytes:
     axes[0, 0].set_yticks(picks, [_depth_name(depths[order][i]) for i in picks])
     axes[0, 0].set_ylabel("source depth")
     figure.suptitle("PSF along depth (each depth at its own full scale)", fontsize=10)
-    return png(figure)
+    return figure_png(figure)
 
 
-def montage(stack: PsfStack, *, most: int = 7) -> bytes:
+def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
     """PSFs over depth (across) and angle (down), square root of intensity, each at its
     own full scale.
     """
@@ -102,7 +102,7 @@ def montage(stack: PsfStack, *, most: int = 7) -> bytes:
         .astype(int)
     )
     size = (1.3 * len(picks) + 0.7, 1.35 * len(light) + 0.6)
-    figure, axes = canvas(len(light), len(picks), size=size, squeeze=False)
+    figure, axes = make_figure(len(light), len(picks), size=size, squeeze=False)
     across, down = (stack.step_um * n / 2 for n in light.shape[:-3:-1])
     for row, (psfs, angle) in enumerate(zip(light, stack.angles_rad, strict=True)):
         for column, i in enumerate(picks):
@@ -120,10 +120,10 @@ def montage(stack: PsfStack, *, most: int = 7) -> bytes:
         f"√PSF over depth and field angle, {2 * across:.3g} x {2 * down:.3g} µm, +x right, +y down",
         fontsize=10,
     )
-    return png(figure)
+    return figure_png(figure)
 
 
-def transfer(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes:
+def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes:
     """MTF along x and y up to its cut-off (where samples show it), and encircled
     energy, of three depths at the first and last angle.
     """
@@ -136,11 +136,11 @@ def transfer(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
         np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61),
     )
     curves = psf_metrics.mtf(stack, frequencies_per_um=frequency)
-    energy = psf_metrics.encircled(stack, radii_um=radius)
+    energy = psf_metrics.encircled_energy(stack, radii_um=radius)
     angles = sorted({0, len(stack.angles_rad) - 1})
     curves = curves.reshape(len(stack.angles_rad), -1, 2, len(frequency))
     energy = energy.reshape(len(stack.angles_rad), -1, len(radius))
-    figure, axes = canvas(1, 2, size=(9.5, 3.4))
+    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     for style, angle in zip(("-", "--"), angles, strict=False):
         for colour, i in enumerate(depths):
             name = f"{_depth_name(stack.depths_um[i])}, {_angle_name(stack.angles_rad[angle])}"
@@ -179,12 +179,12 @@ def transfer(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
         ylim=(0, 1.02),
     )
     axes[1].legend(fontsize=7)
-    return png(figure)
+    return figure_png(figure)
 
 
 def along_z(scan: "FocusScan") -> bytes:
     """Irradiance along x against the shift of the plane, and its peak and FWHM."""
-    figure, axes = canvas(1, 2, size=(9.5, 3.4))
+    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     axes[0].pcolormesh(
         scan.shift_um,
         scan.x_um,
@@ -204,14 +204,14 @@ def along_z(scan: "FocusScan") -> bytes:
         xlabel="shift from the sensor / µm", ylabel="of the largest", ylim=(0, None)
     )
     axes[1].legend(fontsize=7)
-    return png(figure)
+    return figure_png(figure)
 
 
-def information(stack: PsfStack) -> bytes:
+def plot_information(stack: PsfStack) -> bytes:
     """I(z) of Eq. 11 on pixels of 3 µm, binned 1, 2 and 3 times, under each named
     normalisation.
     """
-    figure, axes = canvas(1, 2, size=(9.5, 3.4))
+    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     for panel, name in zip(axes, ("sum", "l2"), strict=True):
         for colour, bins in enumerate((1, 2, 3)):
             depth, value = _averaged(stack, name, bins)
@@ -236,7 +236,7 @@ def information(stack: PsfStack) -> bytes:
     figure.suptitle(
         "Axial information of Eq. 11, mean over 9 sub-pixel positions; the normalisation decides the ranking"
     )
-    return png(figure)
+    return figure_png(figure)
 
 
 def _averaged(stack: PsfStack, name: Any, bins: int) -> tuple[Array, Array]:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.reading import reader
-from metalens.ground.store import Provenance
-from metalens.propagate import axis
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
+from metalens.propagate import axis_positions
 from metalens.psf.budget import Budget
 
 SourceShape = Literal["disc", "square", "gaussian"]
@@ -82,12 +82,12 @@ class PsfStack:
     @property
     def x_um(self) -> Array:
         """(x,) positions from the window centre."""
-        return axis(self.intensity.shape[-1], self.step_um)
+        return axis_positions(self.intensity.shape[-1], self.step_um)
 
     @property
     def y_um(self) -> Array:
         """(y,) positions from the window centre."""
-        return axis(self.intensity.shape[-2], self.step_um)
+        return axis_positions(self.intensity.shape[-2], self.step_um)
 
     @property
     def converged(self) -> bool:
@@ -131,7 +131,7 @@ def save(path: str | Path, stack: PsfStack) -> None:
     store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
 
 
-@reader
+@typed_reader
 def load(path: str | Path) -> PsfStack:
     """Read a PSF file.
 

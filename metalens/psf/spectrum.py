@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from metalens.ground import reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import MaterialError, PropagationError
+from metalens.core import reading
+from metalens.core.arrays import Array
+from metalens.core.errors import MaterialError, PropagationError
 
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
@@ -44,11 +44,11 @@ class Source:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Nodes:
+class SpectralNodes:
     """wavelengths_um and weights (sum 1), and the error of the quadrature on the band
     that was asked for.
 
-    source: the spectrum that they stand for, by which :func:`missed` judges them on any
+    source: the spectrum that they stand for, by which :func:`quadrature_error` judges them on any
     path; None for wavelengths as
         such.
 
@@ -61,7 +61,7 @@ class Nodes:
     wavelengths_um: Array
     weights: Array
     error: float
-    source: "Source | Measured | None" = None
+    source: "Source | MeasuredSpectrum | None" = None
 
     def __post_init__(self) -> None:
         waves, weights = np.asarray(self.wavelengths_um), np.asarray(self.weights)
@@ -83,7 +83,7 @@ class Nodes:
             )
 
 
-def weight(source: Source) -> tuple[Array, Array]:
+def spectral_weight(source: Source) -> tuple[Array, Array]:
     """(wavelengths in um, weight of sum 1) of diode times silicon over ±2.5 FWHM, every
     0.25 nm or FWHM / 40.
 
@@ -114,7 +114,7 @@ def weight(source: Source) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Measured:
+class MeasuredSpectrum:
     """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
 
     beside: share of the light that is left out at its ends, outside of what the pillars
@@ -126,7 +126,9 @@ class Measured:
     beside: float = 0.0
 
 
-def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measured:
+def read_measured_spectrum(
+    files: Sequence[Path], *, within_um: tuple[float, float]
+) -> MeasuredSpectrum:
     """Product of measured curves (LED, filter, sensor) where all of them are known.
 
     A file has two columns, wavelength in nm and value, parted by commas, semicolons or
@@ -170,7 +172,9 @@ def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measur
     share = share / share.sum()
     first, last = _kept(nm, value, within_um)
     nm, share = nm[first:last], share[first:last]
-    return Measured(nm * 1e-3, share / share.sum(), max(0.0, 1 - float(share.sum())))
+    return MeasuredSpectrum(
+        nm * 1e-3, share / share.sum(), max(0.0, 1 - float(share.sum()))
+    )
 
 
 def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int, int]:
@@ -205,7 +209,7 @@ def _curve(file: Path) -> Array:
             f"{file}: cannot be read as a table of wavelength and value: {error}"
         ) from None
     for number, line in enumerate(lines, 1):
-        words = reading.columns(line)
+        words = reading.split_columns(line)
         if (
             not words
             or words[0][0] in "#\"'"
@@ -246,13 +250,13 @@ def _number(word: str) -> bool:
     return True
 
 
-def nodes(
-    source: Source | Measured,
+def spectral_nodes(
+    source: Source | MeasuredSpectrum,
     *,
     path_um: float | Array,
     tolerance: float,
     light: Array | None = None,
-) -> Nodes:
+) -> SpectralNodes:
     """As few wavelengths as meet the tolerance.
 
     Args:
@@ -268,20 +272,20 @@ def nodes(
         PropagationError: more than 64 wavelengths would be needed.
     """
     spans, light = np.atleast_1d(path_um), np.ones(1) if light is None else light
-    um, share = points(source)
+    um, share = spectrum_points(source)
     judge = _Judge(source, float(spans.max()))
     for count in range(1, MOST_NODES + 1):
-        x, w = gauss(um, share, count)
+        x, w = gauss_rule(um, share, count)
         error = float(np.sqrt(light @ judge.missed(x, w, spans) ** 2))
         if error <= tolerance:
-            return Nodes(x, w, error, source)
+            return SpectralNodes(x, w, error, source)
     raise PropagationError(
         f"more than {MOST_NODES} wavelengths needed for paths of {spans.max():.3g} um under a line from "
         f"{um[0] * 1e3:.1f} to {um[-1] * 1e3:.1f} nm; raise the tolerance or narrow the line"
     )
 
 
-def missed(nodes: Nodes, span_um: Array) -> Array:
+def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
     """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up
     to each of these.
     """
@@ -292,17 +296,18 @@ def missed(nodes: Nodes, span_um: Array) -> Array:
     )
 
 
-def points(source: Source | Measured) -> tuple[Array, Array]:
+def spectrum_points(source: Source | MeasuredSpectrum) -> tuple[Array, Array]:
     """(wavelengths in um, shares of sum 1) of a spectrum."""
     return (
         (source.wavelengths_um, source.share)
-        if isinstance(source, Measured)
-        else weight(source)
+        if isinstance(source, MeasuredSpectrum)
+        else spectral_weight(source)
     )
 
 
-def unknown(
-    source: Source | Measured | Nodes | None, within_um: tuple[float, float]
+def share_outside_library(
+    source: Source | MeasuredSpectrum | SpectralNodes | None,
+    within_um: tuple[float, float],
 ) -> float:
     """Share of the light of a spectrum outside of the wavelengths that pillars are
     known for, which those within stand
@@ -313,15 +318,17 @@ def unknown(
     quadrature is.
     """
     low, high = within_um
-    if not high > low or not isinstance(source, Source | Measured):
+    if not high > low or not isinstance(source, Source | MeasuredSpectrum):
         return 0.0
-    um, share = points(source)
+    um, share = spectrum_points(source)
     return float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
 
 
-def known(
-    nodes: Nodes, source: Source | Measured, within_um: tuple[float, float]
-) -> Nodes:
+def nodes_inside_library(
+    nodes: SpectralNodes,
+    source: Source | MeasuredSpectrum,
+    within_um: tuple[float, float],
+) -> SpectralNodes:
     """The wavelengths that stand for a spectrum, all of which lie within those that
     pillars are known for.
 
@@ -343,7 +350,7 @@ def known(
             if width >= LEAST_FWHM_NM
             else ""
         )
-    um, share = points(source)
+    um, share = spectrum_points(source)
     raise _refusal((um * 1e3, share), within_um, narrow)
 
 
@@ -362,11 +369,11 @@ def _refusal(
     )
     return PropagationError(
         f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {told}, and {part:.2g} of it lies "
-        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {sweep(nm)})"
+        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {library_sweep_hint(nm)})"
     )
 
 
-def sweep(nm: Array) -> str:
+def library_sweep_hint(nm: Array) -> str:
     """The key of CELL.toml whose library is known for light of these wavelengths (n,),
     ascending.
     """
@@ -374,11 +381,12 @@ def sweep(nm: Array) -> str:
     return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 
 
-def beyond(
-    source: Source | Measured | Nodes | None, within_um: tuple[float, float]
+def outside_library_text(
+    source: Source | MeasuredSpectrum | SpectralNodes | None,
+    within_um: tuple[float, float],
 ) -> str:
-    """Words for :func:`unknown` light; empty where that is less than 1e-4 of it."""
-    share = unknown(source, within_um)
+    """Words for :func:`share_outside_library` light; empty where that is less than 1e-4 of it."""
+    share = share_outside_library(source, within_um)
     if share < 1e-4:
         return ""
     low, high = within_um
@@ -391,13 +399,13 @@ def beyond(
 class _Judge:
     """Means of exp(2πi·path/λ) over a spectrum, of paths from 0 to the largest."""
 
-    def __init__(self, source: Source | Measured, longest_um: float) -> None:
-        um, share = points(source)
+    def __init__(self, source: Source | MeasuredSpectrum, longest_um: float) -> None:
+        um, share = spectrum_points(source)
         self.paths = np.linspace(0, longest_um, PATHS)
         self.want = np.array(
             [np.exp(2j * np.pi * path / um) @ share for path in self.paths]
         )
-        self.beside = source.beside if isinstance(source, Measured) else 0.0
+        self.beside = source.beside if isinstance(source, MeasuredSpectrum) else 0.0
 
     def missed(self, um: Array, weights: Array, span_um: Array) -> Array:
         """(n,) of a rule, for paths up to each of these."""
@@ -408,7 +416,7 @@ class _Judge:
         return np.asarray(np.maximum.accumulate(error)[place] + self.beside)
 
 
-def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
+def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
     """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1
     (Lanczos, Golub and Welsch).
     """

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 
 from metalens import propagate
-from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
-from metalens.lens import Layers, Neighbours
-from metalens.propagate import Case, Moving
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.lens import Layers, NeighbourRows
+from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import among
-from metalens.psf.among import Jones
+from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import Budget, Polarisation
-from metalens.psf.compute import EXACT, KEPT, Result
-from metalens.psf.direction import Wanted, direction
+from metalens.psf.compute import EXACT, KEPT, IntensityResult
+from metalens.psf.direction import DirectionRequest, compute_direction
 from metalens.psf.extended import Extent
 from metalens.psf.metrics import blur_um
 from metalens.psf.record import PsfStack
@@ -41,7 +41,7 @@ def psf_stack(
     polarisation: Polarisation = "scalar",
     integrate: bool = True,
     source: Extent | None = None,
-    neighbours: Neighbours | Jones | None = None,
+    neighbours: NeighbourRows | NeighbourJonesFactors | None = None,
     row_um: float = 0.0,
     site_um2: float = 0.0,
 ) -> PsfStack:
@@ -115,7 +115,10 @@ def psf_stack(
     """
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
     maps, wanted = _coupled(
-        maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source)
+        maps,
+        neighbours,
+        pitch_um,
+        DirectionRequest(tolerance, polarisation, integrate, source),
     )
     about: dict[str, Any] = {
         "pitch_um": pitch_um,
@@ -136,7 +139,7 @@ def psf_stack(
     cases, found = [], []
     for angle in angles:
         seen = [
-            propagate.case(
+            propagate.make_case(
                 maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about
             )
             for w in waves
@@ -165,9 +168,9 @@ def psf_stack(
 
 
 _Given = tuple[
-    list[Case], list[float], Wanted, Moving | None
+    list[PropagationCase], list[float], DirectionRequest, MovingGeometry | None
 ]  # cases and weights of the wavelengths of a direction
-_Found = tuple[torch.Tensor, list[Result], torch.Tensor]
+_Found = tuple[torch.Tensor, list[IntensityResult], torch.Tensor]
 
 
 def _one_direction(
@@ -192,7 +195,7 @@ def _one_direction(
         seen = [
             dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases
         ]
-        found.append(direction(maps, seen, weights, wanted, moving, layers))
+        found.append(compute_direction(maps, seen, weights, wanted, moving, layers))
     light = (
         found[0][0]
         if len(found) == 1
@@ -212,37 +215,39 @@ def _directions(angle_rad: Any) -> tuple[bool, Any]:
     return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
 
 
-def _with_window_of(cases: list[Case], like: Case) -> list[Case]:
+def _with_window_of(
+    cases: list[PropagationCase], like: PropagationCase
+) -> list[PropagationCase]:
     """The cases with the window of one of them."""
     return [dataclasses.replace(one, centre_um=like.centre_um) for one in cases]
 
 
 def _coupled(
     maps: tuple[torch.Tensor, torch.Tensor],
-    neighbours: Neighbours | Jones | None,
+    neighbours: NeighbourRows | NeighbourJonesFactors | None,
     pitch_um: float,
-    wanted: Wanted,
-) -> tuple[tuple[torch.Tensor, torch.Tensor], Wanted]:
+    wanted: DirectionRequest,
+) -> tuple[tuple[torch.Tensor, torch.Tensor], DirectionRequest]:
     """The maps with the mean factor of unlike neighbours, or as they are and with it on
     both fields.
     """
     if neighbours is None:
         return maps, wanted
-    if isinstance(neighbours, Jones):
+    if isinstance(neighbours, NeighbourJonesFactors):
         if wanted.polarisation == "scalar":
             raise PropagationError(
                 "factors on both fields, but one scalar: give the rows, or polarisation = 'flux'"
             )
         return maps, dataclasses.replace(wanted, fields=neighbours)
     if wanted.polarisation == "scalar":
-        return among.scalar(*maps, neighbours, pitch_um), wanted
+        return among.apply_scalar_coupling(*maps, neighbours, pitch_um), wanted
     return maps, dataclasses.replace(
-        wanted, fields=among.jones(*maps, neighbours, pitch_um)
+        wanted, fields=among.apply_jones_coupling(*maps, neighbours, pitch_um)
     )
 
 
 def _stop_error(
-    stack: PsfStack, share: Array, cases: list[Case], layers: Layers | None
+    stack: PsfStack, share: Array, cases: list[PropagationCase], layers: Layers | None
 ) -> float:
     """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan
     without one.
@@ -273,9 +278,9 @@ def _stop_error(
 
 def _with_budget(
     stack: PsfStack,
-    worst: Result,
+    worst: IntensityResult,
     whole: torch.Tensor,
-    cases: list[Case],
+    cases: list[PropagationCase],
     layers: Layers | None,
 ) -> PsfStack:
     """With its error by cause; whole: light that leaves the pillars towards the sensor
@@ -299,9 +304,9 @@ def _with_budget(
 
 def _record(
     light: torch.Tensor,
-    cases: list[Case],
+    cases: list[PropagationCase],
     axes: tuple[Array, Array, Array],
-    worst: Result,
+    worst: IntensityResult,
     tolerance: float,
 ) -> PsfStack:
     """The stack for intensities (…, depth, y, x), a case for each angle; axes are
@@ -330,7 +335,7 @@ def _record(
     )
 
 
-def _above(worst: Result, tolerance: float, dtype: torch.dtype) -> str:
+def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
     """What keeps an estimate above the tolerance."""
     least = max(KEPT[dtype], EXACT[dtype])
     if tolerance < least:
@@ -354,8 +359,8 @@ def _value(argument: Any) -> Any:
 
 
 def _geometry_with_gradients(
-    angle: Any, depths: Any, distance: Any, offset: Any, case: Case
-) -> Moving | None:
+    angle: Any, depths: Any, distance: Any, offset: Any, case: PropagationCase
+) -> MovingGeometry | None:
     """Geometry as tensors where any of it carries a gradient."""
     given = [
         angle,
@@ -371,8 +376,10 @@ def _geometry_with_gradients(
     )
     d = _double(distance).reshape(())
     shift = torch.stack([_double(o).reshape(()) for o in offset])
-    meets = torch.stack([propagate.chief(case.behind, d, tangents, i) for i in (0, 1)])
-    return Moving(tangents, 1 / _double(depths).reshape(-1), d, meets + shift)
+    meets = torch.stack(
+        [propagate.chief_ray_offset(case.behind, d, tangents, i) for i in (0, 1)]
+    )
+    return MovingGeometry(tangents, 1 / _double(depths).reshape(-1), d, meets + shift)
 
 
 def _double(argument: Any) -> torch.Tensor:

@@ -37,10 +37,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import media
-from metalens.propagate import Case, Pupils, apart, cosines
-from metalens.psf.among import Jones
+from metalens.propagate import (
+    PropagationCase,
+    Pupils,
+    polarized_amplitudes,
+    ray_cosines,
+)
+from metalens.psf.among import NeighbourJonesFactors
 
 # blocks of pillars along an axis over which the cosine of a ray is taken as alike
 POOLED = 64
@@ -48,7 +53,7 @@ NOTHING = 1e-12  # of the light of the strongest combination of factors: roundin
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Mixed:
+class VectorPupil:
     """pupils: (components, …) factors on the scalar's pupil, real or complex; signs: 1
     or -1, of what each adds
     to the light."""
@@ -58,7 +63,7 @@ class Mixed:
 
 
 @dataclass(frozen=True, slots=True)
-class Mixing:
+class PolarizationMixing:
     """Both polarisations of light from maps of pillars, as smooth factors where a lens
     is known by a few nodes.
 
@@ -75,7 +80,7 @@ class Mixing:
         """Of every wavelength."""
         return 3 if self.apart else 1
 
-    def pupils(self, case: Case) -> Pupils:
+    def pupils(self, case: PropagationCase) -> Pupils:
         """Components of the light of a case: of one map four of the flux of light along
         x, which is that of light along
         y but behind films, or six of the mean |E|²; of three maps or behind films eight
@@ -84,7 +89,7 @@ class Mixing:
         return lambda y_um, x_um: self._components(case, (y_um, x_um))
 
     def _components(
-        self, case: Case, at_um: tuple[Array, Array]
+        self, case: PropagationCase, at_um: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """(components,) signs and (components, map, y, x) factors."""
         order = order_behind(case)
@@ -94,14 +99,14 @@ class Mixing:
             [case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep],
             dtype=torch.float64,
         )
-        x, y = beyond_faces(turned(a, first), first, order).chunk(2)
+        x, y = beyond_faces(transmitted_polarization(a, first), first, order).chunk(2)
         none = torch.zeros_like(x)
         both = [
             torch.cat(pair)
             for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])
         ]
         fields = [
-            of_flux(one, b) if self.flux else Mixed(one, (1.0,) * len(one))
+            of_flux(one, b) if self.flux else VectorPupil(one, (1.0,) * len(one))
             for one in both
         ]
         factors, signs = (
@@ -116,7 +121,9 @@ class Mixing:
         lit = size > NOTHING * size.max()
         return signs[lit], factors[lit]
 
-    def power(self, case: Case, powers: Sequence[float], levels: Tensor) -> float:
+    def power(
+        self, case: PropagationCase, powers: Sequence[float], levels: Tensor
+    ) -> float:
         """Mean over both polarisations of what the pillars let through, from the sums
         of squares of the maps; of |E|²
         over the cosine of every ray, as it lies on the plane.
@@ -133,7 +140,7 @@ class Mixing:
             )
         return total
 
-    def _steep(self, case: Case, level: Tensor) -> float:
+    def _steep(self, case: PropagationCase, level: Tensor) -> float:
         """Mean of 1/cos of the rays to the sensor, weighed by the light of the pillars;
         from means over blocks.
         """
@@ -155,20 +162,20 @@ class Mixing:
         return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
 
 
-def order_behind(case: Case) -> tuple[float, ...]:
+def order_behind(case: PropagationCase) -> tuple[float, ...]:
     """Indices of the media from the pillars to the sensor; 1 for one medium, whose
     wavelength is its own.
     """
     return (1.0,) if case.behind is None else case.behind.order
 
 
-def has_faces(case: Case) -> bool:
+def has_faces(case: PropagationCase) -> bool:
     """Whether light goes from one medium to another behind the lens."""
     return len(set(order_behind(case))) > 1
 
 
 def rays_to(
-    case: Case, at_um: tuple[Array, Array], index: float | None = None
+    case: PropagationCase, at_um: tuple[Array, Array], index: float | None = None
 ) -> Tensor:
     """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's
     centre, as they reach the sensor, or
@@ -179,13 +186,13 @@ def rays_to(
     )
     n = index or order_behind(case)[-1]
     p, q = (
-        torch.as_tensor(-cosines(case, *at) / n)
+        torch.as_tensor(-ray_cosines(case, *at) / n)
         for at in ((across, down), (down, across))
     )
     return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
 
 
-def s_and_p(case: Case) -> Pupils:
+def s_and_p(case: PropagationCase) -> Pupils:
     """Two components of a scalar's light behind films: light that is s all over, and p,
     whose mean power is the light;
     each over the one amplitude that the scalar takes for both, as they reach the
@@ -193,7 +200,7 @@ def s_and_p(case: Case) -> Pupils:
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
         b = rays_to(case, (y_um, x_um), 1.0).numpy()  # p = n sin θ
-        return np.ones(2), np.stack(apart(case, b[0] ** 2 + b[1] ** 2))[
+        return np.ones(2), np.stack(polarized_amplitudes(case, b[0] ** 2 + b[1] ** 2))[
             :, None
         ] * math.sqrt(0.5)
 
@@ -233,7 +240,9 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
     return torch.stack(out)
 
 
-def apart_maps(maps: tuple[Tensor, Tensor], fields: Jones) -> tuple[Tensor, Tensor]:
+def apart_maps(
+    maps: tuple[Tensor, Tensor], fields: NeighbourJonesFactors
+) -> tuple[Tensor, Tensor]:
     """(…, wavelength · 3, y, x) phase and transmission of light from x to x, y to y,
     and between, of (…, wavelength, y,
     x) maps of pillars with factors ``fields`` on the light that comes."""
@@ -244,7 +253,7 @@ def apart_maps(maps: tuple[Tensor, Tensor], fields: Jones) -> tuple[Tensor, Tens
     ).flatten(-4, -3)
 
 
-def turned(a: Tensor, b: Tensor) -> Tensor:
+def transmitted_polarization(a: Tensor, b: Tensor) -> Tensor:
     """(2 polarisations x 3 components, …) of light of amplitude 1 that a lens turns
     from the direction a to b.
 
@@ -275,7 +284,7 @@ def _polarisations(a: Tensor) -> list[Tensor]:
     return [e - axis * (a @ e) / (1 + a[2]) for e in unit]
 
 
-def of_flux(electric: Tensor, b: Tensor) -> Mixed:
+def of_flux(electric: Tensor, b: Tensor) -> VectorPupil:
     """From (2 polarisations x 3 components, …) fields of rays in the directions b (3,
     …) to those of their flux.
     """
@@ -283,10 +292,10 @@ def of_flux(electric: Tensor, b: Tensor) -> Mixed:
     for e in electric.reshape(2, 3, *electric.shape[1:]):
         h = torch.linalg.cross(b.expand_as(e), e, dim=0)
         parts += [e[0] + h[1], e[0] - h[1], e[1] - h[0], e[1] + h[0]]
-    return Mixed(torch.stack(parts) / 2, (1.0, -1.0) * 4)
+    return VectorPupil(torch.stack(parts) / 2, (1.0, -1.0) * 4)
 
 
-def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
+def dominant_components(fields: VectorPupil, weight: Tensor, count: int) -> VectorPupil:
     """Mixtures, ``count`` or all that are not 0, that hold most of the light, whose sum
     is that of ``weight``².
 
@@ -311,7 +320,7 @@ def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
         (axes[:, kept].conj() / root) @ turn[:, first] * torch.sqrt(size[first].abs())
     )
     level = torch.sqrt((weight**2).sum() / size[first].sum())
-    return Mixed(
+    return VectorPupil(
         level * torch.einsum("dc,d...->c...", mixture, fields.pupils),
         tuple(torch.sign(size[first]).tolist()),
     )

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from metalens import propagate
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import Lens
-from metalens.psf.budget import aperture
+from metalens.psf.budget import sine_aperture
 from metalens.psf.focus import stop_shadow
 from metalens.psf.metrics import Point, fwhm
 from metalens.psf.of_lens import all_maps
-from metalens.psf.spectrum import Nodes
+from metalens.psf.spectrum import SpectralNodes
 
 PLANES = 21
 RIM_WAVES = 1.75  # defocus at the rim of the first and last plane
@@ -56,7 +56,7 @@ def focus_scan(
     lens: Lens,
     *,
     offset_um: Point = (0.0, 0.0),
-    nodes: Nodes | None = None,
+    nodes: SpectralNodes | None = None,
     tolerance: float = 1e-3,
 ) -> FocusScan:
     """PSFs on 21 planes about the sensor, by the angular spectrum of the field there.
@@ -75,12 +75,12 @@ def focus_scan(
     Accuracy: beside the tolerance, light outside the window (1 % of an Airy pattern) is
     not followed: 1e-3 of the peak.
     """
-    waves = nodes or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    waves = nodes or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     maps, _ = all_maps(lens, waves, (0.0, 0.0), torch.float64, scalar=True)
     shade = stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
     turn, part = torch.from_numpy(np.angle(shade)), torch.from_numpy(np.abs(shade))
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    sine = aperture(lens, (0.0, 0.0))
+    sine = sine_aperture(lens, (0.0, 0.0))
     depth = after.index[0] * lens.wavelength_um / sine**2
     most = min(2 * RIM_WAVES * depth, after.thickness_um[0] / 2)
     shifts = np.linspace(-most, most, PLANES)
@@ -107,7 +107,7 @@ def focus_scan(
         light += weight * np.abs(_shifted(field, step, index / wave, shifts)) ** 2
     return FocusScan(
         shifts,
-        propagate.axis(SAMPLES, step),
+        propagate.axis_positions(SAMPLES, step),
         light[:, SAMPLES // 2],
         light.max((-1, -2)),
         np.array([fwhm(plane, step) for plane in light]),

@@ -11,7 +11,7 @@ the work over diameters. Light comes from the substrate.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.rcwa import anchored as anchored
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from metalens.rcwa import stack as stack
     from metalens.rcwa import wall as wall
     from metalens.rcwa.any_shape import SAFETY as SAFETY
-    from metalens.rcwa.any_shape import Jones as Jones
+    from metalens.rcwa.any_shape import JonesResponse as JonesResponse
     from metalens.rcwa.any_shape import jones as jones
     from metalens.rcwa.any_shape import most_harmonics as most_harmonics
-    from metalens.rcwa.near import Grid as Grid
+    from metalens.rcwa.near import FieldGrid as FieldGrid
     from metalens.rcwa.near import NearField as NearField
     from metalens.rcwa.near import near_field as near_field
     from metalens.rcwa.near import near_fields as near_fields
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Grid": "near",
+        "FieldGrid": "near",
         "SAFETY": "any_shape",
-        "Jones": "any_shape",
+        "JonesResponse": "any_shape",
         "anchored": "",
         "any_shape": "",
         "layer": "",

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Response
-from metalens.ground.arrays import Array
+from metalens.cell import Cell, Incidence, Response
+from metalens.core.arrays import Array
 from metalens.rcwa.conditions import DiscCase, check_diameter, disc_case
 from metalens.rcwa.solver import largest_error, solve_truncated, wall_stages
 
@@ -66,7 +66,7 @@ class DiameterShift:
 def solve_anchored(
     cell: Cell,
     diameter_um: float,
-    light: Light,
+    light: Incidence,
     upright: list[Response],
     *,
     tolerance: float,

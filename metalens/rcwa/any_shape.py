@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Response, check_tolerance
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Incidence, Response, check_tolerance
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern, wall
 from metalens.rcwa.conditions import incidence_of
@@ -50,7 +50,7 @@ _COARSE = 3  # orders that suffice to see what the collocation of a tilted wall 
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Jones:
+class JonesResponse:
     """Zero-order response of one cell to both polarisations, power-normalised,
     exp(-iwt), incidence from the substrate.
 
@@ -93,7 +93,7 @@ def jones(
     azimuth_rad: float = 0.0,
     tolerance: float = 1e-3,
     harmonics: int | None = None,
-) -> Jones:
+) -> JonesResponse:
     """Both polarisations of a cell of any shape, at the least number of harmonics that
     meets the tolerance.
 
@@ -182,8 +182,11 @@ def truncation_sequence(
 
 
 def refine_truncation(
-    climb: TruncationSequence, cut: float, tolerance: float, at: Callable[[int], Jones]
-) -> Jones:
+    climb: TruncationSequence,
+    cut: float,
+    tolerance: float,
+    at: Callable[[int], JonesResponse],
+) -> JonesResponse:
     """The result of the least truncation that meets the tolerance, or of the last; cut:
     what its collocation leaves.
     """
@@ -219,7 +222,7 @@ def choose_stages(
     )
 
 
-def _both(found: Jones) -> Array:
+def _both(found: JonesResponse) -> Array:
     """(2, 2, 2) t and r."""
     return np.stack([found.t, found.r])
 
@@ -251,7 +254,12 @@ def _told(reach: int, earlier: int) -> float:
 
 
 def co_polarised(
-    cell: Cell, size_um: float, light: Light, *, tolerance: float, harmonics: int | None
+    cell: Cell,
+    size_um: float,
+    light: Incidence,
+    *,
+    tolerance: float,
+    harmonics: int | None,
 ) -> Response:
     """One diagonal element of :func:`jones`; the same arguments and refusals."""
     place = (
@@ -302,7 +310,7 @@ def _last(found: tuple[tuple[Operation, ...], ...], collocated: bool) -> int:
     ]
 
 
-def _truncated(this: CellProblem, reach: int, stages: int) -> Jones:
+def _truncated(this: CellProblem, reach: int, stages: int) -> JonesResponse:
     """All polarisations at one truncation; stages: of the collocation of a tilted wall,
     0 for an upright one.
     """
@@ -339,7 +347,9 @@ def _truncated(this: CellProblem, reach: int, stages: int) -> Jones:
     return without_error(this, reach, np.stack([t, r]), energy)
 
 
-def without_error(this: CellProblem, reach: int, both: Array, energy: Array) -> Jones:
+def without_error(
+    this: CellProblem, reach: int, both: Array, energy: Array
+) -> JonesResponse:
     """One truncation as a record, before its error is known."""
     names = ("x", "y") if this.light.normal else ("s", "p")
     count = int(
@@ -347,4 +357,4 @@ def without_error(this: CellProblem, reach: int, both: Array, energy: Array) -> 
             np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
         )
     )
-    return Jones(names, both[0], both[1], math.inf, energy, count, False, "")
+    return JonesResponse(names, both[0], both[1], math.inf, energy, count, False, "")

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from metalens.cell import Cell, Film, Light, materials
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Film, Incidence, materials
+from metalens.core.errors import CellError
 from metalens.rcwa.orders import basis as fourier
 from metalens.rcwa.orders.waves import PlaneWaves, plane_waves
 from metalens.rcwa.stack import StackMedia
@@ -41,7 +41,7 @@ class DiscCase:
     media: StackMedia
 
 
-def disc_case(cell: Cell, light: Light) -> DiscCase:
+def disc_case(cell: Cell, light: Incidence) -> DiscCase:
     """The case of a cell and a plane wave.
 
     Raises:
@@ -132,7 +132,7 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
 
 
 def incidence_of(
-    light: Light,
+    light: Incidence,
 ) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
     """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into
     the plane y = 0 where it may be.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.orders import basis as fourier
 from metalens.rcwa.orders.waves import PlaneWaves, normal_component
 

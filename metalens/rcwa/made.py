@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from metalens.cell import Cell, Layer
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import pattern
 from metalens.rcwa.wall import Sample, TiltedWall
 

@@ -24,9 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Light, check_tolerance
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Incidence, check_tolerance
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import pattern
 from metalens.rcwa.any_shape import TruncationSequence, truncation_sequence
 from metalens.rcwa.near_waves import (
@@ -50,7 +50,7 @@ _STEPS = 12  # of a tilted wall, as a staircase; half as many tell what they lea
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Grid:
+class FieldGrid:
     """Points (z, y, x) of three axes; a cut takes one value of an axis.
 
     x_um (nx,), y_um (ny,): from the middle of the pillar; z_um (nz,): from its foot,
@@ -91,7 +91,7 @@ class NearField:
     orders: of the truncation. converged: whether ``error`` meets the tolerance.
     """
 
-    grid: Grid
+    grid: FieldGrid
     e: Array
     h: Array
     index: Array
@@ -121,8 +121,8 @@ class _Stack:
 def near_fields(
     cell: Cell,
     size_um: float,
-    light: Light,
-    grids: Sequence[Grid],
+    light: Incidence,
+    grids: Sequence[FieldGrid],
     *,
     tolerance: float = 0.05,
     harmonics: int | None = None,
@@ -210,7 +210,7 @@ def near_fields(
 def near_field(
     cell: Cell,
     size_um: float,
-    light: Light,
+    light: Incidence,
     *,
     x_um: Sequence[float] | Array,
     y_um: Sequence[float] | Array,
@@ -223,7 +223,7 @@ def near_field(
         cell,
         size_um,
         light,
-        [Grid(x_um, y_um, z_um)],
+        [FieldGrid(x_um, y_um, z_um)],
         tolerance=tolerance,
         harmonics=harmonics,
     )[0]
@@ -243,8 +243,8 @@ def _staircase(
     this: CellProblem,
     stack: _Stack,
     steps: int,
-    light: Light,
-    grids: Sequence[Grid],
+    light: Incidence,
+    grids: Sequence[FieldGrid],
     climb: TruncationSequence,
 ) -> Array:
     """What half as many steps of a tilted wall change, at few orders."""
@@ -253,12 +253,12 @@ def _staircase(
     return np.array(_apart(half, _fields(this, stack, light, grids, coarse)))
 
 
-def _stack(this: CellProblem, steps: int, grids: Sequence[Grid]) -> _Stack:
+def _stack(this: CellProblem, steps: int, grids: Sequence[FieldGrid]) -> _Stack:
     slabs = slabs_of(this, steps)
     return _Stack(slabs, [_looks(this, slabs, grid) for grid in grids])
 
 
-def _looks(this: CellProblem, slabs: list[FieldSlab], grid: Grid) -> list[_Look]:
+def _looks(this: CellProblem, slabs: list[FieldSlab], grid: FieldGrid) -> list[_Look]:
     """Of the substrate, every slab and the cover."""
     y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
     flat = np.ones(x.shape, complex)
@@ -280,7 +280,7 @@ def _looks(this: CellProblem, slabs: list[FieldSlab], grid: Grid) -> list[_Look]
 
 
 def _index(
-    this: CellProblem, slabs: list[FieldSlab], looks: list[_Look], grid: Grid
+    this: CellProblem, slabs: list[FieldSlab], looks: list[_Look], grid: FieldGrid
 ) -> Array:
     """(nz, ny, nx)."""
     return np.asarray(
@@ -293,7 +293,11 @@ def _index(
 
 
 def _fields(
-    this: CellProblem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int
+    this: CellProblem,
+    stack: _Stack,
+    light: Incidence,
+    grids: Sequence[FieldGrid],
+    reach: int,
 ) -> list[tuple[Array, Array]]:
     """(3, nz, ny, nx) e and h of every grid, at one truncation."""
     found = [

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Light
-from metalens.ground.arrays import Array
+from metalens.cell import Incidence
+from metalens.core.arrays import Array
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern
 from metalens.rcwa.conditions import incidence_of
@@ -100,7 +100,7 @@ _ON = 1e-12  # of the height: a point so little below an interface lies on it
 def solve_class(
     this: CellProblem,
     slabs: list[FieldSlab],
-    light: Light,
+    light: Incidence,
     space: mirrors.ReducedOrders,
 ) -> SolvedClass | None:
     """The waves, modes and fields of one symmetry class; None where the light has no
@@ -145,7 +145,7 @@ def solve_class(
     return SolvedClass(space, ways, layers, inverse_z, incident, found)
 
 
-def incident_amplitudes(light: Light) -> tuple[float, float]:
+def incident_amplitudes(light: Incidence) -> tuple[float, float]:
     """Amplitudes of the incident wave along x and y at normal incidence, of s and p
     else.
     """

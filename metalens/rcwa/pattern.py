@@ -26,7 +26,7 @@ import numpy as np
 
 from metalens.cell import Cell, Layer, materials
 from metalens.cell.shapes import Outline
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import LatticeFrame, ReducedOrders
 from metalens.rcwa.orders.waves import PlaneWaves

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Cell, Film, check_direction, materials
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa.made import check_size
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY, Operation

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from metalens.cell import Cell, Layer, index
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -15,7 +15,7 @@ class OrderResponse:
 
     m, n: (k,) orders along x and y.
     t, r: (2, 2) power-normalised zero-order Jones matrices, row: leaving, column:
-        incident; x, y at normal incidence, else s, p (as in ``metalens.rcwa.Jones``).
+        incident; x, y at normal incidence, else s, p (as in ``metalens.rcwa.JonesResponse``).
     transmitted, reflected: (k, 2) power of each order for unit power incident.
     """
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Response
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa import wall
 from metalens.rcwa.conditions import DiscCase, case_waves, taper_um
 from metalens.rcwa.layer import disc_operators, solve_eigenmodes

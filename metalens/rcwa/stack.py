@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.layer import FourierModes
 from metalens.rcwa.orders.waves import PlaneWaves, half_space, normal_component
 

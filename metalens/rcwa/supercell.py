@@ -17,9 +17,9 @@ import numpy as np
 
 from metalens.cell import Cell, Lattice, materials
 from metalens.cell.shapes import Outline
-from metalens.cell.shapes.outline import Conic
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell.shapes.outline import EllipseArc
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import pattern
 from metalens.rcwa.layer import solve_eigenmodes
 from metalens.rcwa.orders import mirrors
@@ -127,7 +127,7 @@ def solve_row(
         lattice=Lattice("rectangular", 1 / blocks),
     )
     discs = [
-        Conic(d / 2, d / 2, centre_um=(float(x), float(y)))
+        EllipseArc(d / 2, d / 2, centre_um=(float(x), float(y)))
         for d, (x, y) in zip(diameters_um, block.places_um(count), strict=True)
     ]
     inside, around = (

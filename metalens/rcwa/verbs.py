@@ -12,8 +12,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Incidence, Polarization, Response, check_tolerance
+from metalens.core.errors import CellError
 from metalens.rcwa.any_shape import co_polarised
 from metalens.rcwa.conditions import check_diameter, disc_case
 from metalens.rcwa.solver import solve_case
@@ -88,7 +88,7 @@ def solve_many(
     diameters = np.array([float(diameter) for diameter in diameter_um])
     for diameter in diameters if cell.round else ():
         check_diameter(cell, float(diameter))
-    light = Light(
+    light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
     if not cell.round:

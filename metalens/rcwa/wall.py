@@ -23,7 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.stack import Pair, TangentialFields
 
 Sample = Callable[

@@ -12,18 +12,18 @@ import numpy as np
 from metalens import lens as lenses
 from metalens import library as libraries
 from metalens import psf
-from metalens.ground import report, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import StoreError
+from metalens.core import report, store
+from metalens.core.arrays import Array
+from metalens.core.errors import StoreError
 from metalens.pillars import axes
 from metalens.view import standing
 from metalens.view.panels import (
-    Axis,
-    Classes,
-    Curves,
-    Images,
-    Numbers,
+    ClassMapPanel,
+    CurvePanel,
+    ImagePanel,
     Panel,
+    SliderAxis,
+    TablePanel,
     at_brightest,
     classes_of,
 )
@@ -39,9 +39,9 @@ def library_panels(path: Path) -> list[Panel]:
     """
     made = libraries.load(path)
     axes = [
-        Axis("polarisation", list(made.polarization)),
-        Axis("angle", np.degrees(made.angle_rad).tolist(), "deg"),
-        Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+        SliderAxis("polarisation", list(made.polarization)),
+        SliderAxis("angle", np.degrees(made.angle_rad).tolist(), "deg"),
+        SliderAxis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
     ]
     x, error = 1e3 * made.diameter_um, made.t_error
     phase = np.unwrap(np.angle(made.t), axis=-1)
@@ -49,7 +49,7 @@ def library_panels(path: Path) -> list[Panel]:
         (1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()
     ]
     return [
-        Curves(
+        CurvePanel(
             "Transmission of the pillar",
             x,
             "diameter / nm",
@@ -60,7 +60,7 @@ def library_panels(path: Path) -> list[Panel]:
             bands,
             f"Bands: error bars of the solver, at most {error.max():.1e}. Shaded: resonances, to their half-width.",
         ),
-        Curves(
+        CurvePanel(
             "Phase of the pillar",
             x,
             "diameter / nm",
@@ -75,7 +75,7 @@ def library_panels(path: Path) -> list[Panel]:
             },
             bands,
         ),
-        Curves(
+        CurvePanel(
             "Error bar of t",
             x,
             "diameter / nm",
@@ -93,8 +93,8 @@ def axes_panels(path: Path) -> list[Panel]:
     """
     made = axes.load(path)
     names = [
-        Axis("polarisation", ["x", "y"]),
-        Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+        SliderAxis("polarisation", ["x", "y"]),
+        SliderAxis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
     ]
     own = np.stack([made.t[..., k, k] for k in (0, 1)]).swapaxes(
         -1, -2
@@ -109,9 +109,11 @@ def axes_panels(path: Path) -> list[Panel]:
     turns = np.where(kept, np.angle(own) / (2 * math.pi) % 1, 0.0)
     held = [tuple(row) for row in (made.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]
     return [
-        Images("Phase", turns, names, step, "turns", words),
-        Images("Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words),
-        Images(
+        ImagePanel("Phase", turns, names, step, "turns", words),
+        ImagePanel(
+            "Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words
+        ),
+        ImagePanel(
             "Error bar",
             made.t_error.swapaxes(-1, -2),
             names[1:],
@@ -119,7 +121,7 @@ def axes_panels(path: Path) -> list[Panel]:
             "|t - exact| at most",
             words,
         ),
-        Numbers(
+        TablePanel(
             "Pairs held out",
             (
                 "wavelength",
@@ -138,10 +140,14 @@ def lens_panels(path: Path) -> list[Panel]:
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
-        return [standing.drawn(lens), standing.phase(lens), _section(diameter, lens)]
+        return [
+            standing.draw_pillars(lens),
+            standing.draw_phase(lens),
+            _section(diameter, lens),
+        ]
     index, sizes = classes_of(diameter)
     return [
-        Classes(
+        ClassMapPanel(
             "Pillars",
             index,
             1e3 * sizes,
@@ -159,14 +165,14 @@ def lens_panels(path: Path) -> list[Panel]:
     ]
 
 
-def _section(diameter: Array, lens: lenses.Lens) -> Curves:
+def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
     """Phase along the middle row."""
     middle = diameter[len(diameter) // 2]
     held = middle > 0
     phase = lens.phase_rad()[len(diameter) // 2]
     x = lens.diameters.x_um[held]
     wrapped = (phase[held] / (2 * math.pi)) % 1
-    return Curves(
+    return CurvePanel(
         "Phase along the middle row",
         x,
         "x / µm",
@@ -227,17 +233,18 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
     )
     energy = np.stack([np.asarray(stack.energy_um2)[..., some] for stack in stacks])
     depth = 1e-3 * first.depths_um[some]
-    names = [Axis("depth", depth.tolist(), "mm")]
+    names = [SliderAxis("depth", depth.tolist(), "mm")]
     if values.ndim >= 5:
         names.insert(
-            0, Axis("field angle", [_angle(pair) for pair in first.angles_rad])
+            0, SliderAxis("field angle", [_angle(pair) for pair in first.angles_rad])
         )
     while values.ndim - 3 > len(names):
         names.insert(
-            0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)])))
+            0,
+            SliderAxis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))),
         )
     if len(stacks) > 1:
-        names.insert(0, Axis("light", lights))
+        names.insert(0, SliderAxis("light", lights))
     else:
         values, energy = values[0], energy[0]
     peak, names = float(values.max()), at_brightest(names, values)
@@ -247,7 +254,7 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
     }
     worst = max(stacks, key=lambda stack: stack.error)
     return [
-        Images(
+        ImagePanel(
             "Point spread function",
             values / peak,
             names,
@@ -256,11 +263,13 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
             f"Samples of {first.step_um:g} um; stated relative error {worst.error:.1e} ({worst.reason}).",
             optics=True,
         ),
-        Curves("Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]),
+        CurvePanel(
+            "Over depth", depth, "depth / mm", lines, "of the largest", names[:-1]
+        ),
     ]
 
 
-def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> Numbers:
+def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
     """The error of the PSFs by cause; what is not known of a cause is a dash."""
     held = [
         dataclasses.asdict(stack.budget or psf.Budget(stack.error)) for stack in stacks
@@ -273,7 +282,7 @@ def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> Numbers:
         for cause in held[0]
     ]
     words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
-    return Numbers("Budget of the error", ("cause", *names), rows, words)
+    return TablePanel("Budget of the error", ("cause", *names), rows, words)
 
 
 def far_field_panels(path: Path) -> list[Panel]:
@@ -287,7 +296,7 @@ def far_field_panels(path: Path) -> list[Panel]:
     )
     step, names = (
         float(sine[1] - sine[0]),
-        [Axis("light from", [_degrees(pair) for pair in angles])],
+        [SliderAxis("light from", [_degrees(pair) for pair in angles])],
     )
     edges = np.degrees(
         np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1)))
@@ -306,7 +315,7 @@ def far_field_panels(path: Path) -> list[Panel]:
     )
     cone = {"share": np.cumsum(held["rings"], axis=-1)}
     return [
-        Images(
+        ImagePanel(
             "Far field",
             share / share.max(),
             names,
@@ -315,7 +324,7 @@ def far_field_panels(path: Path) -> list[Panel]:
             words,
             across="sine",
         ),
-        Curves(
+        CurvePanel(
             "Light within a cone about the axis",
             edges,
             "angle / deg",
@@ -323,7 +332,7 @@ def far_field_panels(path: Path) -> list[Panel]:
             "share of the light that passes",
             names,
         ),
-        Numbers(
+        TablePanel(
             "Beams",
             ("light from", "sine x", "sine y", "share"),
             beams,
@@ -338,7 +347,7 @@ def near_field_panels(path: Path) -> list[Panel]:
     held, about = stored.arrays, stored.attributes
     step, heights = (
         float(about["step_um"]),
-        Axis("height", (1e3 * held["heights_um"]).tolist(), "nm"),
+        SliderAxis("height", (1e3 * held["heights_um"]).tolist(), "nm"),
     )
     out: list[Panel] = []
     for name, title in (
@@ -356,7 +365,7 @@ def near_field_panels(path: Path) -> list[Panel]:
             ]
         )
         up = shown if name == "xy" else shown[..., ::-1, :]
-        parts = Axis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
+        parts = SliderAxis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
         words = (
             f"For light of {1e3 * float(about['wavelength_um']):g} nm and electric amplitude 1 (H times the impedance "
             f"of vacuum); relative error {float(about[f'error_{name}']):.1e} (root mean square)."
@@ -364,7 +373,7 @@ def near_field_panels(path: Path) -> list[Panel]:
         if name != "xy":
             words += f" Light goes upwards; z from {held['z_um'][0]:.4g} to {held['z_um'][-1]:.4g} um, 0 at the foot."
         out.append(
-            Images(
+            ImagePanel(
                 title,
                 up,
                 [parts, heights] if name == "xy" else [parts],
@@ -398,11 +407,11 @@ def plain_panels(path: Path) -> list[Panel]:
             continue
         if array.ndim >= 2 and min(array.shape[-2:]) >= 8:
             axes = [
-                Axis(f"axis {i}", list(range(n)))
+                SliderAxis(f"axis {i}", list(range(n)))
                 for i, n in enumerate(array.shape[:-2])
             ]
             out.append(
-                Images(
+                ImagePanel(
                     name,
                     _finite(array),
                     axes,
@@ -413,14 +422,16 @@ def plain_panels(path: Path) -> list[Panel]:
             )
         elif array.ndim == 1 and len(array) >= 8:
             out.append(
-                Curves(name, np.arange(len(array)), "index", {name: _finite(array)}, "")
+                CurvePanel(
+                    name, np.arange(len(array)), "index", {name: _finite(array)}, ""
+                )
             )
     rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]
     rows += [
         (name, f"{a.dtype} {tuple(a.shape)}")
         for name, a in sorted(stored.arrays.items())
     ]
-    return [*out, Numbers("Content", ("name", "value"), rows)]
+    return [*out, TablePanel("Content", ("name", "value"), rows)]
 
 
 def _finite(array: Array) -> Array:

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from metalens import __version__
-from metalens.ground import store
-from metalens.ground.arrays import Array
+from metalens.core import store
+from metalens.core.arrays import Array
 from metalens.view.panels import (
-    Axis,
-    Classes,
-    Curves,
-    Drawing,
-    Images,
-    Numbers,
-    Outline,
+    ClassMapPanel,
+    CurvePanel,
+    DrawingPanel,
+    ImagePanel,
+    OutlinePanel,
     Panel,
-    Points,
+    PointPanel,
+    SliderAxis,
+    TablePanel,
 )
 
 DTYPES = {
@@ -36,7 +36,7 @@ DTYPES = {
 }
 
 
-def write(
+def write_page(
     path: str | Path,
     title: str,
     panels: Sequence[Panel],
@@ -52,10 +52,10 @@ def write(
     Raises:
         OSError: the target cannot be written.
     """
-    store.write_text(path, html(title, panels, about=about))
+    store.write_text(path, page_html(title, panels, about=about))
 
 
-def html(
+def page_html(
     title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None
 ) -> str:
     """The page as text; no address in it leads out of the file."""
@@ -92,9 +92,9 @@ def _plain(panel: Panel) -> dict[str, Any]:
         "title": panel.title,
         "caption": panel.caption,
     }
-    if isinstance(panel, Images):
+    if isinstance(panel, ImagePanel):
         return shared | {
-            "values": packed(np.asarray(panel.values, np.float32)),
+            "values": pack_array(np.asarray(panel.values, np.float32)),
             "axes": [_axis(axis) for axis in panel.axes],
             "step": panel.step_um,
             "unit": panel.unit,
@@ -103,26 +103,26 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "across": panel.across,
             "fromLeast": panel.from_least,
         }
-    if isinstance(panel, Curves):
+    if isinstance(panel, CurvePanel):
         return shared | {
-            "x": packed(np.asarray(panel.x, np.float32)),
+            "x": pack_array(np.asarray(panel.x, np.float32)),
             "xName": panel.x_name,
             "yName": panel.y_name,
             "lines": {
-                name: packed(np.asarray(line, np.float32))
+                name: pack_array(np.asarray(line, np.float32))
                 for name, line in panel.lines.items()
             },
             "errors": {
-                name: packed(np.asarray(line, np.float32))
+                name: pack_array(np.asarray(line, np.float32))
                 for name, line in panel.errors.items()
             },
             "axes": [_axis(axis) for axis in panel.axes],
             "bands": [list(band) for band in panel.bands],
             "scale": panel.scale,
         }
-    if isinstance(panel, Classes):
+    if isinstance(panel, ClassMapPanel):
         return shared | {
-            "index": packed(panel.index),
+            "index": pack_array(panel.index),
             "sizes": [_number(v) for v in panel.sizes],
             "pitch": panel.pitch_um,
             "unit": panel.unit,
@@ -132,16 +132,16 @@ def _plain(panel: Panel) -> dict[str, Any]:
             },
             "marks": [list(mark) for mark in panel.marks],
         }
-    if isinstance(panel, Drawing):
+    if isinstance(panel, DrawingPanel):
         return shared | {
             "outlines": [_outline(outline) for outline in panel.outlines],
             "unit": panel.unit_um,
             "marks": [list(mark) for mark in panel.marks],
         }
-    return shared | (_points(panel) if isinstance(panel, Points) else _table(panel))
+    return shared | (_points(panel) if isinstance(panel, PointPanel) else _table(panel))
 
 
-def _points(panel: Points) -> dict[str, Any]:
+def _points(panel: PointPanel) -> dict[str, Any]:
     notes = panel.notes or [{}] * len(panel.x)
     return {
         "x": [_number(v) for v in panel.x],
@@ -155,7 +155,7 @@ def _points(panel: Points) -> dict[str, Any]:
     }
 
 
-def _outline(outline: Outline) -> dict[str, Any]:
+def _outline(outline: OutlinePanel) -> dict[str, Any]:
     """Places by rising y, then x, as steps: those of a lattice repeat and deflate to a
     fraction of a byte.
     """
@@ -163,21 +163,21 @@ def _outline(outline: Outline) -> dict[str, Any]:
     steps = np.diff(places, axis=0, prepend=np.zeros((1, 2), places.dtype))
     return {
         "layer": outline.layer,
-        "corners": packed(np.asarray(outline.corners, np.float32)),
-        "dx": packed(np.asarray(steps[:, 0], np.int32)),
-        "dy": packed(np.asarray(steps[:, 1], np.int32)),
+        "corners": pack_array(np.asarray(outline.corners, np.float32)),
+        "dx": pack_array(np.asarray(steps[:, 0], np.int32)),
+        "dy": pack_array(np.asarray(steps[:, 1], np.int32)),
         "notes": {name: _number(value) for name, value in outline.notes.items()},
     }
 
 
-def _table(panel: Numbers) -> dict[str, Any]:
+def _table(panel: TablePanel) -> dict[str, Any]:
     return {
         "head": list(panel.head),
         "rows": [[_number(v) for v in row] for row in panel.rows],
     }
 
 
-def _axis(axis: Axis) -> dict[str, Any]:
+def _axis(axis: SliderAxis) -> dict[str, Any]:
     values = [_number(v) for v in axis.values]
     return {
         "name": axis.name,
@@ -196,7 +196,7 @@ def _number(value: Any) -> Any:
     return int(value) if isinstance(value, np.integer) else value
 
 
-def packed(array: Array) -> dict[str, Any]:
+def pack_array(array: Array) -> dict[str, Any]:
     """An array for the page: type, shape, and its little-endian bytes deflated, in base
     64.
     """

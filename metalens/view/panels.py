@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import StoreError
+from metalens.core.arrays import Array
+from metalens.core.errors import StoreError
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class SliderAxis:
     """A slider: its name, its values, and their unit.
 
     blink: steps through its values by itself, on one scale. first: place of the value
@@ -28,7 +28,7 @@ class Axis:
     first: int = 0
 
 
-def at_brightest(axes: Sequence[Axis], values: Array) -> list[Axis]:
+def at_brightest(axes: Sequence[SliderAxis], values: Array) -> list[SliderAxis]:
     """The sliders of images (*axes, y, x), set to the one with the highest peak."""
     places = np.unravel_index(int(values.argmax()), values.shape)
     return [
@@ -38,7 +38,7 @@ def at_brightest(axes: Sequence[Axis], values: Array) -> list[Axis]:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Images:
+class ImagePanel:
     """A stack of images, one slider an axis before (y, x).
 
     values: (*axes, y, x) real; shown in single precision.
@@ -51,7 +51,7 @@ class Images:
 
     title: str
     values: Array
-    axes: Sequence[Axis]
+    axes: Sequence[SliderAxis]
     step_um: float
     unit: str = ""
     caption: str = ""
@@ -69,7 +69,7 @@ class Images:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Curves:
+class CurvePanel:
     """Curves over one axis, one slider for each further one.
 
     x: (n,). lines: {name: (*axes, n)}; errors: {name of a line: (*axes, n)}, drawn as a
@@ -82,7 +82,7 @@ class Curves:
     x_name: str
     lines: Mapping[str, Array]
     y_name: str
-    axes: Sequence[Axis] = ()
+    axes: Sequence[SliderAxis] = ()
     errors: Mapping[str, Array] = field(default_factory=dict)
     bands: Sequence[tuple[float, float]] = ()
     caption: str = ""
@@ -90,7 +90,7 @@ class Curves:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Classes:
+class ClassMapPanel:
     """A map of classes on a lattice, every site present: averaged where many share a
     pixel of the screen.
 
@@ -117,7 +117,7 @@ class Classes:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Numbers:
+class TablePanel:
     """A table; numbers are shown to four digits."""
 
     title: str
@@ -127,7 +127,7 @@ class Numbers:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Outline:
+class OutlinePanel:
     """Copies of one polygon, nothing left out.
 
     layer: name of the layer it is drawn on. corners: (n, 2), places: (m, 2) int32, both
@@ -142,7 +142,7 @@ class Outline:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Drawing:
+class DrawingPanel:
     """Polygons on layers that can be turned on and off; far away the covered part of a
     pixel is shown.
 
@@ -151,14 +151,14 @@ class Drawing:
     """
 
     title: str
-    outlines: Sequence[Outline]
+    outlines: Sequence[OutlinePanel]
     unit_um: float
     caption: str = ""
     marks: Sequence[tuple[float, float, str]] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Points:
+class PointPanel:
     """Points that can be picked, by a click or with the arrow keys; what is known of
     the picked one is told.
 
@@ -187,7 +187,7 @@ class Points:
             )
 
 
-Panel = Images | Curves | Classes | Drawing | Numbers | Points
+Panel = ImagePanel | CurvePanel | ClassMapPanel | DrawingPanel | TablePanel | PointPanel
 
 
 def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:

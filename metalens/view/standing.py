@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import axes
-from metalens.view.panels import Axis, Drawing, Images, Outline
+from metalens.view.panels import DrawingPanel, ImagePanel, OutlinePanel, SliderAxis
 
 MOST_DRAWN = 3_000_000  # pillars of a page; of a larger lens its middle is drawn
 BANDS = 6  # colours of sizes or turns
@@ -36,7 +36,7 @@ class _Standing:
         return found, place.reshape(-1)
 
 
-def drawn(lens: Lens) -> Drawing:
+def draw_pillars(lens: Lens) -> DrawingPanel:
     """Every pillar's outline where it stands, coloured by its size, or by its turn
     where pillars are turned.
     """
@@ -56,7 +56,7 @@ def drawn(lens: Lens) -> Drawing:
         notes = {"size / nm": size} | ({"length / nm": length} if length else {})
         corners = _NM * _corners(lens, size / _NM, length / _NM, math.radians(turn))
         outlines.append(
-            Outline(
+            OutlinePanel(
                 name, corners, places, notes | ({"turn / deg": turn} if what else {})
             )
         )
@@ -64,10 +64,10 @@ def drawn(lens: Lens) -> Drawing:
         f"{len(at):,} pillars, each a {lens.cell.shape.name} where it stands, +y of the lens up, as on the mask"
         f"{'' if whole else ' (the middle of a larger lens)'}. Drag to move, wheel or + and - to zoom."
     )
-    return Drawing("Pillars", outlines, 1 / _NM, text)
+    return DrawingPanel("Pillars", outlines, 1 / _NM, text)
 
 
-def phase(lens: Lens) -> Images:
+def draw_phase(lens: Lens) -> ImagePanel:
     """Phase over the aperture on square pixels, each that of the site nearest to it."""
     d = lens.diameters
     edge = max(d.x_um[-1] - d.x_um[0], d.y_um[-1] - d.y_um[0], d.pitch_um)
@@ -76,17 +76,19 @@ def phase(lens: Lens) -> Images:
         np.arange(-math.ceil(end / step), math.ceil(end / step) + 1) * step
         for end in (d.y_um[-1], d.x_um[-1])
     )
-    row, column = nearest(d, y[:, None], x[None])
+    row, column = nearest_site(d, y[:, None], x[None])
     seen = [lens] if lens.pairs is None else [lens.seen("x"), lens.seen("y")]
     values = np.stack(
         [np.mod(one.phase_rad()[row, column] / (2 * np.pi), 1) for one in seen]
     )
     values = np.where(d.diameter_um[row, column] > 0, values, 0.0)
     names = [lens.hand or "any"] if lens.pairs is None else ["along x", "along y"]
-    return Images("Phase", values, [Axis("light", names)], step, "turns, modulo one")
+    return ImagePanel(
+        "Phase", values, [SliderAxis("light", names)], step, "turns, modulo one"
+    )
 
 
-def nearest(d: DiameterMap, y_um: Array, x_um: Array) -> tuple[Array, Array]:
+def nearest_site(d: DiameterMap, y_um: Array, x_um: Array) -> tuple[Array, Array]:
     """(row, column) of the site of the lattice nearest to places; a hexagonal one is
     two rectangular ones.
     """
@@ -135,11 +137,11 @@ def _standing(lens: Lens) -> tuple[_Standing, bool]:
 
 def _corners(lens: Lens, size_um: float, length_um: float, turn_rad: float) -> Array:
     """(n, 2) of one pillar about its site."""
-    from metalens.cell.shapes import turned
+    from metalens.cell.shapes import rotate_corners
 
-    cell = axes.sized(lens.cell, size_um, length_um) if length_um else lens.cell
+    cell = axes.cell_of_sizes(lens.cell, size_um, length_um) if length_um else lens.cell
     corners = cell.outline(size_um).line(_CORNERS)
-    return np.asarray(turned(corners, turn_rad))
+    return np.asarray(rotate_corners(corners, turn_rad))
 
 
 def _bands(values: Array, unit: str) -> list[str]:

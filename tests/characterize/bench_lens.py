@@ -9,15 +9,15 @@ import math
 import numpy as np
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.captures.capture import Capture
 from characterize.inference.asbuilt import AsBuilt
-from characterize.inference.estimate import Options, fit
-from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.search import Task
+from characterize.inference.estimate import FitOptions, fit
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.inference.search import SearchTask
 from characterize.model import NAMES, ForwardModel
-from characterize.model.parameters import Known
-from characterize.model.setting import Setting
+from characterize.model.parameters import KnownValue
+from characterize.model.setting import FrameSetting
 from metalens import design, profiles
 from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import Sensitivity
@@ -98,14 +98,14 @@ def row(radius_um: float = 20.0, **more: object) -> Lens:
     return Lens(**(usual | more))
 
 
-def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> Truth:
+def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> HiddenLens:
     """The hidden lens and its bench."""
-    known = tuple(Known(name, value) for name, value in (VALUES | more).items())
-    return Truth(
+    known = tuple(KnownValue(name, value) for name, value in (VALUES | more).items())
+    return HiddenLens(
         DEPTHS,
         peak_e=peak_e,
         parameter=known,
-        camera=Camera(pixel_um=1.5, pixels=16),
+        camera=BenchCamera(pixel_um=1.5, pixels=16),
         seed=seed,
     )
 
@@ -113,7 +113,7 @@ def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> Truth:
 @functools.lru_cache
 def light(strength_rad: float = 0.0, **more: float) -> np.ndarray:
     """Noise-free light of the bench, in units of its own."""
-    return bench.irradiance(lens(strength_rad), truth(**more), RESPONSE)
+    return bench.bench_irradiance(lens(strength_rad), truth(**more), RESPONSE)
 
 
 def counts(
@@ -163,27 +163,27 @@ def electrons(
 ) -> np.ndarray:
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
-    return bright * (peak_e / bright.max()) + bench.background(truth(**more))
+    return bright * (peak_e / bright.max()) + bench.background_plane(truth(**more))
 
 
 def near_focus(
     depths_um: tuple[float, ...], **values: float
-) -> tuple[Data, ForwardModel]:
+) -> tuple[FitImages, ForwardModel]:
     """Frames of a lens of these parameters with 6000 electrons at the peak and a floor
     of 9 e², and their model.
     """
-    known = tuple(Known(name, value) for name, value in values.items())
-    hidden = Truth(
+    known = tuple(KnownValue(name, value) for name, value in values.items())
+    hidden = HiddenLens(
         depths_um,
         peak_e=6000.0,
         parameter=known,
-        camera=Camera(pixel_um=1.5, pixels=16),
+        camera=BenchCamera(pixel_um=1.5, pixels=16),
     )
-    electrons = bench.irradiance(lens(), hidden, RESPONSE)
+    electrons = bench.bench_irradiance(lens(), hidden, RESPONSE)
     electrons = electrons * (6000.0 / electrons.max())
     electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
     everywhere, n = np.ones(electrons.shape, bool), len(depths_um)
-    data = Data(
+    data = FitImages(
         electrons,
         everywhere,
         ~everywhere,
@@ -192,17 +192,17 @@ def near_focus(
     )
     return data, ForwardModel(
         lens(),
-        Setting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16),
+        FrameSetting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16),
         RESPONSE,
     )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Given(Task):
+class Given(SearchTask):
     """A task whose parameters and what is known of them are given, not those of a lens."""
 
     names: tuple[str, ...] = ()
-    prior: Prior | None = None
+    prior: GaussianPrior | None = None
 
 
 def given(
@@ -210,11 +210,11 @@ def given(
     frames: np.ndarray,
     noise: float,
     names: tuple[str, ...],
-    prior: Prior,
+    prior: GaussianPrior,
 ) -> Given:
     """Frames with the same noise in every pixel, and a stand-in for the model."""
     everywhere = np.ones(frames.shape, bool)
-    data = Data(
+    data = FitImages(
         frames,
         everywhere,
         ~everywhere,
@@ -236,12 +236,12 @@ def found_again(made: Lens) -> tuple[AsBuilt, dict[str, float], dict[str, float]
     is off in standard deviations
     of the model, and these, by name."""
     hidden = truth(peak_e=6000.0)
-    light = bench.irradiance(made, hidden, RESPONSE)
-    frames = capture(light * (6000.0 / light.max()) + bench.background(hidden))
+    light = bench.bench_irradiance(made, hidden, RESPONSE)
+    frames = capture(light * (6000.0 / light.max()) + bench.background_plane(hidden))
     found = fit(
         frames,
         made,
-        Options(scan_um=60.0),
+        FitOptions(scan_um=60.0),
         response=dataclasses.replace(RESPONSE, error=0.08),
     )
     names = [

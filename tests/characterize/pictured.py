@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from characterize.model.setting import Setting
+from characterize.model.setting import FrameSetting
 
 DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
 
@@ -19,7 +19,7 @@ class Pictured:
     def __init__(self, index=None, seen=1.0):
         self.seen = seen
         self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(
+        self.setting = FrameSetting(
             DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3
         )
         self.groups = [SimpleNamespace(index=np.arange(len(index)))]

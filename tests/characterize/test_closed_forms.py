@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import bench_lens as b
 
 from characterize.inference import leastsquares
-from characterize.inference.leastsquares import Data, Prior
-from characterize.model.detector import oversampling
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.model.detector import required_oversampling
 from characterize.pupil.record import _components
 
 
@@ -49,15 +49,15 @@ def test_a_saturated_pixel_says_something_only_where_the_model_falls_short_of_it
     def model(x, jacobian):
         return np.full((1, 2, 2), x[0]), np.ones((1, 1, 2, 2)) if jacobian else None
 
-    data = Data(
+    data = FitImages(
         seen,
         np.ones_like(full),
         full,
         np.full(seen.shape, 9.0),
         np.full(seen.shape, 1e18),
     )
-    found = leastsquares.fit(model, data, np.array([70.0]), prior=Prior.none(np.zeros(1)),
-                             settings=leastsquares.Settings(huber=1e6))  # fmt: skip
+    found = leastsquares.fit_levenberg_marquardt(model, data, np.array([70.0]), prior=GaussianPrior.none(np.zeros(1)),
+                             settings=leastsquares.SolverSettings(huber=1e6))  # fmt: skip
     counted = seen.ravel()[: 2 if full_e < 72 else 4]
     assert found.value[0] == pytest.approx(counted.mean(), rel=1e-6)
     assert found.covariance[0, 0] == pytest.approx(9.0 / len(counted), rel=1e-6)
@@ -68,4 +68,8 @@ def test_samples_of_a_pixel_are_twice_the_light_s_highest_frequency():
     cycles/um: 3 samples a um.
     """
     lens = b.row(300.0, sensor_distance_um=470.0, layers=b.GLASS, wavelength_um=0.8)
-    assert [oversampling(lens, pixel_um) for pixel_um in (0.2, 1.0, 2.1)] == [1, 3, 7]
+    assert [required_oversampling(lens, pixel_um) for pixel_um in (0.2, 1.0, 2.1)] == [
+        1,
+        3,
+        7,
+    ]

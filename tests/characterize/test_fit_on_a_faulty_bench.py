@@ -17,9 +17,15 @@ import hidden_lens as hidden
 import pillar_bench as bench
 
 import characterize
-from characterize.inference.estimate import Options
-from characterize.model import PLACE, ForwardModel, Setting, slopes, vector
-from metalens.ground.errors import CaptureError, FitError
+from characterize.inference.estimate import FitOptions
+from characterize.model import (
+    PLACE,
+    ForwardModel,
+    FrameSetting,
+    log_response_slopes,
+    parameter_vector,
+)
+from metalens.core.errors import CaptureError, FitError
 
 READ_NOISE_E = 7.3  # far from the 2 e that are assumed where nothing tells
 
@@ -27,12 +33,12 @@ READ_NOISE_E = 7.3  # far from the 2 e that are assumed where nothing tells
 @functools.lru_cache
 def response():
     """Slopes of the small lens's pillars by height, index and sidewall."""
-    return slopes(hidden.lens())
+    return log_response_slopes(hidden.lens())
 
 
 def fitted(capture, **options):
     """The fit of a capture of the small lens."""
-    choice = Options(scan_um=60.0, **options)
+    choice = FitOptions(scan_um=60.0, **options)
     return characterize.fit(capture, hidden.lens(), choice, response=response())
 
 
@@ -106,7 +112,7 @@ def test_a_pixel_pitch_that_is_three_percent_off_is_named():
     )
     session = bench.with_faults(session, pixel_error=0.03)
     built = characterize.fit(
-        bench.shoot(lens, session).capture, lens, response=slopes(lens)
+        bench.shoot(lens, session).capture, lens, response=log_response_slopes(lens)
     )
     assert any("a wrong pixel pitch explains" in words for words in built.cautions)
     low, high = built.interval("pixel_percent")
@@ -124,7 +130,7 @@ def test_a_spectrum_of_thirty_nm_is_found_and_the_bias_lies_inside():
     )
     session = bench.with_faults(session, led_nm=30.0)
     built = characterize.fit(
-        bench.shoot(lens, session).capture, lens, response=slopes(lens)
+        bench.shoot(lens, session).capture, lens, response=log_response_slopes(lens)
     )
     low, high = built.interval("bandwidth_nm")
     assert low < 30 / 2.3548 < high
@@ -148,11 +154,11 @@ def test_no_derivative_by_a_bias_that_is_beyond_the_known_pillars():
     """At 200 nm every pillar is as at the end of the range: images and differences of
     them stand still, and so must the derivative.
     """
-    setting = Setting(
+    setting = FrameSetting(
         np.array(hidden.DEPTHS), np.zeros((6, 2)), np.ones(6), 1.5, 11, 14
     )
     model = ForwardModel(hidden.lens(), setting, response())
-    x = vector({"bias_nm": 200.0, "log_gain": 9.0})
+    x = parameter_vector({"bias_nm": 200.0, "log_gain": 9.0})
     more = x + 5.0 * (np.arange(len(x)) == PLACE["bias_nm"])
     frames, rates = model.images(x, ["bias_nm"])
     assert np.array_equal(model.images(more)[0], frames)

@@ -11,15 +11,15 @@ import numpy as np
 
 from characterize.inference.asbuilt import AsBuilt
 from characterize.model.parameters import NAMES
-from codesign.network.architecture import smallest
+from codesign.network.architecture import smallest_architecture
 from codesign.optics.stack import OpticsConfig
 from codesign.train import evolution, run
-from codesign.train.evolution import Candidate, Search
+from codesign.train.evolution import EvaluatedCandidate, EvolutionState
 from metalens import design, lens
 from metalens.cell.record import Cell, Index
+from metalens.core.store import Provenance
 from metalens.design.profiles import Focus
 from metalens.fabrication import sensitivity
-from metalens.ground.store import Provenance
 from metalens.pillars.proxy import Proxy
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt;
@@ -120,13 +120,17 @@ def finished_run(folder, text=TINY):
     """The files of a run whose search ended, its network untrained."""
     folder.mkdir(parents=True)
     (folder / "run.toml").write_text(text)
-    settings = run.load(folder / "run.toml")
-    going = run.start(settings)
-    chosen = smallest(settings.space)
-    going.searches = [Search((Candidate(chosen, 1.0, going.macs(chosen)),), {})]
-    run.save(folder / "checkpoint.safetensors", going)
+    settings = run.load_run_settings(folder / "run.toml")
+    going = run.start_run(settings)
+    chosen = smallest_architecture(settings.space)
+    going.searches = [
+        EvolutionState((EvaluatedCandidate(chosen, 1.0, going.macs(chosen)),), {})
+    ]
+    run.save_run(folder / "checkpoint.safetensors", going)
     row = {"budget_mmacs": 2.0, "mmacs": 1.0}
-    row["architecture"] = json.loads(evolution.dumps(going.searches[0]))["history"][0]
+    row["architecture"] = json.loads(evolution.state_to_json(going.searches[0]))[
+        "history"
+    ][0]
     (folder / "result.json").write_text(json.dumps({"rows": [row]}))
     lens.save(folder / "lens.h5", small())
     return settings

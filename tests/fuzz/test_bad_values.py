@@ -11,8 +11,8 @@ import typing
 import pytest
 
 from docs.site.reference import SETTINGS
-from metalens.ground import config
-from metalens.ground.errors import MetalensError
+from metalens.core import config
+from metalens.core.errors import MetalensError
 
 # never good, whatever the key
 BAD = {

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from characterize.captures import capture
 from layout.pec import psf
-from layout.process.process import Exposure
+from layout.process.process import ExposureSettings
+from metalens.core.errors import MetalensError
 from metalens.fabrication import bias
-from metalens.ground.errors import MetalensError
 
 LIMITS = dict(max_examples=60)
 FRAMES = (np.arange(2 * 6 * 5).reshape(2, 6, 5) * 37 % 1000).astype(np.uint16)
@@ -93,7 +93,7 @@ def test_the_exposure_table_itself_is_good(tmp_path):
     """Its density falls from the first radius to the last, as the table does."""
     path = tmp_path / "dose.csv"
     path.write_bytes(DOSE)
-    found = psf.point_exposure(Exposure(csv=path)).density(
+    found = psf.point_exposure(ExposureSettings(csv=path)).density(
         np.array([0.05, 0.3, 3.0, 10.0])
     )
     assert (found > 0).all()
@@ -209,7 +209,7 @@ def test_damaged_bias_tables_are_refused_by_type_or_hold_numbers(
 def test_damaged_exposure_tables_are_refused_by_type_or_fitted(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fuzz") / "dose.csv"
     path.write_bytes(_damaged(DOSE, data))
-    found, said = _read(lambda: psf.point_exposure(Exposure(csv=path)))
+    found, said = _read(lambda: psf.point_exposure(ExposureSettings(csv=path)))
     if found is None:
         assert said
         return

@@ -6,26 +6,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from characterize.bench.bench import Truth
-from characterize.commands.fit import Metrology
+from characterize.bench.bench import HiddenLens
+from characterize.commands.fit import MetrologySettings
 from characterize.pupil.record import PupilSpec
 from codesign.train import run as runs
 from layout.process import process as processes
 from metalens import materials
 from metalens.chain.stages import ChainFiles
-from metalens.commands.design import Design
+from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile
-from metalens.commands.psf import Settings
-from metalens.ground import config
-from metalens.ground.errors import MetalensError
+from metalens.commands.psf import PsfSettings
+from metalens.core import config
+from metalens.core.errors import MetalensError
 
 TEXTS = {
     "cell": ("[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n[sweep]\nwavelengths_um = [0.85]\nsamples = 200\n", CellFile),
-    "design": ('profile = "cubic"\naperture_mm = 0.5\n[limits]\nmin_gap_nm = 70\n[cubic]\nstrength_rad = 5\n', Design),
-    "psf": ("depths_mm = [16.0, 26.0, 0.5]\nangles_deg = [0.0, 10.0]\ntolerance = 1e-4\n", Settings),
+    "design": ('profile = "cubic"\naperture_mm = 0.5\n[limits]\nmin_gap_nm = 70\n[cubic]\nstrength_rad = 5\n',
+        DesignSettings),
+    "psf": ("depths_mm = [16.0, 26.0, 0.5]\nangles_deg = [0.0, 10.0]\ntolerance = 1e-4\n", PsfSettings),
     "process": ('name = "x"\n[rules]\ngrid_nm = 1\n[bias]\ntable_nm = [[80, -6.0], [120, 1.0]]\n', processes.Process),
-    "truth": ('depths_um = [18000.0, 22000.0]\npeak_e = 8000.0\n[[parameter]]\nname = "bias_nm"\nvalue = 3.0\n', Truth),
-    "metrology": ('scan_um = 150.0\n[[known]]\nname = "height_nm"\nvalue = -3.0\nsigma = 3.0\n', Metrology),
+    "truth": ('depths_um = [18000.0, 22000.0]\npeak_e = 8000.0\n[[parameter]]\nname = "bias_nm"\nvalue = 3.0\n', HiddenLens),
+    "metrology": ('scan_um = 150.0\n[[known]]\nname = "height_nm"\nvalue = -3.0\nsigma = 3.0\n', MetrologySettings),
     "pupil": ("numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\nstep_um = 0.5\n", PupilSpec),
     "chain": ('cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\n', ChainFiles),
     "run": ('preset = "smoke"\n[inner]\nsteps = 3\n[run]\npitch_um = 18.0\n', None),
@@ -36,7 +37,7 @@ LIMITS = dict(max_examples=40)
 def _load(kind, path):
     record = TEXTS[kind][1]
     if kind == "run":
-        return runs.load(path)
+        return runs.load_run_settings(path)
     return processes.load(path) if kind == "process" else config.load(path, record)
 
 

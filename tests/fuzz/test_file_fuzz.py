@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterize.inference import asbuilt
-from codesign.budget.links import Entry
+from codesign.budget.links import BudgetEntry
 from codesign.commands import budget as command_budget
 from codesign.eye import dataset
 from codesign.gaze import people_file
-from codesign.gaze.shared import Mixed, People
+from codesign.gaze.shared import MixedModel, PopulationPrior
 from metalens import lens, library, psf
 from metalens.cell.record import Cell, Index
+from metalens.core import store
+from metalens.core.errors import MetalensError
 from metalens.fabrication import Sensitivity
-from metalens.ground import store
-from metalens.ground.errors import MetalensError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary, Sweep
@@ -85,17 +85,17 @@ def _asbuilt():
 
 def _budget_rows():
     return [
-        Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"),
-        Entry("all links", 0.1, math.nan, 1e-3, "sum"),
+        BudgetEntry("mask grid", 0.1, 0.2, 1e-4, "rounded"),
+        BudgetEntry("all links", 0.1, math.nan, 1e-3, "sum"),
     ]
 
 
 def _people():
     rng = np.random.default_rng(0)
-    model = Mixed(
+    model = MixedModel(
         rng.normal(0, 1, (36, 2)), rng.uniform(0.1, 2, (36, 2)), rng.uniform(0.1, 1, 2)
     )
-    return People(model, rng.normal(0, 3, 7), rng.uniform(0.5, 5, 7))
+    return PopulationPrior(model, rng.normal(0, 3, 7), rng.uniform(0.5, 5, 7))
 
 
 KINDS = {
@@ -104,10 +104,13 @@ KINDS = {
     "psf": (lambda p: psf.save(p, _psf()), psf.load),
     "asbuilt": (lambda p: asbuilt.save(p, _asbuilt()), asbuilt.load),
     "budget": (
-        lambda p: command_budget.save(p, _budget_rows(), store.Provenance()),
-        command_budget.load,
+        lambda p: command_budget.save_budget(p, _budget_rows(), store.Provenance()),
+        command_budget.load_budget,
     ),
-    "people": (lambda p: people_file.save(p, _people()), people_file.load),
+    "people": (
+        lambda p: people_file.save_people(p, _people()),
+        people_file.load_people,
+    ),
 }
 
 

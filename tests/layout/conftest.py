@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
+from layout.mask.plan import FigureCell, MaskPlan, PillarLattice, pillar_classes
 
 
 def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=100):
@@ -29,8 +29,8 @@ def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=
     return MaskPlan(
         name="TOP",
         classes=made,
-        lattices=(Lattice.of("LENS", classes, pitch=pitch, x0=-6000, y0=4400),),
-        figures=(Figure("MARKS", {(3, 0): (corner,)}),) if figures else (),
+        lattices=(PillarLattice.of("LENS", classes, pitch=pitch, x0=-6000, y0=4400),),
+        figures=(FigureCell("MARKS", {(3, 0): (corner,)}),) if figures else (),
         layer_names={(1, 0): "pillar", (3, 0): "marks"},
     )
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from layout import solids
-from layout.process.process import Etch, Process
+from layout.process.process import EtchProfile, Process
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
+from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
-from metalens.ground.errors import ProcessError
-from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.pillars import Proxy
 
 PROXY = Proxy(
@@ -22,7 +22,7 @@ PROXY = Proxy(
 )
 HEIGHT = Cell(0.42).height_um
 DEGREES = 1.3
-TILTED = Process(etch=Etch(sidewall_deg=DEGREES))
+TILTED = Process(etch=EtchProfile(sidewall_deg=DEGREES))
 # um by which both edges together move from half height to the foot
 LEAN = HEIGHT * math.tan(math.radians(DEGREES))
 U = Polygon(
@@ -116,7 +116,7 @@ def test_stl_holds_closed_pillars_of_their_volume_on_their_sites(
 @pytest.mark.parametrize("shape", [Circle(), Ring(0.5), Ellipse(0.6, 0.3), U])
 def test_step_has_the_volume_of_each_class_by_the_kernel(tmp_path, shape, degrees):
     build123d = pytest.importorskip("build123d")
-    tile = solids.cut_tile(lens(shape), Process(etch=Etch(sidewall_deg=degrees)))
+    tile = solids.cut_tile(lens(shape), Process(etch=EtchProfile(sidewall_deg=degrees)))
     solids.write_step(tmp_path / "a.step", tile)
     found = build123d.import_step(tmp_path / "a.step")
     assert len(found.children) == len(tile.kind) + 1
@@ -172,7 +172,7 @@ def test_pillars_of_two_sizes_have_width_and_length_as_fabricated():
     rng = np.random.default_rng(8)
     size, length = rng.choice([0.12, 0.2], (5, 6)), rng.choice([0.14, 0.24], (5, 6))
     axes = np.array([0.12, 0.2]), np.array([0.14, 0.24])
-    table = Pairs(
+    table = TwoSizeTable(
         np.array([0.94]), *axes, np.ones((1, 2, 2, 2), complex), (77.0, math.inf)
     )
     grid, cell = DiameterMap(size, 0.4, length_um=length), Cell(0.4, shape=Rectangle())
@@ -198,7 +198,7 @@ def test_pillars_of_two_sizes_have_width_and_length_as_fabricated():
 )
 def test_walls_that_close_and_openings_of_a_film_are_refused(shape, degrees, words):
     with pytest.raises(ProcessError, match=words):
-        solids.cut_tile(lens(shape), Process(etch=Etch(sidewall_deg=degrees)))
+        solids.cut_tile(lens(shape), Process(etch=EtchProfile(sidewall_deg=degrees)))
 
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])

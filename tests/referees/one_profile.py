@@ -2,13 +2,15 @@
 
 import math
 
-from characterize.inference.ends import end, joined
+from characterize.inference.ends import find_limit, join_limits
 from characterize.inference.posterior import REACH
 
 
 def profile(valley, i, *, level=REACH**2):
     """Out to a rise of ``level``; second: a place below the mode, if one was met."""
     goal = math.sqrt(level)
-    sides = [end(valley, i, sign, goal) for sign in (-1, 1)]
+    sides = [find_limit(valley, i, sign, goal) for sign in (-1, 1)]
     better = next((one.lower for one in sides if one.lower is not None), None)
-    return joined(sides, float(valley.mode[i]), float(valley.sigma[i]), goal), better
+    return join_limits(
+        sides, float(valley.mode[i]), float(valley.sigma[i]), goal
+    ), better

@@ -23,17 +23,17 @@ from torch import Tensor
 
 from codesign.eye import (
     POPULATION,
-    Camera,
-    Rig,
-    States,
+    CameraRig,
+    EyeStates,
+    PinholeCamera,
     model,
-    parameters,
+    model_parameters,
     renderer,
     textures,
 )
-from metalens.ground import store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import SceneError
+from metalens.core import store
+from metalens.core.arrays import Array
+from metalens.core.errors import SceneError
 from tests.referees.traced_shapes import LAMP_RADIUS_MM, build
 
 REGIONS = ("pupil", "iris", "sclera", "skin", "edges", "mirrors")
@@ -116,10 +116,10 @@ def start() -> Any:
 
 
 def compare(
-    states: States,
+    states: EyeStates,
     *,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
     samples: int = 512,
 ) -> Comparison:
     """Render the first of the states both ways; by default 96 pixels of 15 um, about
@@ -134,7 +134,7 @@ def compare(
     if samples < 2:
         raise SceneError(f"{samples} paths a pixel: need 2 or more, for two halves")
     mitsuba = start()
-    rig, camera = rig or Rig(), camera or Camera(96, 15.0)
+    rig, camera = rig or CameraRig(), camera or PinholeCamera(96, 15.0)
     state = _without_glints(states[:1])
     renderer.render(state, rig=rig, camera=camera)  # compiles
     begin = time.perf_counter()
@@ -158,10 +158,10 @@ def compare(
 
 
 def trace(
-    states: States,
+    states: EyeStates,
     *,
-    rig: Rig | None = None,
-    camera: Camera | None = None,
+    rig: CameraRig | None = None,
+    camera: PinholeCamera | None = None,
     samples: int = 64,
     seed: int = 0,
 ) -> Array:
@@ -171,7 +171,7 @@ def trace(
         SceneError: Mitsuba is not installed.
     """
     mitsuba = start()
-    rig, camera = rig or Rig(), camera or Camera(96, 15.0)
+    rig, camera = rig or CameraRig(), camera or PinholeCamera(96, 15.0)
     p = _parameters(states, rig, camera)
     scene = mitsuba.load_dict(build(mitsuba, p, _bank(), rig=rig, camera=camera))
     light = np.array(mitsuba.render(scene, spp=samples, seed=seed))[..., 0]
@@ -192,23 +192,25 @@ def picture(made: Comparison, path: Path) -> None:
     store.write_bytes(path, coded.tobytes())
 
 
-def _parameters(states: States, rig: Rig, camera: Camera) -> Tensor:
-    return parameters(
+def _parameters(states: EyeStates, rig: CameraRig, camera: PinholeCamera) -> Tensor:
+    return model_parameters(
         states[:1], rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
     )[0]
 
 
 def _bank() -> Tensor:
-    return torch.tensor(textures.bank(0), dtype=torch.float64)
+    return torch.tensor(textures.texture_bank(0), dtype=torch.float64)
 
 
-def _without_glints(states: States) -> States:
+def _without_glints(states: EyeStates) -> EyeStates:
     traits = states.traits.clone()
     traits[:, list(POPULATION).index("glint")] = 0
     return replace(states, traits=traits)
 
 
-def _regions(states: States, rig: Rig, camera: Camera) -> dict[str, Array]:
+def _regions(
+    states: EyeStates, rig: CameraRig, camera: PinholeCamera
+) -> dict[str, Array]:
     """Masks of REGIONS: pixels that show one of them alone, those that show a lamp in
     the cornea, and the others.
     """

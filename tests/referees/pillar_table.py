@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from metalens import library
-from metalens.ground import store
+from metalens.core import store
 from metalens.pillars import fit as proxies
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import DEFAULT_CELL, Sweep

@@ -16,7 +16,7 @@ from matplotlib.path import Path as Outline
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import convolve1d, map_coordinates
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 _WIDE_UM = 1.0  # ranges from there on are summed over points
 _CUT = 4.2  # ranges: exp(-17.6)

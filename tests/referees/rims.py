@@ -4,8 +4,8 @@ way is judged by.
 
 import numpy as np
 
-from layout.pec.psf import PointExposure, disc, rim_of_own_disc
-from metalens.ground.arrays import Array
+from layout.pec.psf import PointExposure, disc_exposure, rim_of_own_disc
+from metalens.core.arrays import Array
 
 
 def at_edges(
@@ -39,7 +39,7 @@ def at_edges(
         distance = np.linalg.norm(points[:, None] - centres_um[others], axis=-1)
         for width, weight in zip(point.widths_um, point.weights, strict=True):
             near = (
-                (disc(distance, diameter_um[others], width) * dose[others])
+                (disc_exposure(distance, diameter_um[others], width) * dose[others])
                 .sum(-1)
                 .mean()
             )

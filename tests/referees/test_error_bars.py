@@ -7,12 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from characterize.captures import clean
+from characterize.captures import to_electrons
 from characterize.inference import leastsquares
-from characterize.inference.leastsquares import Settings
+from characterize.inference.leastsquares import SolverSettings
 from characterize.inference.prepare import data_of
-from characterize.inference.search import Task
-from characterize.model import PARAMETERS, PLACE, ForwardModel, Setting, slopes, vector
+from characterize.inference.search import SearchTask
+from characterize.model import (
+    PARAMETERS,
+    PLACE,
+    ForwardModel,
+    FrameSetting,
+    log_response_slopes,
+    parameter_vector,
+)
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_bench as bench
 
@@ -66,7 +73,7 @@ def test_scores_of_the_referee_s_noise_scatter_as_the_fit_believes():
     lens, session = hidden.lens(), hidden.session(21)
     seen = bench.shoot(lens, session)
     n, side = len(session.depths_um), session.pixels
-    setting = Setting(
+    setting = FrameSetting(
         np.array(session.depths_um),
         np.zeros((n, 2)),
         np.ones(n),
@@ -74,9 +81,11 @@ def test_scores_of_the_referee_s_noise_scatter_as_the_fit_believes():
         side,
         side,
     )
-    start = vector(session.values)
-    model = ForwardModel(lens, setting, slopes(lens))
-    bare = model.images(vector(session.values | dict.fromkeys(hidden.PLANE, 0.0)))[0]
+    start = parameter_vector(session.values)
+    model = ForwardModel(lens, setting, log_response_slopes(lens))
+    bare = model.images(
+        parameter_vector(session.values | dict.fromkeys(hidden.PLANE, 0.0))
+    )[0]
     light = seen.electrons - bench._background(session)
     start[PLACE["log_gain"]] = np.log((light * bare).sum() / (bare**2).sum())
     names = [p.name for p in PARAMETERS if p.free]
@@ -92,7 +101,7 @@ def test_scores_of_the_referee_s_noise_scatter_as_the_fit_believes():
             np.full((24, side, side), 6800.0) * response,
         )
         frames, dark, flat = (bench._read(part, session, rng, fixed) for part in parts)
-        shots = clean(
+        shots = to_electrons(
             dataclasses.replace(seen.capture, frames=frames, dark=dark, flat=flat)
         )
         data, counted = (
@@ -130,7 +139,7 @@ def test_the_fit_knows_how_much_its_frames_tell():
     lens, session = hidden.lens(), hidden.session(6)
     seen = bench.shoot(lens, session)
     n, side = len(session.depths_um), session.pixels
-    setting = Setting(
+    setting = FrameSetting(
         np.array(session.depths_um),
         np.zeros((n, 2)),
         np.ones(n),
@@ -138,11 +147,13 @@ def test_the_fit_knows_how_much_its_frames_tell():
         side,
         side,
     )
-    model = ForwardModel(lens, setting, slopes(lens))
-    start = vector(session.values)
+    model = ForwardModel(lens, setting, log_response_slopes(lens))
+    start = parameter_vector(session.values)
     light = seen.electrons - bench._background(session)
-    bare = model.images(vector(session.values | dict.fromkeys(hidden.PLANE, 0.0)))[0]
-    frames = clean(seen.capture)
+    bare = model.images(
+        parameter_vector(session.values | dict.fromkeys(hidden.PLANE, 0.0))
+    )[0]
+    frames = to_electrons(seen.capture)
     counted = (
         frames.gain.gain_e / session.gain_e
     )  # electrons of the fit for one of the referee
@@ -150,14 +161,16 @@ def test_the_fit_knows_how_much_its_frames_tell():
     assert frames.gain.gain_e == pytest.approx(
         session.gain_e, rel=0.1
     )  # four of its sigma
-    task = Task(model, data_of(frames, (slice(None), slice(None))), start, {}, None)
+    task = SearchTask(
+        model, data_of(frames, (slice(None), slice(None))), start, {}, None
+    )
     truth = start[[PLACE[name] for name in task.names]]
-    found = leastsquares.fit(
+    found = leastsquares.fit_levenberg_marquardt(
         task.problem(),
         task.data,
         truth,
         prior=task.prior,
-        settings=Settings(iterations=0),
+        settings=SolverSettings(iterations=0),
     )
     want = seen_by_differences(
         session, light.max() / bench.irradiance(lens, session).max()

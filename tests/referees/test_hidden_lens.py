@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import characterize
-from characterize.inference.estimate import Options
-from characterize.model import NAMES, UNFITTED, slopes
+from characterize.inference.estimate import FitOptions
+from characterize.model import NAMES, UNFITTED, log_response_slopes
 from metalens import modal
-from metalens.ground.errors import CaptureError, FitError
+from metalens.core.errors import CaptureError, FitError
 from metalens.pillars.record import DEFAULT_CELL
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_bench as bench
 from tests.referees import pillar_table
 
-USUAL = Options(scan_um=60.0)
+USUAL = FitOptions(scan_um=60.0)
 
 
 @pytest.fixture(scope="module")
 def response():
-    return slopes(hidden.lens())
+    return log_response_slopes(hidden.lens())
 
 
 def test_the_table_is_what_the_solver_says_between_its_entries():

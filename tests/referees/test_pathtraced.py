@@ -10,14 +10,14 @@ import torch
 
 from codesign.eye import model, renderer
 from codesign.eye import population as eye
-from codesign.eye.population import Rig
-from codesign.eye.renderer import Camera
-from metalens.ground.errors import SceneError
+from codesign.eye.population import CameraRig
+from codesign.eye.renderer import PinholeCamera
+from metalens.core.errors import SceneError
 from tests.referees import pathtraced, traced_shapes
 from tests.referees.pathtraced import Comparison
 
-CAMERA = Camera(pixels=32, pitch_um=45.0)
-STATES = eye.draw(2, 5)
+CAMERA = PinholeCamera(pixels=32, pitch_um=45.0)
+STATES = eye.draw_states(2, 5)
 
 
 def test_without_mitsuba_the_referee_says_how_to_get_it(monkeypatch):
@@ -48,7 +48,7 @@ def test_shapes_lie_on_the_surfaces_that_rays_meet():
     """Points of the meshes against the closed forms of sphere, plane and limbus, and
     against the renderer's depth.
     """
-    p = pathtraced._parameters(STATES, Rig(), CAMERA)
+    p = pathtraced._parameters(STATES, CameraRig(), CAMERA)
     bank = pathtraced._bank()
     centre, axis = p[:3].numpy(), p[model.AXIS : model.AXIS + 3].numpy()
     globe, _, white = traced_shapes._globe(p, bank)
@@ -61,7 +61,7 @@ def test_shapes_lie_on_the_surfaces_that_rays_meet():
     height = (1e3 * iris - centre).dot(axis).reshape(-1, 513)
     np.testing.assert_allclose(height[2:-1], float(p[model.PUPIL_D]), atol=1e-6)
     assert brown.min() > 0
-    face, triangles, _ = traced_shapes._face(p, bank, Rig(), CAMERA)
+    face, triangles, _ = traced_shapes._face(p, bank, CameraRig(), CAMERA)
     depth = renderer.render(STATES[:1], camera=CAMERA).frames.depth_um[0, 0]
     assert 1e3 * face[:, 2].min() < float(
         depth.min()
@@ -70,7 +70,7 @@ def test_shapes_lie_on_the_surfaces_that_rays_meet():
 
 
 def test_regions_do_not_overlap_and_cover_the_frame():
-    masks = pathtraced._regions(STATES[:1], Rig(), CAMERA)
+    masks = pathtraced._regions(STATES[:1], CameraRig(), CAMERA)
     assert (sum(masks[name].astype(int) for name in pathtraced.REGIONS) == 1).all()
     np.testing.assert_array_equal(masks["all"], ~masks["mirrors"])
 
@@ -108,7 +108,7 @@ def test_ambient_light_on_white_skin_is_the_models():
     """Integral of the sky over the hemisphere of a normal: ambient (0.6 - 0.4 n.down),
     whatever the normal.
     """
-    p = pathtraced._parameters(STATES, Rig(), CAMERA)
+    p = pathtraced._parameters(STATES, CameraRig(), CAMERA)
     rng = np.random.default_rng(0)
     way = rng.standard_normal((200_000, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)

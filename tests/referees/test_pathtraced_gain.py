@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign.eye import model, population
-from codesign.eye.renderer import Camera
+from codesign.eye.renderer import PinholeCamera
 from tests.referees import pathtraced
 
 
@@ -40,7 +40,9 @@ def test_paths_are_shared_by_two_halves_of_their_own_seeds(monkeypatch):
         pathtraced, "start", lambda: SimpleNamespace(variant=lambda: "none")
     )
     monkeypatch.setattr(pathtraced, "trace", trace)
-    made = pathtraced.compare(population.draw(1, 5), camera=Camera(16, 90.0), samples=7)
+    made = pathtraced.compare(
+        population.draw_states(1, 5), camera=PinholeCamera(16, 90.0), samples=7
+    )
     assert asked == [(3, 0), (3, 1)]
     assert (made.samples, made.variant) == (6, "none")
     assert made.traced == pytest.approx(np.full((16, 16), 1.5))

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from characterize.model import slopes
-from characterize.model.pillars import Change, Pillars
+from characterize.model import log_response_slopes
+from characterize.model.pillars import PillarChange, PillarResponse
 from metalens import modal
 from metalens.cell import Index
 from metalens.fabrication import ResponseError, answer, named, transmission
@@ -21,7 +21,7 @@ D = np.array([0.0837, 0.1121, 0.1493, 0.1772, 0.1994])
 
 @pytest.fixture(scope="module")
 def response():
-    return slopes(hidden.lens())
+    return log_response_slopes(hidden.lens())
 
 
 def amounts(height_um=0.0, index=0.0, sidewall_rad=0.0):
@@ -90,8 +90,8 @@ def test_rates_are_derivatives_of_the_factor(response):
 
 
 def test_few_functions_hold_every_change(response):
-    pillars = Pillars(hidden.lens(), response)
-    change = Change((0.0163, *[0.0] * (len(named(ResponseError)) - 1)), 0.0007)
+    pillars = PillarResponse(hidden.lens(), response)
+    change = PillarChange((0.0163, *[0.0] * (len(named(ResponseError)) - 1)), 0.0007)
     for bias_um in (-0.0117, 0.0, 0.0193):
         weight = pillars.weights(np.array(bias_um))
         rate = pillars.rates(np.array(bias_um), weight)
@@ -114,4 +114,4 @@ def test_a_proxy_of_something_else_is_believed():
     proxy = dataclasses.replace(
         lens.proxy, phase_coefficients=0.8 * lens.proxy.phase_coefficients
     )
-    assert slopes(dataclasses.replace(lens, proxy=proxy)).solved is None
+    assert log_response_slopes(dataclasses.replace(lens, proxy=proxy)).solved is None

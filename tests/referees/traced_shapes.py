@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import Camera, Rig, model
-from metalens.ground.arrays import Array
+from codesign.eye import CameraRig, PinholeCamera, model
+from metalens.core.arrays import Array
 
 LAMP_RADIUS_MM = (
     2.0  # of the emitting spheres, large enough to be met by chance through the cornea
@@ -18,7 +18,7 @@ LAMP_RADIUS_MM = (
 
 
 def build(
-    mitsuba: Any, p: Tensor, bank: Tensor, *, rig: Rig, camera: Camera
+    mitsuba: Any, p: Tensor, bank: Tensor, *, rig: CameraRig, camera: PinholeCamera
 ) -> dict[str, Any]:
     """The scene of parameters ``p`` (COUNT,) as Mitsuba's dictionary; the camera at the
     origin.
@@ -89,7 +89,7 @@ def _ambient(mitsuba: Any, p: Tensor) -> dict[str, Any]:
 
 
 def _rays(
-    rig: Rig, camera: Camera, p: Tensor
+    rig: CameraRig, camera: PinholeCamera, p: Tensor
 ) -> tuple[int, tuple[Tensor, Tensor, Tensor]]:
     """A square grid of rays, twice as fine as the pixels and 1.6 times as wide: its
     side, and their directions.
@@ -101,7 +101,7 @@ def _rays(
 
 
 def _face(
-    p: Tensor, bank: Tensor, rig: Rig, camera: Camera
+    p: Tensor, bank: Tensor, rig: CameraRig, camera: PinholeCamera
 ) -> tuple[Array, Array, Array]:
     """Lids and skin: the near sheet without the opening."""
     side, (dx, dy, dz) = _rays(rig, camera, p)
@@ -137,7 +137,7 @@ def _globe(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
 
 
 def _fold(
-    p: Tensor, bank: Tensor, rig: Rig, camera: Camera
+    p: Tensor, bank: Tensor, rig: CameraRig, camera: PinholeCamera
 ) -> tuple[Array, Array, Array]:
     """The far sheet where rays through the opening pass beside the globe: conjunctiva,
     as the model continues it.

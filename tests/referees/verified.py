@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from layout.verify import verify_exposure
-from metalens.ground.units import nm
+from metalens.core.units import nm
 
 
 def verify(plan, content, doses, process, *, height_um=0.0):

@@ -4,7 +4,7 @@ neither torch nor time.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from codesign.commands.options import budget as budget
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from codesign.commands.options import retrain as retrain
     from codesign.commands.options import scene as scene
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "budget": "",

@@ -8,13 +8,13 @@ from pathlib import Path
 import tyro
 
 from codesign.train import Part, Place
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.codesign"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens codesign``.
 
     Attributes:

@@ -8,13 +8,13 @@ from pathlib import Path
 import tyro
 
 from codesign.evaluate import ExperimentConfig
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.experiment"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens evaluate experiment``.
 
     Attributes:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.paper"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens evaluate paper``.
 
     Attributes:

@@ -10,13 +10,13 @@ import tyro
 
 from codesign.adapt import RetrainConfig
 from codesign.train import Place
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.retrain"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens retrain``.
 
     Attributes:

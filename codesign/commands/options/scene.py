@@ -5,13 +5,13 @@ from pathlib import Path
 
 import tyro
 
-from metalens.commands import Common, Output
+from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.scene"
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(CommonOptions):
     """Options of ``metalens scene``.
 
     Attributes:

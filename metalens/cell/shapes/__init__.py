@@ -4,15 +4,15 @@ polygon, name.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
     from metalens.cell.shapes import motion as motion
     from metalens.cell.shapes.every import Shape as Shape
-    from metalens.cell.shapes.outline import Conic as Conic
-    from metalens.cell.shapes.outline import Loop as Loop
+    from metalens.cell.shapes.outline import EllipseArc as EllipseArc
     from metalens.cell.shapes.outline import Outline as Outline
-    from metalens.cell.shapes.outline import turned as turned
+    from metalens.cell.shapes.outline import PolygonLoop as PolygonLoop
+    from metalens.cell.shapes.outline import rotate_corners as rotate_corners
     from metalens.cell.shapes.round import Circle as Circle
     from metalens.cell.shapes.round import Ellipse as Ellipse
     from metalens.cell.shapes.round import Ring as Ring
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from metalens.cell.shapes.straight import RegularPolygon as RegularPolygon
     from metalens.cell.shapes.straight import Square as Square
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "Circle": "round",
-        "Conic": "outline",
+        "EllipseArc": "outline",
         "Cross": "straight",
         "Ellipse": "round",
-        "Loop": "outline",
+        "PolygonLoop": "outline",
         "Outline": "outline",
         "Polygon": "straight",
         "Rectangle": "straight",
@@ -38,6 +38,6 @@ __getattr__, __dir__, __all__ = attach(
         "Shape": "every",
         "Square": "straight",
         "motion": "",
-        "turned": "outline",
+        "rotate_corners": "outline",
     },
 )

@@ -14,9 +14,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from metalens.cell.shapes.outline import Conic, Loop, Outline
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell.shapes.outline import EllipseArc, Outline, PolygonLoop
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 
 _STENCIL = (
     (1, 45 / 60),
@@ -25,12 +25,14 @@ _STENCIL = (
 )  # central differences of sixth order
 
 
-def numbers(outline: Outline) -> Array:
+def shape_parameters(outline: Outline) -> Array:
     """(k,) numbers of all parts, one after another."""
     return np.concatenate([_numbers(part) for part in outline.parts])
 
 
-def pushed(outline: Outline, gx: Array, gy: Array, rates: Array) -> Array:
+def fourier_shape_derivative(
+    outline: Outline, gx: Array, gy: Array, rates: Array
+) -> Array:
     """(n,) derivatives of the Fourier factor at the wave vectors (n,), as the (k,)
     numbers change at these rates.
     """
@@ -38,13 +40,13 @@ def pushed(outline: Outline, gx: Array, gy: Array, rates: Array) -> Array:
     total = np.zeros(len(g), complex)
     for part in outline.parts:
         count = len(_numbers(part))
-        of = _conic if isinstance(part, Conic) else _loop
+        of = _conic if isinstance(part, EllipseArc) else _loop
         total += of(part, g, rates[start : start + count].real)  # type: ignore[arg-type]
         start += count
     return total
 
 
-def difference(of: Callable[[float], Array], step: float) -> Array:
+def sixth_order_difference(of: Callable[[float], Array], step: float) -> Array:
     """Derivative at 0 of elementary functions, by differences of sixth order: 1e-11 of
     their size over the step's.
 
@@ -59,13 +61,13 @@ def difference(of: Callable[[float], Array], step: float) -> Array:
     return np.asarray(sum(weight * (high - low) for weight, high, low in ends) / step)
 
 
-def _numbers(part: Conic | Loop) -> Array:
-    if isinstance(part, Conic):
+def _numbers(part: EllipseArc | PolygonLoop) -> Array:
+    if isinstance(part, EllipseArc):
         return np.array([part.half_x_um, part.half_y_um, part.angle_rad])
     return np.array(part.corners_um, float).ravel()
 
 
-def _conic(part: Conic, g: Array, rates: Array) -> Array:
+def _conic(part: EllipseArc, g: Array, rates: Array) -> Array:
     """From F = pi a b 2 J1(s) / s, s = |(a X, b Y)|, with d(2 J1(s) / s) / ds = -2
     J2(s) / s.
     """
@@ -91,7 +93,7 @@ def _conic(part: Conic, g: Array, rates: Array) -> Array:
     )
 
 
-def _loop(part: Loop, g: Array, rates: Array) -> Array:
+def _loop(part: PolygonLoop, g: Array, rates: Array) -> Array:
     points, speed = np.array(part.corners_um, float), rates.reshape(-1, 2)
     after = np.roll(points, -1, axis=0)
     edge = after - points

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 
 Point = tuple[float, float]
 _ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
@@ -27,7 +27,7 @@ _DIRECTIONS = np.stack(
 
 
 @dataclass(frozen=True, slots=True)
-class Conic:
+class EllipseArc:
     """An ellipse with half axes a (along x before the turn) and b; sign -1 cuts it out.
 
     centre_um: (x, y), the site of the pillar but in rows of several.
@@ -78,7 +78,7 @@ class Conic:
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
+class PolygonLoop:
     """A polygon without crossings; sign -1 cuts it out."""
 
     corners_um: tuple[Point, ...]
@@ -129,7 +129,7 @@ class Outline:
     parts: with signs; the first is the outermost.
     """
 
-    parts: tuple[Conic | Loop, ...]
+    parts: tuple[EllipseArc | PolygonLoop, ...]
 
     @property
     def area_um2(self) -> float:
@@ -153,14 +153,14 @@ class Outline:
 
     def turned(self, angle_rad: float) -> "Outline":
         """The same about the origin from +x towards +y."""
-        made: list[Conic | Loop] = []
+        made: list[EllipseArc | PolygonLoop] = []
         for part in self.parts:
-            if isinstance(part, Conic):
-                x, y = turned(np.array([part.centre_um]), angle_rad)[0].tolist()
+            if isinstance(part, EllipseArc):
+                x, y = rotate_corners(np.array([part.centre_um]), angle_rad)[0].tolist()
                 angle = part.angle_rad + angle_rad
                 made.append(replace(part, angle_rad=angle, centre_um=(x, y)))
             else:
-                corners = turned(np.array(part.corners_um), angle_rad).tolist()
+                corners = rotate_corners(np.array(part.corners_um), angle_rad).tolist()
                 made.append(replace(part, corners_um=tuple((x, y) for x, y in corners)))
         return Outline(tuple(made))
 
@@ -187,7 +187,7 @@ class Outline:
         points, normals = [], []
         for part in self.parts:
             count = 0
-            if isinstance(part, Conic):
+            if isinstance(part, EllipseArc):
                 radius_um = max(part.half_x_um, part.half_y_um)
                 count = max(32, math.ceil(2 * math.pi * radius_um / step_um))
             corners = part.vertices(count)
@@ -297,7 +297,7 @@ class Outline:
         return gap
 
 
-def moved(corners: Array, grow_um: float) -> tuple[Point, ...]:
+def offset_corners(corners: Array, grow_um: float) -> tuple[Point, ...]:
     """Corners of the polygon whose edges lie ``grow_um`` / 2 further out, mitred.
 
     Raises:
@@ -316,7 +316,7 @@ def moved(corners: Array, grow_um: float) -> tuple[Point, ...]:
     return tuple((float(x), float(y)) for x, y in made)
 
 
-def turned(corners: Array, angle_rad: float) -> Array:
+def rotate_corners(corners: Array, angle_rad: float) -> Array:
     """(n, 2) corners turned from +x towards +y."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.asarray(corners @ np.array([[c, s], [-s, c]]))

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from metalens.cell.shapes.outline import Conic, Outline
-from metalens.ground.errors import CellError
+from metalens.cell.shapes.outline import EllipseArc, Outline
+from metalens.core.errors import CellError
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Circle:
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of this diameter, wider by ``grow_um``."""
         half = _half(size_um + grow_um)
-        return Outline((Conic(half, half),))
+        return Outline((EllipseArc(half, half),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Ellipse:
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of this size, wider by ``grow_um`` along every axis."""
         half = (_half(size_um + grow_um), _half(self.ratio * size_um + grow_um))
-        return Outline((Conic(*half, self.angle_rad),))
+        return Outline((EllipseArc(*half, self.angle_rad),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,10 @@ class Ring:
         hole.
         """
         outer, inner = _half(size_um + grow_um), self.ratio * size_um / 2 - grow_um / 2
-        whole = Conic(outer, outer)
-        return Outline((whole, Conic(inner, inner, sign=-1)) if inner > 0 else (whole,))
+        whole = EllipseArc(outer, outer)
+        return Outline(
+            (whole, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (whole,)
+        )
 
 
 def _half(width_um: float) -> float:

@@ -8,13 +8,21 @@ from typing import Literal
 
 import numpy as np
 
-from metalens.cell.shapes.outline import Loop, Outline, Point, moved, turned
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell.shapes.outline import (
+    Outline,
+    Point,
+    PolygonLoop,
+    offset_corners,
+    rotate_corners,
+)
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 
 
 def _made(corners: Array, angle_rad: float, grow_um: float) -> Outline:
-    return Outline((Loop(moved(turned(corners, angle_rad), grow_um)),))
+    return Outline(
+        (PolygonLoop(offset_corners(rotate_corners(corners, angle_rad), grow_um)),)
+    )
 
 
 def _box(width_um: float, depth_um: float) -> Array:
@@ -103,7 +111,7 @@ class Cross:
         corner = np.array([(b, -a), (b, -b), (a, -b)])
         return _made(
             np.concatenate(
-                [turned(corner, quarter * math.pi / 2) for quarter in range(4)]
+                [rotate_corners(corner, quarter * math.pi / 2) for quarter in range(4)]
             ),
             self.angle_rad,
             grow_um,

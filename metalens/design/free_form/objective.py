@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from metalens.design.free_form.settings import Asked, Variation
-from metalens.ground.paths import path_difference
+from metalens.core.paths import path_difference
+from metalens.design.free_form.settings import ProcessVariation, ResolvedFisherSettings
 from metalens.image import (
     Field,
     Pupil,
@@ -30,7 +30,7 @@ STILL = torch.tensor(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Score:
+class DesignScore:
     """Honest figures of a phase on the quick pupil model.
 
     information: (depths,) I(z) per mm², averaged over sub-pixel positions, with several
@@ -54,7 +54,7 @@ class Objective(Protocol):
         function at every call.
         """
 
-    def judge(self, phase_rad: Tensor, focus_um: float) -> Score:
+    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
         """Honest figures."""
 
 
@@ -63,7 +63,7 @@ class AxialObjective:
     pixels; alike for every angle.
     """
 
-    def __init__(self, pupil: Pupil, settings: Asked) -> None:
+    def __init__(self, pupil: Pupil, settings: ResolvedFisherSettings) -> None:
         self.pupil, self.settings = pupil, settings
 
     def loss(
@@ -127,17 +127,21 @@ class AxialObjective:
         ]
         return depths, fields, torch.rand(2, 2, generator=generator) - 0.5
 
-    def judge(self, phase_rad: Tensor, focus_um: float) -> Score:
+    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
         """See :class:`Objective`."""
-        return score(phase_rad, self.pupil, focus_um=focus_um, settings=self.settings)
+        return score_phase(
+            phase_rad, self.pupil, focus_um=focus_um, settings=self.settings
+        )
 
 
-class Robust:
+class RobustObjective:
     """An objective under the process: its mean over plus and minus the variation, the
     worst encircled energy.
     """
 
-    def __init__(self, inner: Objective, pupil: Pupil, variation: Variation) -> None:
+    def __init__(
+        self, inner: Objective, pupil: Pupil, variation: ProcessVariation
+    ) -> None:
         self.inner, self.pupil, self.variation = inner, pupil, variation
 
     def loss(
@@ -155,7 +159,7 @@ class Robust:
         ]
         return (both[0][0] + both[1][0]) / 2, torch.minimum(both[0][1], both[1][1])
 
-    def judge(self, phase_rad: Tensor, focus_um: float) -> Score:
+    def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
         """Worst of nominal, plus and minus at every depth."""
         found = [
             self.inner.judge(self._made(phase_rad, focus_um, sign), focus_um)
@@ -165,7 +169,7 @@ class Robust:
             torch.stack([getattr(f, name) for f in found]).amin(0)
             for name in ("information", "encircled")
         ]
-        return Score(worst[0], worst[1])
+        return DesignScore(worst[0], worst[1])
 
     def _made(self, phase_rad: Tensor, focus_um: float, sign: float) -> Tensor:
         """The phase of the lens as made: pillars give (1 + error) of their phase in [0,
@@ -182,14 +186,14 @@ class Robust:
         return phase_rad + sign * self.variation.phase * made + k * moved
 
 
-def score(
+def score_phase(
     phase_rad: Tensor,
     pupil: Pupil,
     *,
     focus_um: float,
-    settings: Asked,
+    settings: ResolvedFisherSettings,
     depths: int = 11,
-) -> Score:
+) -> DesignScore:
     """Information and encircled energy of a phase on the pupil's nodes, at ``depths``
     depths of the range.
 
@@ -223,11 +227,11 @@ def score(
         values.append(torch.stack([value for value, _ in seen]).mean(0))
         energies.append(torch.stack([energy for _, energy in seen]).amin(0))
     if len(values) == 1:
-        return Score(values[0], energies[0])
-    return Score(torch.stack(values), torch.stack(energies))
+        return DesignScore(values[0], energies[0])
+    return DesignScore(torch.stack(values), torch.stack(energies))
 
 
-def _counted(settings: Asked) -> dict[str, Any]:
+def _counted(settings: ResolvedFisherSettings) -> dict[str, Any]:
     """How Eq. 11 counts, as arguments."""
     return {"step_um": settings.step_um, "sample_um": settings.sample_um, "pixel_um": settings.pixel_um,
             "normalisation": settings.normalisation}  # fmt: skip
@@ -243,7 +247,7 @@ def _stacks(
     focus_um: float,
     depths_um: Tensor,
     fields: list[Field],
-    settings: Asked,
+    settings: ResolvedFisherSettings,
     window_um: float,
 ) -> tuple[Tensor, Tensor]:
     sample = settings.sample_um

@@ -12,16 +12,16 @@ import torch
 from torch import Tensor
 
 from metalens.design.free_form.objective import Objective
-from metalens.design.free_form.settings import Asked
+from metalens.design.free_form.settings import ResolvedFisherSettings
 
 REACH_RAD = 0.5  # from the start, for every control
 
 
-def refine(
+def refine_phase(
     controls: Tensor,
     build: Callable[[Tensor], Tensor],
     objective: Objective,
-    settings: Asked,
+    settings: ResolvedFisherSettings,
     focus_um: float,
 ) -> Tensor:
     """Lower the objective at fixed depths and positions, with the energy of every depth

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.core.report import figure_png, make_figure
 from metalens.design.free_form import simple_lenses as baselines
-from metalens.design.free_form.objective import Score, score
+from metalens.design.free_form.objective import DesignScore, score_phase
 from metalens.design.free_form.search import FisherPhase, phase_on
-from metalens.design.free_form.settings import Asked
-from metalens.ground.report import canvas, png
+from metalens.design.free_form.settings import ResolvedFisherSettings
 from metalens.image import Field, Pupil
 from metalens.image import pupil as pupils
 
@@ -22,7 +22,7 @@ STRIP = 6  # depths of them
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Judged:
+class JudgedLens:
     """A lens on the quick pupil. phase_rad: (nodes, nodes) without its focus. score:
     over (angles, depths).
     """
@@ -30,10 +30,12 @@ class Judged:
     name: str
     phase_rad: Tensor
     focus_um: float
-    score: Score
+    score: DesignScore
 
 
-def judged(made: FisherPhase, pupil: Pupil, settings: Asked) -> tuple[Judged, ...]:
+def judge_designs(
+    made: FisherPhase, pupil: Pupil, settings: ResolvedFisherSettings
+) -> tuple[JudgedLens, ...]:
     """The design, and the best hyperbolic lens and double helix for the same pixels,
     depths and angles.
 
@@ -41,7 +43,7 @@ def judged(made: FisherPhase, pupil: Pupil, settings: Asked) -> tuple[Judged, ..
     depths.
     """
     lenses = [("free form", phase_on(pupil, made), made.focus_um)]
-    for simple in baselines.tuned_pair(pupil, settings):
+    for simple in baselines.tune_baselines(pupil, settings):
         lenses.append(
             (
                 f"{simple.name}, tuned",
@@ -51,22 +53,24 @@ def judged(made: FisherPhase, pupil: Pupil, settings: Asked) -> tuple[Judged, ..
         )
     out = []
     for name, phase, focus in lenses:
-        found = score(phase, pupil, focus_um=focus, settings=settings)
+        found = score_phase(phase, pupil, focus_um=focus, settings=settings)
         rows = [
             t.reshape(len(settings.angles_deg), -1)
             for t in (found.information, found.encircled)
         ]
-        out.append(Judged(name, phase, focus, Score(rows[0], rows[1])))
+        out.append(JudgedLens(name, phase, focus, DesignScore(rows[0], rows[1])))
     return tuple(out)
 
 
-def times(lenses: tuple[Judged, ...]) -> float:
+def information_gain(lenses: tuple[JudgedLens, ...]) -> float:
     """Mean information of the first lens over that of the best of the others."""
     means = [float(lens.score.information.mean()) for lens in lenses]
     return means[0] / max(means[1:])
 
 
-def values(lenses: tuple[Judged, ...], settings: Asked) -> dict[str, Any]:
+def report_values(
+    lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings
+) -> dict[str, Any]:
     """Every figure, ready for JSON."""
     return {
         "depths_mm": _depths(lenses, settings).tolist(),
@@ -75,7 +79,7 @@ def values(lenses: tuple[Judged, ...], settings: Asked) -> dict[str, Any]:
         "radius_um": settings.radius_um,
         "step_um": settings.step_um,
         "normalisation": settings.normalisation,
-        "times_the_better_baseline": times(lenses),
+        "times_the_better_baseline": information_gain(lenses),
         "lenses": {
             lens.name: {
                 "information_per_mm2": lens.score.information.tolist(),
@@ -86,7 +90,9 @@ def values(lenses: tuple[Judged, ...], settings: Asked) -> dict[str, Any]:
     }
 
 
-def text(lenses: tuple[Judged, ...], settings: Asked) -> str:
+def report_text(
+    lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings
+) -> str:
     """A table: information (mean over the depths) at every angle, and the least energy
     over the depths.
     """
@@ -116,16 +122,18 @@ def text(lenses: tuple[Judged, ...], settings: Asked) -> str:
     return "\n".join(
         [
             *lines,
-            f"  {times(lenses):.2f} x the better baseline; energy of the free form: {energy}",
+            f"  {information_gain(lenses):.2f} x the better baseline; energy of the free form: {energy}",
         ]
     )
 
 
-def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Asked) -> bytes:
+def report_picture(
+    lenses: tuple[JudgedLens, ...], pupil: Pupil, settings: ResolvedFisherSettings
+) -> bytes:
     """Information and energy over depth at the first angle, and PSFs of the lenses
     through the range.
     """
-    figure, _ = canvas(1, 1, size=(10, 7.6))
+    figure, _ = make_figure(1, 1, size=(10, 7.6))
     figure.clear()
     top, bottom = figure.subfigures(2, 1, height_ratios=(3, 0.4 + 1.3 * len(lenses)))
     left, right = top.subplots(1, 2)
@@ -171,8 +179,8 @@ def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Asked) -> bytes:
         f"PSFs, {samples * settings.sample_um:.3g} µm wide, square root of the intensity, each at its own scale",
         fontsize=8,
     )
-    return png(figure)
+    return figure_png(figure)
 
 
-def _depths(lenses: tuple[Judged, ...], settings: Asked) -> Any:
+def _depths(lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings) -> Any:
     return np.linspace(*settings.depths_mm, lenses[0].score.information.shape[1])

@@ -18,17 +18,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.design import Focus, PhaseOf, hyperbolic
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
+from metalens.design import Focus, PhaseOf, hyperbolic_phase
 from metalens.design.free_form.objective import (
     AxialObjective,
+    DesignScore,
     Objective,
-    Robust,
-    Score,
-    score,
+    RobustObjective,
+    score_phase,
 )
-from metalens.design.free_form.settings import Asked, Fisher
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError
+from metalens.design.free_form.settings import FisherSettings, ResolvedFisherSettings
 from metalens.image import Pupil
 from metalens.image import pupil as pupils
 
@@ -37,15 +37,15 @@ NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
 CHECKS = 20  # iterations between two honest looks
 __all__ = [
-    "Fisher",
+    "DesignScore",
     "FisherPhase",
-    "Score",
+    "FisherSettings",
+    "bspline_weights",
     "fisher_profile",
-    "optimise",
+    "optimize_free_form",
     "phase_on",
-    "score",
-    "spline",
-    "vortices",
+    "score_phase",
+    "vortex_phase",
 ]
 
 
@@ -66,7 +66,7 @@ class FisherPhase:
     focus_um: float
     zones: int
     cells: bool
-    score: Score
+    score: DesignScore
     starts: tuple[tuple[float, float], ...]
     converged: bool
     reason: str
@@ -76,7 +76,7 @@ def fisher_profile(
     focus: Focus,
     *,
     radius_um: float,
-    settings: Fisher | None = None,
+    settings: FisherSettings | None = None,
     objective: Objective | None = None,
 ) -> tuple[PhaseOf, FisherPhase]:
     """The whole lens phase (focus and free form) as a function of position, and how it
@@ -85,17 +85,17 @@ def fisher_profile(
     ``focus.source_distance_um`` is used where the settings leave depths and foci to the
     lens.
     """
-    asked = (settings or Fisher()).about(focus, radius_um)
+    asked = (settings or FisherSettings()).about(focus, radius_um)
     pupil = design_pupil(focus, radius_um, asked)
-    found = optimise(pupil, asked, objective=objective)
+    found = optimize_free_form(pupil, asked, objective=objective)
     base = replace(focus, source_distance_um=found.focus_um)
     extra = free_form(found.controls.numpy(), pupil, cells=found.cells)
 
     def phase(x_um: Array, y_um: Array) -> Array:
-        smooth = hyperbolic(x_um, y_um[:, None], base) + extra(x_um, y_um)
+        smooth = hyperbolic_phase(x_um, y_um[:, None], base) + extra(x_um, y_um)
         return np.asarray(
             smooth
-            + vortices(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones)
+            + vortex_phase(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones)
         )
 
     return phase, found
@@ -108,7 +108,7 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
 
     def smooth(x_um: Array, y_um: Array) -> Array:
         across, down = (
-            spline(a / pupil.radius_um, len(controls)) for a in (x_um, y_um)
+            bspline_weights(a / pupil.radius_um, len(controls)) for a in (x_um, y_um)
         )
         return np.asarray(down @ controls @ across.T)
 
@@ -128,7 +128,9 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
     return stepped if cells else smooth
 
 
-def design_pupil(focus: Focus, radius_um: float, settings: Asked) -> Pupil:
+def design_pupil(
+    focus: Focus, radius_um: float, settings: ResolvedFisherSettings
+) -> Pupil:
     """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
     edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
     nodes = max(
@@ -138,8 +140,11 @@ def design_pupil(focus: Focus, radius_um: float, settings: Asked) -> Pupil:
     return Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes)
 
 
-def optimise(
-    pupil: Pupil, settings: Asked, *, objective: Objective | None = None
+def optimize_free_form(
+    pupil: Pupil,
+    settings: ResolvedFisherSettings,
+    *,
+    objective: Objective | None = None,
 ) -> FisherPhase:
     """Best of several starts; deterministic for a seed.
 
@@ -157,7 +162,7 @@ def optimise(
             )
         objective = AxialObjective(pupil, settings)
     if settings.variation.phase or settings.variation.distance_um:
-        objective = Robust(objective, pupil, settings.variation)
+        objective = RobustObjective(objective, pupil, settings.variation)
     best: FisherPhase | None = None
     reached = []
     for start in range(settings.starts):
@@ -190,7 +195,7 @@ def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
     )
 
 
-def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
+def vortex_phase(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
     """Phase of a double helix without its focus: ring l of equal areas carries the
     charge 2l - 1; 0 for no zones.
     """
@@ -200,7 +205,7 @@ def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array
     return np.asarray((2 * ring - 1) * np.arctan2(y_um, x_um))
 
 
-def spline(position: Array, count: int) -> Array:
+def bspline_weights(position: Array, count: int) -> Array:
     """(n, count) cubic B-spline weights of positions in [-1, 1] (held at the ends),
     uniform knots.
     """
@@ -222,11 +227,13 @@ def spline(position: Array, count: int) -> Array:
 class _Best:
     """The best iterate seen: first whether it keeps the energy, then its information."""
 
-    def __init__(self, objective: Objective, settings: Asked, focus_um: float) -> None:
+    def __init__(
+        self, objective: Objective, settings: ResolvedFisherSettings, focus_um: float
+    ) -> None:
         self.objective, self.settings, self.focus_um = objective, settings, focus_um
         self.rank: tuple[bool, float] = (False, -math.inf)
         self.controls: Tensor | None = None
-        self.score: Score | None = None
+        self.score: DesignScore | None = None
 
     def look(self, controls: Tensor, phase: Tensor) -> float:
         """Judge an iterate; returns the energy that is to spare."""
@@ -240,7 +247,7 @@ class _Best:
 
 def _climb(
     pupil: Pupil,
-    settings: Asked,
+    settings: ResolvedFisherSettings,
     objective: Objective,
     focus_um: float,
     zones: int,
@@ -276,9 +283,9 @@ def _climb(
                 margin = _margin(margin, spare)
         controls = controls.detach()
     if settings.refine:
-        from metalens.design.free_form.refine import refine
+        from metalens.design.free_form.refine import refine_phase
 
-        refined = refine(
+        refined = refine_phase(
             best.controls if best.controls is not None else controls,
             build,
             objective,
@@ -305,7 +312,9 @@ def _climb(
     )
 
 
-def _begun(settings: Asked, zones: int, generator: torch.Generator) -> Tensor:
+def _begun(
+    settings: ResolvedFisherSettings, zones: int, generator: torch.Generator
+) -> Tensor:
     """Controls of the coarsest grid at random; on a double helix a tenth of the spread,
     which leaves its vortices.
     """
@@ -333,7 +342,7 @@ def _margin(margin: float, spare: float) -> float:
     return min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
 
 
-def _shares(settings: Fisher) -> list[int]:
+def _shares(settings: FisherSettings) -> list[int]:
     """Iterations of every stage: in proportion to its grid, at least one."""
     whole = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
     early = [
@@ -350,13 +359,13 @@ class _Phase:
     def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:
         px, py = (a.numpy() for a in pupils.coordinates(pupil))
         self.base = torch.from_numpy(
-            vortices(px, py, radius_um=pupil.radius_um, zones=zones)
+            vortex_phase(px, py, radius_um=pupil.radius_um, zones=zones)
         )
         self.matrix: Tensor | None = None
         if grid == 0:
             return
         x, y = px.ravel() / pupil.radius_um, py.ravel() / pupil.radius_um
-        across, down = spline(x, grid), spline(y, grid)
+        across, down = bspline_weights(x, grid), bspline_weights(y, grid)
         rows, columns, values = [], [], []
         for k in range(len(x)):
             i, j = np.nonzero(down[k])[0], np.nonzero(across[k])[0]
@@ -383,6 +392,6 @@ class _Phase:
 def _refined(controls: Tensor, grid: int) -> Tensor:
     """The same phase on a finer control grid, in the sense of least squares."""
     place = np.linspace(-1, 1, 4 * grid)
-    coarse, fine = spline(place, len(controls)), spline(place, grid)
+    coarse, fine = bspline_weights(place, len(controls)), bspline_weights(place, grid)
     change = torch.from_numpy(np.linalg.lstsq(fine, coarse, rcond=None)[0])
     return change @ controls @ change.mT

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
+from metalens.core.errors import ConfigError
 from metalens.design.profiles import Focus
-from metalens.ground.errors import ConfigError
 from metalens.lens import reach
 
 WINDOW, CLIMB = (
@@ -18,7 +18,7 @@ FOCI = (
 
 
 @dataclass(frozen=True, slots=True)
-class Variation:
+class ProcessVariation:
     """What the process may do to the lens; the design is made to stand plus and minus
     these.
 
@@ -38,7 +38,7 @@ class Variation:
 
 
 @dataclass(frozen=True, slots=True)
-class Fisher:
+class FisherSettings:
     """What a Fisher-designed lens is asked for.
 
     objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets
@@ -91,7 +91,7 @@ class Fisher:
     normalisation: Literal["sum", "l2"] = "l2"
     seed: int = 0
     refine: int = 0
-    variation: Variation = field(default_factory=Variation)
+    variation: ProcessVariation = field(default_factory=ProcessVariation)
     scenes: int = 6
     orthogonality: float = 1.0
 
@@ -134,14 +134,14 @@ class Fisher:
                 f"{self.zones}: need 0 or more, 1 or more, 0 or more, and at least one entry"
             )
 
-    def about(self, focus: Focus, radius_um: float) -> "Asked":
+    def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":
         """These for a lens of this radius, its depths, foci and disc where they were
         left out.
 
         Raises:
             ConfigError: pixels larger than the window of this lens.
         """
-        lens = reach.Aperture(
+        lens = reach.ApertureSummary(
             radius_um,
             focus.wavelength_um,
             focus.sensor_distance_um,
@@ -172,12 +172,12 @@ class Fisher:
             "sample_um": reach.sample_um(lens, pixel),
             "step_um": reach.depth_step_um(lens, near),
         }
-        return Asked(**own, window_um=window, climb_window_um=climbed)
+        return ResolvedFisherSettings(**own, window_um=window, climb_window_um=climbed)
 
 
 @dataclass(frozen=True, slots=True)
-class Asked(Fisher):
-    """A :class:`Fisher` with nothing left to the lens: what a search climbs, and what
+class ResolvedFisherSettings(FisherSettings):
+    """A :class:`FisherSettings` with nothing left to the lens: what a search climbs, and what
     its results are judged by.
 
     window_um, climb_window_um: widths of the PSFs. sample_um: of their intensities.
@@ -194,7 +194,7 @@ class Asked(Fisher):
     sample_um: float = field(kw_only=True)
     step_um: float = field(kw_only=True)
 
-    def about(self, focus: Focus, radius_um: float) -> "Asked":
+    def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":
         """Itself."""
         return self
 

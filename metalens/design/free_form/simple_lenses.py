@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.core.errors import ConfigError
 from metalens.design import DoubleHelix, Focus, PhaseOf, phase_of
-from metalens.design.free_form.search import score, vortices
-from metalens.design.free_form.settings import Asked, between_mm
-from metalens.ground.errors import ConfigError
+from metalens.design.free_form.search import score_phase, vortex_phase
+from metalens.design.free_form.settings import ResolvedFisherSettings, between_mm
 from metalens.image import Pupil
 from metalens.image import pupil as pupils
 
@@ -25,7 +25,7 @@ ZONES = (1, 2, 3, 4, 5, 6)
 
 
 @dataclass(frozen=True, slots=True)
-class Baseline:
+class BaselineLens:
     """A simple lens and what it is worth.
 
     zones: of the double helix, 0 for a hyperbolic lens. focus_um: source distance of
@@ -56,11 +56,13 @@ class Baseline:
         return phase_of(shape, mine, radius_um=radius_um), mine
 
 
-def judged(pupil: Pupil, settings: Asked, *, zones: int, focus_um: float) -> Baseline:
+def judge_baseline(
+    pupil: Pupil, settings: ResolvedFisherSettings, *, zones: int, focus_um: float
+) -> BaselineLens:
     """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``."""
     phase = baseline_phase(pupil, zones)
-    found = score(phase, pupil, focus_um=focus_um, settings=settings)
-    return Baseline(
+    found = score_phase(phase, pupil, focus_um=focus_um, settings=settings)
+    return BaselineLens(
         zones, focus_um, float(found.information.mean()), float(found.encircled.min())
     )
 
@@ -68,17 +70,17 @@ def judged(pupil: Pupil, settings: Asked, *, zones: int, focus_um: float) -> Bas
 def baseline_phase(pupil: Pupil, zones: int) -> Tensor:
     """(nodes, nodes) vortices on the pupil's nodes."""
     x, y = (a.numpy() for a in pupils.coordinates(pupil))
-    return torch.from_numpy(vortices(x, y, radius_um=pupil.radius_um, zones=zones))
+    return torch.from_numpy(vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones))
 
 
-def tuned(
+def tune_baseline(
     pupil: Pupil,
-    settings: Asked,
+    settings: ResolvedFisherSettings,
     *,
     zones: Sequence[int] = (0,),
     foci_mm: tuple[float, float],
     count: int = 12,
-) -> Baseline:
+) -> BaselineLens:
     """Most informative lens over zones and focus: a scan at equal steps of 1/z, then
     twice a finer one around the best.
 
@@ -90,17 +92,20 @@ def tuned(
         raise ConfigError(
             f"zones = {zones}, foci_mm = {foci_mm}, count = {count}: need 0 < least < largest and 3 foci"
         )
-    tried: list[Baseline] = []
+    tried: list[BaselineLens] = []
     for rings in zones:
         here = 1e3 / np.linspace(1 / low, 1 / high, count)
         step = (1 / low - 1 / high) / (count - 1)
-        found = [judged(pupil, settings, zones=rings, focus_um=float(f)) for f in here]
+        found = [
+            judge_baseline(pupil, settings, zones=rings, focus_um=float(f))
+            for f in here
+        ]
         for _ in range(2):
             best = max(found, key=lambda b: b.information)
             step /= 2
             near = [1 / (1e3 / best.focus_um + side * step) for side in (-1, 1)]
             found += [
-                judged(pupil, settings, zones=rings, focus_um=1e3 * f)
+                judge_baseline(pupil, settings, zones=rings, focus_um=1e3 * f)
                 for f in near
                 if low <= f <= high
             ]
@@ -108,9 +113,11 @@ def tuned(
     return max(tried, key=lambda b: b.information)
 
 
-def tuned_pair(pupil: Pupil, settings: Asked) -> tuple[Baseline, Baseline]:
+def tune_baselines(
+    pupil: Pupil, settings: ResolvedFisherSettings
+) -> tuple[BaselineLens, BaselineLens]:
     """The best hyperbolic lens and the best double helix."""
     near, far = (1e3 * z for z in settings.depths_mm)
     plain, wound = (between_mm((near, far), *ends) for ends in (FOCI, HELIX_FOCI))
-    helix = tuned(pupil, settings, zones=ZONES, foci_mm=wound, count=6)
-    return tuned(pupil, settings, foci_mm=plain), helix
+    helix = tune_baseline(pupil, settings, zones=ZONES, foci_mm=wound, count=6)
+    return tune_baseline(pupil, settings, foci_mm=plain), helix

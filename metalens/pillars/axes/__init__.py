@@ -4,30 +4,30 @@ ellipse.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
-    from metalens.pillars.axes.between import surface as surface
-    from metalens.pillars.axes.plots import figure as figure
+    from metalens.pillars.axes.between import interpolate_table as interpolate_table
+    from metalens.pillars.axes.plots import axes_library_figure as axes_library_figure
     from metalens.pillars.axes.record import KIND as KIND
     from metalens.pillars.axes.record import AxesLibrary as AxesLibrary
-    from metalens.pillars.axes.record import check as check
+    from metalens.pillars.axes.record import cell_of_sizes as cell_of_sizes
+    from metalens.pillars.axes.record import check_axes_sweep as check_axes_sweep
     from metalens.pillars.axes.record import load as load
     from metalens.pillars.axes.record import save as save
-    from metalens.pillars.axes.record import sized as sized
-    from metalens.pillars.axes.solving import sweep as sweep
+    from metalens.pillars.axes.solving import sweep_two_sizes as sweep_two_sizes
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
         "AxesLibrary": "record",
         "KIND": "record",
-        "check": "record",
-        "figure": "plots",
+        "check_axes_sweep": "record",
+        "axes_library_figure": "plots",
         "load": "record",
         "save": "record",
-        "sized": "record",
-        "surface": "between",
-        "sweep": "solving",
+        "cell_of_sizes": "record",
+        "interpolate_table": "between",
+        "sweep_two_sizes": "solving",
     },
 )

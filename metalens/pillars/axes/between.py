@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.pillars import rational
 
 FLOOR_SHARE = 0.05  # of the tolerance: in every doubt, for what neither order shows
@@ -30,7 +30,7 @@ FIT_SHARE = 0.1  # of the tolerance: residual of the rational fits
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class InterpolatedTable:
     """value: (p, q, components) at the places asked for; doubt: (p, q), of the
     interpolation alone.
     """
@@ -39,13 +39,13 @@ class Surface:
     doubt: Array
 
 
-def surface(
+def interpolate_table(
     nodes: tuple[Array, Array],
     values: Array,
     places: tuple[Array, Array],
     *,
     tolerance: float,
-) -> Surface:
+) -> InterpolatedTable:
     """t at all pairs of places.
 
     Args:
@@ -62,7 +62,9 @@ def surface(
     apart = np.maximum(apart, np.abs(rival - (first + second) / 2).max(axis=-1))
     reach = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
     apart = maximum_filter(apart, size=[2 * n + 1 for n in reach], mode="nearest")
-    return Surface((first + second) / 2, np.asarray(apart + FLOOR_SHARE * tolerance))
+    return InterpolatedTable(
+        (first + second) / 2, np.asarray(apart + FLOOR_SHARE * tolerance)
+    )
 
 
 def _fewer(count: int) -> Array:
@@ -85,10 +87,15 @@ def _both(
 ) -> Array:
     """Along x on every line of nodes, then along y: (p, q, components)."""
     lines = [
-        rational.fit(x, values[:, k], tolerance=FIT_SHARE * tolerance)(at_x)
+        rational.fit_rational_aaa(x, values[:, k], tolerance=FIT_SHARE * tolerance)(
+            at_x
+        )
         for k in range(len(y))
     ]
     along = np.stack(lines, axis=1)
     return np.stack(
-        [rational.fit(y, line, tolerance=FIT_SHARE * tolerance)(at_y) for line in along]
+        [
+            rational.fit_rational_aaa(y, line, tolerance=FIT_SHARE * tolerance)(at_y)
+            for line in along
+        ]
     )

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from metalens.ground import report
-from metalens.ground.arrays import Array
-from metalens.ground.store import write_bytes
+from metalens.core import report
+from metalens.core.arrays import Array
+from metalens.core.store import write_bytes
 from metalens.pillars.axes.record import AxesLibrary
 
 NM = 1e3
 
 
-def figure(path: Path, library: AxesLibrary) -> None:
+def axes_library_figure(path: Path, library: AxesLibrary) -> None:
     """PNG of the first wavelength; pairs of sizes above the tolerance are blank."""
-    canvas, panels = report.canvas(2, 3, size=(11, 6.6))
+    canvas, panels = report.make_figure(2, 3, size=(11, 6.6))
     t, usable = library.t[0], library.usable[0]
     for row, name in enumerate("xy"):
         own = np.where(usable, t[..., row, row], np.nan)
@@ -36,7 +36,7 @@ def figure(path: Path, library: AxesLibrary) -> None:
         canvas, panels[0][2], library, bar, ("error bar", "log10 |t - exact|"), "magma"
     )
     _held_out(panels[1][2], library)
-    write_bytes(path, report.png(canvas))
+    write_bytes(path, report.figure_png(canvas))
 
 
 def _map(

@@ -12,11 +12,11 @@ import numpy as np
 
 from metalens.cell import Cell
 from metalens.cell.shapes import Ellipse, Rectangle
-from metalens.ground import config, store
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, ConfigError, DomainError
-from metalens.ground.reading import reader
-from metalens.ground.store import Provenance
+from metalens.core import config, store
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
 from metalens.pillars.record import Sweep, check_light
 
 KIND = "axes-library"
@@ -97,7 +97,7 @@ class AxesLibrary:
         return int(found[0])
 
 
-def sized(cell: Cell, x_um: float, y_um: float) -> Cell:
+def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
     """The cell whose pillar of size ``x_um`` is ``y_um`` long along its other axis."""
     shape = cell.shape
     if not isinstance(shape, Rectangle | Ellipse):
@@ -109,17 +109,17 @@ def sized(cell: Cell, x_um: float, y_um: float) -> Cell:
     )
 
 
-def check(cell: Cell, sweep: Sweep) -> None:
+def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
     """Refuse a sweep over two sizes that cannot be computed, before anything is
     computed.
 
     Raises:
         ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
             with a ratio of its own, pillars
-            that touch; and as :func:`metalens.pillars.record.check`.
+            that touch; and as :func:`metalens.pillars.record.check_sweep`.
     """
-    spans = ranges(sweep)
-    if getattr(sized(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
+    spans = size_ranges(sweep)
+    if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
         cell.shape, "ratio", 1.0
     ):
         raise CellError(
@@ -130,7 +130,7 @@ def check(cell: Cell, sweep: Sweep) -> None:
             raise CellError(
                 f"sizes {x:g} by {y:g} um: need sides within a factor of 100"
             )
-        if sized(cell, x, y).gap_um(x) <= 0:
+        if cell_of_sizes(cell, x, y).gap_um(x) <= 0:
             raise CellError(
                 f"a {cell.shape.kind} of {x:g} by {y:g} um touches its neighbour on a pitch of {cell.pitch_um:g} um; "
                 "keep diameters_um and lengths_um smaller"
@@ -138,7 +138,7 @@ def check(cell: Cell, sweep: Sweep) -> None:
     check_light(cell, sweep)
 
 
-def ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
+def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
     """(least, largest) size along x and along y.
 
     Raises:
@@ -151,7 +151,7 @@ def ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
     return sweep.diameters_um, sweep.lengths_um
 
 
-def swaps(cell: Cell, sweep: Sweep) -> bool:
+def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
     """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square
     lattice, not turned.
     """
@@ -176,7 +176,7 @@ def save(path: str | Path, library: AxesLibrary) -> None:
     store.save(path, KIND, arrays, attributes=attributes, provenance=library.provenance)
 
 
-@reader
+@typed_reader
 def load(path: str | Path) -> AxesLibrary:
     """Read a library over two sizes.
 

@@ -10,15 +10,21 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from metalens.cell import Cell
-from metalens.ground import config
-from metalens.ground.arrays import Array
-from metalens.ground.console import Console
-from metalens.ground.store import Provenance
+from metalens.core import config
+from metalens.core.arrays import Array
+from metalens.core.console import Console
+from metalens.core.store import Provenance
 from metalens.pillars import workers
-from metalens.pillars.axes.between import surface
-from metalens.pillars.axes.record import AxesLibrary, check, ranges, sized, swaps
+from metalens.pillars.axes.between import interpolate_table
+from metalens.pillars.axes.record import (
+    AxesLibrary,
+    cell_of_sizes,
+    check_axes_sweep,
+    is_exchange_symmetric,
+    size_ranges,
+)
 from metalens.pillars.record import Sweep
-from metalens.pillars.workers import Journal
+from metalens.pillars.workers import SweepJournal
 
 FIRST, MOST, ADDED = (
     7,
@@ -44,7 +50,7 @@ _GOLDEN = (
 )  # of the plane: 1/g, 1/g², g³ = g + 1
 
 
-class Solved(NamedTuple):
+class SolvedPillar(NamedTuple):
     """One pillar: (2, 2) Jones matrix and its error bar."""
 
     t: Array
@@ -62,7 +68,7 @@ class _Nodes:
         sweep: Sweep,
         wavelength_um: float,
         reach: int,
-        journal: Journal,
+        journal: SweepJournal,
     ) -> None:
         self._cell, self._wavelength, self._reach, self._journal = (
             cell,
@@ -70,13 +76,13 @@ class _Nodes:
             reach,
             journal,
         )
-        self.swaps, self._tolerance = swaps(cell, sweep), sweep.bar
-        self._known: dict[tuple[float, float], Solved] = {}
+        self.swaps, self._tolerance = is_exchange_symmetric(cell, sweep), sweep.bar
+        self._known: dict[tuple[float, float], SolvedPillar] = {}
         self.solves = 0
 
     def solve(
         self, pairs: list[tuple[float, float]], console: Console, label: str
-    ) -> list[Solved]:
+    ) -> list[SolvedPillar]:
         """Of every pair."""
         left = list(
             dict.fromkeys(
@@ -87,7 +93,7 @@ class _Nodes:
         )
         tasks = [
             workers.jones_task(
-                sized(self._cell, x, y),
+                cell_of_sizes(self._cell, x, y),
                 x,
                 self._wavelength,
                 tolerance=self._tolerance,
@@ -99,19 +105,19 @@ class _Nodes:
             left, self._journal.run(tasks, console, label), strict=True
         ):
             t = (np.array(result["t"]) @ (1, 1j)).reshape(2, 2)
-            self._known[pair] = Solved(t, max(result["error"]))
+            self._known[pair] = SolvedPillar(t, max(result["error"]))
         self.solves += len(left)
         return [self._of(pair) for pair in pairs]
 
     def _first(self, pair: tuple[float, float]) -> tuple[float, float]:
         return (max(pair), min(pair)) if self.swaps else pair
 
-    def _of(self, pair: tuple[float, float]) -> Solved:
+    def _of(self, pair: tuple[float, float]) -> SolvedPillar:
         found = self._known[self._first(pair)]
         return (
             found
             if self._first(pair) == pair
-            else Solved(found.t[::-1, ::-1], found.error)
+            else SolvedPillar(found.t[::-1, ::-1], found.error)
         )
 
     def grid(
@@ -125,7 +131,7 @@ class _Nodes:
         ).reshape(shape)
 
 
-def sweep(
+def sweep_two_sizes(
     cell: Cell,
     settings: Sweep,
     *,
@@ -146,20 +152,20 @@ def sweep(
         they and twelve more are.
 
     Raises:
-        ConfigError, CellError, MaterialError: see :func:`metalens.pillars.axes.check`.
+        ConfigError, CellError, MaterialError: see :func:`metalens.pillars.axes.check_axes_sweep`.
     """
-    check(cell, settings)
+    check_axes_sweep(cell, settings)
     settings = settings.settled(cell)
     console = console or Console(quiet=True)
-    journal = Journal(checkpoint, cell, settings)
-    places = entries(settings)
+    journal = SweepJournal(checkpoint, cell, settings)
+    places = size_entries(settings)
     reach = _reach(cell, settings)
     t, error, held, solves = [], [], [], 0
     for index, wavelength in enumerate(settings.wavelengths_um):
         nodes = _Nodes(cell, settings, wavelength, reach, journal)
         x, y = _lines(nodes, settings, console)
         values, bars = nodes.grid(x, y, console, "pillars")
-        made = surface((x, y), values, places, tolerance=settings.bar)
+        made = interpolate_table((x, y), values, places, tolerance=settings.bar)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
         wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
         bar = np.minimum(
@@ -181,11 +187,11 @@ def sweep(
     return library
 
 
-def entries(sweep: Sweep) -> tuple[Array, Array]:
+def size_entries(sweep: Sweep) -> tuple[Array, Array]:
     """Evenly spaced sizes along x and y, with one step; the shorter range may end
     before its largest size.
     """
-    spans = ranges(sweep)
+    spans = size_ranges(sweep)
     step = max(high - low for low, high in spans) / (sweep.samples - 1)
     x, y = (
         low + step * np.arange(int((high - low) / step + 1e-9) + 1)
@@ -202,15 +208,15 @@ def _reach(cell: Cell, sweep: Sweep) -> int:
     """
     from metalens.rcwa import jones, most_harmonics
 
-    (x0, x1), (y0, y1) = ranges(sweep)
+    (x0, x1), (y0, y1) = size_ranges(sweep)
     shares = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
-    most = most_harmonics(sized(cell, *sizes[0]), sizes[0][0])
+    most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
     for reach in range(min(COARSEST, most), most):
         wanted = SOLVER_SHARE * sweep.bar
         about = {"tolerance": wanted, "harmonics": reach}
         if all(
-            jones(sized(cell, x, y), x, wavelength, **about).converged  # type: ignore[arg-type]
+            jones(cell_of_sizes(cell, x, y), x, wavelength, **about).converged  # type: ignore[arg-type]
             for x, y in sizes
             for wavelength in sweep.wavelengths_um
         ):
@@ -222,7 +228,7 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
     """Nodes along x and y: Chebyshev's, and lines between them where the interpolations
     disagree most.
     """
-    spans = ranges(sweep)
+    spans = size_ranges(sweep)
     angle = np.pi * np.arange(FIRST) / (FIRST - 1)
     lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
     look = np.linspace(*spans[0], LOOK), np.linspace(*spans[1], LOOK)
@@ -231,7 +237,7 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
     while True:
         x, y = lines
         values, _ = nodes.grid(x, y, console, "pillars")
-        doubt = surface((x, y), values, look, tolerance=sweep.bar).doubt
+        doubt = interpolate_table((x, y), values, look, tolerance=sweep.bar).doubt
         above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
         if above <= LEFT_OUT or len(x) >= MOST:
             return x, y

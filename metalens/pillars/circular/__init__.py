@@ -4,14 +4,20 @@ one by one.
 
 from typing import TYPE_CHECKING
 
-from metalens.ground.lazy import attach
+from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
-    from metalens.pillars.circular.turned import Turned as Turned
-    from metalens.pillars.circular.turned import check as check
-    from metalens.pillars.circular.turned import solve as solve
+    from metalens.pillars.circular.turned import GeometricPhase as GeometricPhase
+    from metalens.pillars.circular.turned import (
+        check_geometric_phase as check_geometric_phase,
+    )
+    from metalens.pillars.circular.turned import solve_rotations as solve_rotations
 
-__getattr__, __dir__, __all__ = attach(
+__getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
-    {"Turned": "turned", "check": "turned", "solve": "turned"},
+    {
+        "GeometricPhase": "turned",
+        "check_geometric_phase": "turned",
+        "solve_rotations": "turned",
+    },
 )

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import SAFETY, jones
 
 # turns that are solved, evenly up to half the angle after which the lattice repeats
@@ -27,7 +27,7 @@ STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Turned:
+class GeometricPhase:
     """Solved cells of one pillar, turned in its lattice.
 
     size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one
@@ -50,10 +50,10 @@ class Turned:
         hand +1: x + iy comes.
         """
         return np.asarray(
-            circular(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad)
+            to_circular_basis(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad)
         )
 
-    def _share(self, of: Callable[["Turned"], float]) -> tuple[float, float]:
+    def _share(self, of: Callable[["GeometricPhase"], float]) -> tuple[float, float]:
         """A number that follows from t, and its error bar."""
         here = of(self)
         before = [
@@ -77,7 +77,7 @@ class Turned:
         error bar.
         """
         return self._share(
-            lambda one: float((np.abs(circular(one.t, hand)[0]) ** 2).mean())
+            lambda one: float((np.abs(to_circular_basis(one.t, hand)[0]) ** 2).mean())
         )
 
     @property
@@ -86,7 +86,11 @@ class Turned:
         is that at angle 0, turned.
         """
         return max(
-            float(np.abs(self.converted(hand) - circular(self.t[0], hand)[1]).max())
+            float(
+                np.abs(
+                    self.converted(hand) - to_circular_basis(self.t[0], hand)[1]
+                ).max()
+            )
             for hand in (1.0, -1.0)
         )
 
@@ -99,7 +103,7 @@ class Turned:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Array]) -> "Turned":
+    def from_arrays(cls, arrays: dict[str, Array]) -> "GeometricPhase":
         """Inverse of :meth:`to_arrays`."""
         size, wavelength = arrays["at"].tolist()
         return cls(
@@ -109,7 +113,7 @@ class Turned:
         )
 
 
-def circular(t: Array, hand: float) -> tuple[Array, Array]:
+def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
     """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1)
     through Jones matrices.
     """
@@ -118,7 +122,7 @@ def circular(t: Array, hand: float) -> tuple[Array, Array]:
     return np.asarray(leave @ come.conj()), np.asarray(leave @ come)
 
 
-def mirrored(t: Array) -> Array:
+def mirror_jones(t: Array) -> Array:
     """Jones matrices of the mirror image (y to -y): those of the pillar turned the
     other way.
     """
@@ -134,7 +138,7 @@ def period_rad(cell: Cell) -> float:
     )
 
 
-def check(cell: Cell, size_um: float) -> None:
+def check_geometric_phase(cell: Cell, size_um: float) -> None:
     """Refuse pillars that carry no geometric phase, and those whose mirrors do not lie
     along x and y.
 
@@ -158,17 +162,17 @@ def check(cell: Cell, size_um: float) -> None:
         )
 
 
-def solve(
+def solve_rotations(
     cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float
-) -> Turned:
+) -> GeometricPhase:
     """Solve the pillar turned in its lattice, over one period; half of it follows from
     the mirror of the lattice.
 
     Raises:
-        CellError: a shape that cannot be turned (see :func:`check`), or that meets its
+        CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or that meets its
             neighbours when turned.
     """
-    check(cell, size_um)
+    check_geometric_phase(cell, size_um)
     period = period_rad(cell)
     angles = np.arange(STEPS + 1) / (2 * STEPS) * period
     found = []
@@ -188,11 +192,11 @@ def solve(
     )
     earlier = np.array([one.earlier for one in found])
     back = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
-    return Turned(
+    return GeometricPhase(
         size_um,
         wavelength_um,
         np.concatenate([angles, -angles[back]]),
-        np.concatenate([t, mirrored(t[back])]),
+        np.concatenate([t, mirror_jones(t[back])]),
         np.concatenate([error, error[back]]),
-        np.concatenate([earlier, mirrored(earlier[back])]),
+        np.concatenate([earlier, mirror_jones(earlier[back])]),
     )

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import j0, j1, jv
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 Symmetry = Literal[
     "x", "p", "s", "none"

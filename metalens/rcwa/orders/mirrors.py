@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
 Operation = tuple[int, int, Sign]  # (x, y) -> (sx x, sy y)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.orders.basis import DiscBasis, DiscOrders
 
 

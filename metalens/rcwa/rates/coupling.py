@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.pattern import PillarSection
 from metalens.rcwa.rates import kernels, tables
 from metalens.rcwa.rates.regions import RegionModes

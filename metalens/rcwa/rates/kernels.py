@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa import made
 from metalens.rcwa.rates.regions import LayerRegion, RegionFields, RegionModes
 from metalens.rcwa.rates.tables import Change

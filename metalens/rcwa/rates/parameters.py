@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Cell, Index, Material, materials
-from metalens.cell.shapes.motion import difference
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.cell.shapes.motion import sixth_order_difference
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa import made
 from metalens.rcwa.rates.tables import section_parameters
 from metalens.rcwa.rates.truncated import ParameterMotion, sampled_heights, slab_at
@@ -238,11 +238,13 @@ def parameter_motion(this: PillarParameter, wavelength_um: float) -> ParameterMo
     """
     try:
         cell = this.moved(0.0).cell
-        heights = difference(lambda x: _heights(this.moved(x).cell), this.step)
+        heights = sixth_order_difference(
+            lambda x: _heights(this.moved(x).cell), this.step
+        )
         by = tuple(
             np.stack(
                 [
-                    difference(
+                    sixth_order_difference(
                         functools.partial(_numbers, this, wavelength_um, i, s),
                         this.step,
                     )

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa.layer import FourierModes
 from metalens.rcwa.stack import Pair, foot_pair, layer_reflection
 from metalens.rcwa.wall import EDGES, CollocatedPanel, TiltedWall, collocate_panel

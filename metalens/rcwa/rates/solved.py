@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern
 from metalens.rcwa.layer import film_layer

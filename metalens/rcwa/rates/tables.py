@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 
 from metalens.cell import Cell
 from metalens.cell.shapes import motion
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa import pattern
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import Operation, ReducedOrders
@@ -81,7 +81,7 @@ def section_parameters(this: pattern.PillarSection) -> Array:
     """(k,) numbers of all outlines, then the permittivities from the inside out."""
     return np.concatenate(
         [
-            *(motion.numbers(outline) for outline in this.outlines),
+            *(motion.shape_parameters(outline) for outline in this.outlines),
             this.inside,
             [this.outside],
         ]
@@ -111,8 +111,13 @@ def coefficient_rates(
     direct, inverse = by_eps @ shares, -(by_eps / eps**2) @ shares
     start = 0
     for outline, inner, outer in zip(this.outlines, eps[:-1], eps[1:], strict=True):
-        count = len(motion.numbers(outline))
-        rim = motion.pushed(outline, gx, gy, rates[start : start + count]) / area
+        count = len(motion.shape_parameters(outline))
+        rim = (
+            motion.fourier_shape_derivative(
+                outline, gx, gy, rates[start : start + count]
+            )
+            / area
+        )
         direct, inverse = (
             direct + (inner - outer) * rim,
             inverse + (1 / inner - 1 / outer) * rim,

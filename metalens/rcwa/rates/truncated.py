@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell, Layer
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 from metalens.rcwa import made, pattern
 from metalens.rcwa.problem import CellProblem
 from metalens.rcwa.rates import kernels, tables
@@ -32,7 +32,7 @@ class ParameterMotion:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TruncatedRates:
-    """both: (2, 2, 2) t and r of :class:`metalens.rcwa.Jones`; energy: (2,); by: (2, 2,
+    """both: (2, 2, 2) t and r of :class:`metalens.rcwa.JonesResponse`; energy: (2,); by: (2, 2,
     2) derivatives of both.
     """
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell, check_tolerance
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
 from metalens.rcwa.any_shape import (
-    Jones,
+    JonesResponse,
     choose_stages,
     estimate_error,
     refine_truncation,
@@ -34,7 +34,7 @@ from metalens.rcwa.rates.truncated import (
 class ParameterDerivative:
     """Derivative by one number, per um, rad or 1 as its name says.
 
-    t, r: (2, 2) as of :class:`metalens.rcwa.Jones`. error: estimate of the largest
+    t, r: (2, 2) as of :class:`metalens.rcwa.JonesResponse`. error: estimate of the largest
     |rate - exact| of both.
     """
 
@@ -49,7 +49,7 @@ class JonesDerivatives:
     :func:`jones_derivatives`.
     """
 
-    jones: Jones
+    jones: JonesResponse
     by: dict[str, ParameterDerivative]
 
 
@@ -104,7 +104,7 @@ def jones_derivatives(
     stages, cut = choose_stages(this, climb, tolerance)
     found: list[TruncatedRates] = []
 
-    def at(reach: int) -> Jones:
+    def at(reach: int) -> JonesResponse:
         found.append(solve_with_rates(this, reach, stages, motions))
         return without_error(this, reach, found[-1].both, found[-1].energy)
 

@@ -15,12 +15,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
-from characterize.model import Known
+from characterize.bench.bench import BenchCamera, HiddenLens
+from characterize.model import KnownValue
 
 
 def truth(**more):
-    camera = Camera(
+    camera = BenchCamera(
         pixels=6,
         pixel_um=1.7,
         bits=12,
@@ -29,11 +29,11 @@ def truth(**more):
         read_noise_e=4.1,
         hot_share=0.0,
     )
-    return Truth(**({"depths_um": (21e3, 26e3, 34e3), "camera": camera} | more))
+    return HiddenLens(**({"depths_um": (21e3, 26e3, 34e3), "camera": camera} | more))
 
 
 def knows(**values):
-    return tuple(Known(name, value, 0.0) for name, value in values.items())
+    return tuple(KnownValue(name, value, 0.0) for name, value in values.items())
 
 
 def test_every_angle_has_every_depth():
@@ -44,7 +44,7 @@ def test_every_angle_has_every_depth():
 
 
 def test_the_background_is_a_plane_that_is_never_below_nothing():
-    made = bench.background(
+    made = bench.background_plane(
         truth(
             parameter=knows(background_e=4.0, background_x_e=3.0, background_y_e=-6.0)
         )
@@ -88,7 +88,7 @@ def test_light_falls_with_the_square_of_its_true_distance_and_adds_over_the_line
     about = knows(
         stage_zero_um=400.0, stage_scale=0.02, bandwidth_nm=3.0, wavelength_nm=0.5
     )
-    light = bench.irradiance(lens, truth(parameter=about), None)
+    light = bench.bench_irradiance(lens, truth(parameter=about), None)
     mean_square = (
         1.5**2 + 3.0**2
     )  # of a Gaussian line about 1.5: exact in two lines or more
@@ -168,8 +168,8 @@ def test_a_read_out_has_photon_read_and_rounding_noise_over_its_offset():
 
 def test_frames_are_as_bright_as_asked_for_and_flats_half_full(monkeypatch):
     light = np.linspace(0.1, 0.9, 108).reshape(3, 6, 6)
-    monkeypatch.setattr(bench, "irradiance", lambda *_: light)
-    made = bench.shoot(
+    monkeypatch.setattr(bench, "bench_irradiance", lambda *_: light)
+    made = bench.simulate_frames(
         None,
         truth(
             peak_e=3100.0,
@@ -208,8 +208,8 @@ def test_hot_pixels_are_hot_in_every_frame_and_a_flat_is_taken_twice_at_least(
     """A fifth of 900 pixels, sigma 12; 0.97 of 4095, where light and darkness lie far
     below.
     """
-    monkeypatch.setattr(bench, "irradiance", lambda *_: np.full((2, 30, 30), 0.7))
-    camera = Camera(
+    monkeypatch.setattr(bench, "bench_irradiance", lambda *_: np.full((2, 30, 30), 0.7))
+    camera = BenchCamera(
         pixels=30,
         pixel_um=1.7,
         bits=12,
@@ -218,7 +218,7 @@ def test_hot_pixels_are_hot_in_every_frame_and_a_flat_is_taken_twice_at_least(
         read_noise_e=4.1,
         hot_share=0.2,
     )
-    made = bench.shoot(
+    made = bench.simulate_frames(
         None, truth(camera=camera, peak_e=900.0, dark_frames=1, flat_frames=1), None
     )
     assert (len(made.frames), len(made.dark), len(made.flat)) == (2, 1, 2)

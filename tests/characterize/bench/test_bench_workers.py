@@ -5,21 +5,21 @@ cluster loses a worker.
 import pytest
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
-from characterize.model import Known
-from metalens.ground import executor
-from metalens.ground.errors import ConfigError
+from characterize.bench.bench import BenchCamera, HiddenLens
+from characterize.model import KnownValue
+from metalens.core import executor
+from metalens.core.errors import ConfigError
 from tests.characterize import bench_lens
 
-TRUTH = Truth(
+TRUTH = HiddenLens(
     depths_um=bench_lens.DEPTHS[1:2],
     angles_deg=(0.0, 3.0),
-    camera=Camera(pixels=12),
+    camera=BenchCamera(pixels=12),
     diameter_noise_nm=1.7,
     parameter=(
-        Known("bias_nm", 4.0, 0.0),
-        Known("bandwidth_nm", 1.0, 0.0),
-        Known("decentre_y_um", 1.3, 0.0),
+        KnownValue("bias_nm", 4.0, 0.0),
+        KnownValue("bandwidth_nm", 1.0, 0.0),
+        KnownValue("decentre_y_um", 1.3, 0.0),
     ),
 )
 
@@ -30,11 +30,13 @@ def here():
 
 
 def frames():
-    return bench.irradiance(bench_lens.lens(), TRUTH, bench_lens.RESPONSE).tobytes()
+    return bench.bench_irradiance(
+        bench_lens.lens(), TRUTH, bench_lens.RESPONSE
+    ).tobytes()
 
 
 def test_frames_are_the_same_from_two_workers(here):
-    with executor.on(processes=2):
+    with executor.run_on(processes=2):
         assert frames() == here
 
 
@@ -68,5 +70,5 @@ def test_pillars_of_another_colour_or_incidence_are_made_anew(monkeypatch):
 
 
 def test_fewer_than_one_worker_is_refused():
-    with pytest.raises(ConfigError, match="0 workers"), executor.on(processes=0):
+    with pytest.raises(ConfigError, match="0 workers"), executor.run_on(processes=0):
         pass

@@ -16,15 +16,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import protocol
-from characterize.bench.protocol import Protocol, Wanted
+from characterize.bench.protocol import BenchProtocol, IntervalRequirement
 from characterize.inference import missing
 from characterize.model import UNFITTED
 from metalens import lens as lenses
 from metalens.cli import main
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 
 NAMES = ("bias_nm", "distance_um", "spherical_rad")
-WANTED = Protocol(
+WANTED = BenchProtocol(
     (380.0, 1150.0),
     depth_count=6,
     frames=3,
@@ -46,9 +46,13 @@ def test_choice_is_the_best_of_all(candidates, criterion):
     prior = np.eye(3) * 1e-3
 
     def value(pick):
-        return protocol.score(prior + candidates[list(pick)].sum(0), criterion, NAMES)
+        return protocol.design_criterion(
+            prior + candidates[list(pick)].sum(0), criterion, NAMES
+        )
 
-    found = protocol.choose(candidates, prior, 3, criterion=criterion, names=NAMES)
+    found = protocol.choose_frames(
+        candidates, prior, 3, criterion=criterion, names=NAMES
+    )
     best = max(itertools.combinations_with_replacement(range(7), 3), key=value)
     assert value(found) > 0.98 * value(best)  # exchanges may end in a local optimum
 
@@ -63,17 +67,17 @@ def test_frames_lie_at_four_places_where_there_are_so_many(count):
     slopes[2:4] *= 3.3
     information, place = slopes @ slopes.transpose(0, 2, 1), np.arange(8) // 2
     prior, more = np.eye(3) * 1e-3, {"criterion": "A", "names": NAMES}
-    assert set(place[protocol.choose(information, prior, count, **more)]) == {1}
-    found = protocol.choose(information, prior, count, place=place, **more)
+    assert set(place[protocol.choose_frames(information, prior, count, **more)]) == {1}
+    found = protocol.choose_frames(information, prior, count, place=place, **more)
     assert len(found) == count
     assert len(set(place[found])) == min(count, 4)
     assert (place[found] == 1).sum() == count - min(count, 4) + 1
-    two = protocol.choose(information[:4], prior, count, place=place[:4], **more)
+    two = protocol.choose_frames(information[:4], prior, count, place=place[:4], **more)
     assert set(place[two]) == {0, 1}  # there are no more
 
 
 def test_plan_beats_frames_spread_evenly():
-    found = protocol.plan(b.lens(), WANTED, b.RESPONSE)
+    found = protocol.plan_captures(b.lens(), WANTED, b.RESPONSE)
     scale = [protocol.PARAMETERS[protocol.PLACE[n]].scale for n in found.names]
     ours, even = (np.square(s / scale).sum() for s in (found.sigma, found.even_sigma))
     assert ours < even
@@ -83,7 +87,7 @@ def test_plan_beats_frames_spread_evenly():
 
 def test_frames_that_saturate_tell_less():
     _, dim = protocol.candidate_information(b.lens(), WANTED, b.RESPONSE, NAMES)
-    bright = Protocol(
+    bright = BenchProtocol(
         (380.0, 1150.0),
         depth_count=6,
         pixel_um=1.5,
@@ -92,7 +96,7 @@ def test_frames_that_saturate_tell_less():
         full_well_e=9000.0,
     )
     _, clipped = protocol.candidate_information(b.lens(), bright, b.RESPONSE, NAMES)
-    full = Protocol(
+    full = BenchProtocol(
         (380.0, 1150.0),
         depth_count=6,
         pixel_um=1.5,
@@ -138,7 +142,7 @@ def test_protocol_on_the_command_line(tmp_path, capsys):
 
 def test_impossible_protocols_are_refused():
     with pytest.raises(FitError, match="nearest < farthest"):
-        Protocol((2.0, 1.0))
+        BenchProtocol((2.0, 1.0))
 
 
 def test_no_more_frames_are_taken_than_the_wanted_intervals_need():
@@ -148,7 +152,7 @@ def test_no_more_frames_are_taken_than_the_wanted_intervals_need():
     same = np.full((3, 1, 1), 1.0)
     prior, chosen = np.zeros((1, 1)), [0] * 10
     for within, frames in ((1.95997 / 2, 4), (1.95995 / 2, 5), (1.9, 2), (0.1, 10)):
-        wanted = (Wanted("bias_nm", within),)
+        wanted = (IntervalRequirement("bias_nm", within),)
         assert (
             protocol._needed(same, prior, chosen, ("bias_nm",), wanted, least=1)
             == frames
@@ -159,8 +163,8 @@ def test_no_more_frames_are_taken_than_the_wanted_intervals_need():
     words = protocol._short(
         ("bias_nm",),
         np.array([0.5]),
-        missing.Unstated.none(1),
-        (Wanted("bias_nm", 0.49),),
+        missing.UnmodelledShifts.none(1),
+        (IntervalRequirement("bias_nm", 0.49),),
         4,
     )
     assert "4.0 times the light (16 such frames)" in words[0]
@@ -170,18 +174,22 @@ def test_what_cannot_be_told_is_part_of_a_wanted_interval():
     """Shifts of 0.36: 95 % within 0.707. What is wanted beyond that is left to the
     frames, root of 1 - 0.5 = 0.7.
     """
-    stated = missing.Unstated(
+    stated = missing.UnmodelledShifts(
         ("a plate", "a wall"),
         np.array([[0.2], [0.3]]),
         np.array([[0.13]]),
         np.zeros((1, 1)),
     )
-    (left,) = protocol._left(("bias_nm",), stated.sigma, (Wanted("bias_nm", 1.0),))
+    (left,) = protocol._left(
+        ("bias_nm",), stated.sigma, (IntervalRequirement("bias_nm", 1.0),)
+    )
     assert left.within == pytest.approx(math.sqrt(1 - 1.959964**2 * 0.13), rel=1e-5)
-    (over,) = protocol._left(("bias_nm",), stated.sigma, (Wanted("bias_nm", 0.7),))
+    (over,) = protocol._left(
+        ("bias_nm",), stated.sigma, (IntervalRequirement("bias_nm", 0.7),)
+    )
     assert over.within == 0.7
     (words,) = protocol._short(
-        ("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 0.7),), 4
+        ("bias_nm",), np.array([0.5]), stated, (IntervalRequirement("bias_nm", 0.7),), 4
     )
     assert (
         "known to +- 1.2, wanted +- 0.7: within the model it is +- 0.98, more frames do not help"
@@ -189,11 +197,15 @@ def test_what_cannot_be_told_is_part_of_a_wanted_interval():
     )
     assert "first of all a wall, a plate" in words
     (words,) = protocol._short(
-        ("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 1.0),), 4
+        ("bias_nm",), np.array([0.5]), stated, (IntervalRequirement("bias_nm", 1.0),), 4
     )
     assert "1.9 times the light (8 such frames)" in words  # 0.96 / 0.5006
     assert not protocol._short(
-        ("bias_nm",), np.array([0.5]), stated, (Wanted("bias_nm", 1.22),), 4
+        ("bias_nm",),
+        np.array([0.5]),
+        stated,
+        (IntervalRequirement("bias_nm", 1.22),),
+        4,
     )
 
 
@@ -239,7 +251,7 @@ def test_a_plan_in_focus_or_on_one_side_of_it_is_warned_of():
         in protocol._blind(lens, wide, np.array([610.0, 1100.0]))[0]
     )
     with pytest.raises(FitError, match="no such parameter"):
-        Wanted("bias", 1.0)
+        IntervalRequirement("bias", 1.0)
 
 
 def test_information_of_a_frame_is_its_slopes_over_its_noise(monkeypatch):
@@ -265,7 +277,7 @@ def test_information_of_a_frame_is_its_slopes_over_its_noise(monkeypatch):
             return light, None if names is None else slopes
 
     monkeypatch.setattr(protocol, "ForwardModel", Straight)
-    wanted = Protocol(
+    wanted = BenchProtocol(
         (400.0, 900.0),
         depth_count=3,
         angles_deg=(0.0, 7.0),
@@ -300,8 +312,12 @@ def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
     monkeypatch.setattr(
         protocol, "candidate_information", lambda *words: (rows, information)
     )
-    monkeypatch.setattr(protocol, "_unstated", lambda *words: missing.Unstated.none(2))
-    made = protocol.plan(b.lens(), Protocol((400.0, 900.0), frames=3), None)
+    monkeypatch.setattr(
+        protocol, "_unstated", lambda *words: missing.UnmodelledShifts.none(2)
+    )
+    made = protocol.plan_captures(
+        b.lens(), BenchProtocol((400.0, 900.0), frames=3), None
+    )
     chosen = [int(np.flatnonzero(rows[:, 0] == d)[0]) for d in made.depth_um]
     for sigma, pick in ((made.sigma, chosen), (made.even_sigma, [0, 2, 5])):
         total = prior + sum(information[i] for i in pick)
@@ -312,11 +328,11 @@ def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
 
 def test_what_is_known_of_the_bench_is_information_and_what_is_certain_is_not_fitted():
     known = (
-        protocol.Known("height_nm", 3.0, 2.5),
-        protocol.Known("distance_um", 0.0, 0.0),
+        protocol.KnownValue("height_nm", 3.0, 2.5),
+        protocol.KnownValue("distance_um", 0.0, 0.0),
     )
     names, prior = protocol._parameters(
-        b.lens(), Protocol((400.0, 900.0), known=known, free=("tilt_x_deg",))
+        b.lens(), BenchProtocol((400.0, 900.0), known=known, free=("tilt_x_deg",))
     )
     assert "distance_um" not in names
     assert "tilt_x_deg" in names
@@ -333,11 +349,11 @@ def test_what_nobody_states_is_judged_on_frames_as_bright_as_asked_for(monkeypat
     """At exposure 1 the brightest pixel has 7000 electrons; what is stated without
     doubt is not free.
     """
-    monkeypatch.setattr(missing, "expected", lambda task: task)
+    monkeypatch.setattr(missing, "expected_score_tests", lambda task: task)
     unfitted = UNFITTED[0].name
     stated = (("height_nm", 3.0, 2.5), ("distance_um", 4.0, 0.0), (unfitted, 0.0, 0.37))
-    known = tuple(protocol.Known(*one) for one in stated)
-    wanted = Protocol(
+    known = tuple(protocol.KnownValue(*one) for one in stated)
+    wanted = BenchProtocol(
         (380.0, 1150.0), pixel_um=1.5, pixels=16, peak_e=7000.0, full_well_e=3100.0, read_noise_e=3.3, known=known,
         free=("height_nm", "distance_um", "tilt_x_deg"),
     )  # fmt: skip
@@ -351,9 +367,9 @@ def test_what_nobody_states_is_judged_on_frames_as_bright_as_asked_for(monkeypat
     image = task.data.electrons
     plain = protocol.ForwardModel(
         b.lens(),
-        protocol.Setting(frames[:, 0], setting.angle_rad, np.ones(3), 1.5, 16, 16),
+        protocol.FrameSetting(frames[:, 0], setting.angle_rad, np.ones(3), 1.5, 16, 16),
         b.RESPONSE,
-    ).images(protocol.vector({"height_nm": 3.0, "distance_um": 4.0}))[0]
+    ).images(protocol.parameter_vector({"height_nm": 3.0, "distance_um": 4.0}))[0]
     want = 7000 * plain / plain.max() * frames[:, 2, None, None]
     assert image == pytest.approx(
         want, rel=1e-4, abs=1e-3 * 7000

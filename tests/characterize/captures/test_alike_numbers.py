@@ -7,7 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from characterize.captures.alike import Spectra, above_rim, likeness
+from characterize.captures.alike import (
+    FrameSpectra,
+    above_rim,
+    normalized_cross_correlation,
+)
 
 SHAPE = 9, 11
 
@@ -31,11 +35,11 @@ TWO = pixels(
     ("noise", "norm"), [(0.0, 5.0), (2.0, math.sqrt(21)), (3.0, 4.0)]
 )
 def test_likeness_is_the_largest_product_over_norms_freed_of_noise(noise, norm):
-    score, shift = likeness(TWO, ONE, noise)
+    score, shift = normalized_cross_correlation(TWO, ONE, noise)
     assert score == pytest.approx(4 * 2 / (norm * 2))
     assert shift == (2.0, 4.0)
-    assert likeness(ONE, TWO, 0.0)[1] == (-2.0, -4.0)
-    assert likeness(ONE, TWO, 0.0)[0] == pytest.approx(0.8)
+    assert normalized_cross_correlation(ONE, TWO, 0.0)[1] == (-2.0, -4.0)
+    assert normalized_cross_correlation(ONE, TWO, 0.0)[0] == pytest.approx(0.8)
 
 
 def test_of_a_frame_of_noise_a_tenth_of_the_power_is_left():
@@ -44,11 +48,15 @@ def test_of_a_frame_of_noise_a_tenth_of_the_power_is_left():
     """
     many = np.zeros(SHAPE)
     many.flat[[0, 5, 13, 22, 30, 41, 47, 58, 66, 75, 83, 98]] = 1.0
-    assert likeness(many, ONE, math.sqrt(11.5))[0] == pytest.approx(1 / math.sqrt(1.2))
-    assert likeness(many, ONE, math.sqrt(6.0))[0] == pytest.approx(1 / math.sqrt(6.0))
-    assert likeness(TWO, ONE, 4.9)[0] == 1.0
-    assert likeness(0 * TWO, ONE, 0.0) == (0.0, (0.0, 0.0))
-    assert likeness(TWO, 0 * ONE, 0.0) == (0.0, (0.0, 0.0))
+    assert normalized_cross_correlation(many, ONE, math.sqrt(11.5))[0] == pytest.approx(
+        1 / math.sqrt(1.2)
+    )
+    assert normalized_cross_correlation(many, ONE, math.sqrt(6.0))[0] == pytest.approx(
+        1 / math.sqrt(6.0)
+    )
+    assert normalized_cross_correlation(TWO, ONE, 4.9)[0] == 1.0
+    assert normalized_cross_correlation(0 * TWO, ONE, 0.0) == (0.0, (0.0, 0.0))
+    assert normalized_cross_correlation(TWO, 0 * ONE, 0.0) == (0.0, (0.0, 0.0))
 
 
 @pytest.mark.parametrize(("row", "column"), [(8, 10), (8, 0), (0, 10), (0, 0), (4, 5)])
@@ -59,7 +67,7 @@ def test_shifts_reach_from_rim_to_rim(row, column):
         (pixels(r8c10=1.0), (8, 10)),
         (pixels(r8c0=1.0), (8, 0)),
     ):
-        assert likeness(a, b, 0.0) == (
+        assert normalized_cross_correlation(a, b, 0.0) == (
             pytest.approx(1.0),
             (row - at[0], column - at[1]),
         )
@@ -69,19 +77,22 @@ def test_stacks_are_as_alike_as_their_frames_on_the_mean():
     rng = np.random.default_rng(2)
     light, expected = rng.normal(0, 1, (4, *SHAPE)), rng.normal(0, 1, (3, *SHAPE))
     noise = np.array([1.0, 3.0, 0.5, 20.0])
-    seen, told = Spectra.of(light, noise), Spectra.of(expected, np.zeros(3))
+    seen, told = FrameSpectra.of(light, noise), FrameSpectra.of(expected, np.zeros(3))
     for order in ([0, 1, 2], [3, 0, 1], [2, 2, 3]):
         want = np.mean(
-            [likeness(light[i], expected[k], noise[i])[0] for k, i in enumerate(order)]
+            [
+                normalized_cross_correlation(light[i], expected[k], noise[i])[0]
+                for k, i in enumerate(order)
+            ]
         )
         assert seen.alike(told, np.array(order)) == pytest.approx(want, rel=1e-9)
     strong, one = (
-        Spectra.of(each[None], np.array([noise]))
+        FrameSpectra.of(each[None], np.array([noise]))
         for each, noise in ((TWO, 4.9), (ONE, 0.0))
     )
     assert strong.alike(one, np.array([0])) == 1.0
-    dark = Spectra.of(np.zeros((1, *SHAPE)), np.zeros(1))
-    assert dark.alike(Spectra.of(expected[:1], np.zeros(1)), np.array([0])) == 0.0
+    dark = FrameSpectra.of(np.zeros((1, *SHAPE)), np.zeros(1))
+    assert dark.alike(FrameSpectra.of(expected[:1], np.zeros(1)), np.array([0])) == 0.0
 
 
 def test_frames_do_not_reach_round_their_rims():
@@ -94,9 +105,9 @@ def test_frames_do_not_reach_round_their_rims():
         (pixels(r0c0=1, r8c0=1), pixels(r0c0=1, r1c0=1)),
         (pixels(r0c0=1, r8c0=1), pixels(r0c0=1, r3c0=1)),
     ):
-        seen, told = (Spectra.of(each[None], np.zeros(1)) for each in (a, b))
+        seen, told = (FrameSpectra.of(each[None], np.zeros(1)) for each in (a, b))
         assert seen.alike(told, np.array([0])) == pytest.approx(0.5)
-        assert likeness(a, b, 0.0)[0] == pytest.approx(0.5)
+        assert normalized_cross_correlation(a, b, 0.0)[0] == pytest.approx(0.5)
 
 
 def test_a_plane_through_the_two_outermost_pixels_is_taken_off_and_holes_are_filled():

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 
 from characterize.captures import capture
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 RNG = np.random.default_rng(7)
 FRAMES = RNG.integers(37, 4096, (5, 26, 19)).astype(np.uint16)  # n, y, x: no two alike

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterize.captures.bits import right_align
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 
 def frames(most, kind=np.uint16, least=0):

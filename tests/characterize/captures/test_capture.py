@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from characterize.captures import capture
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 RNG = np.random.default_rng(1)
 FRAMES = RNG.integers(0, 4096, (4, 12, 16)).astype(np.uint16)

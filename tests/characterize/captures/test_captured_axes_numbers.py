@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from characterize.captures import axes
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 PATH = Path("s.tif")
 

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from characterize.captures import electrons as clean
 from characterize.captures.capture import Capture
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 GAIN, READ, OFFSET = 2.0, 5.0, 100.0
 
@@ -88,7 +88,7 @@ def test_clean_gives_electrons_and_says_what_it_did():
     flat = np.stack([shoot(np.full((64, 64), 4000.0), rng) for _ in range(8)])
     dark = np.stack([shoot(np.zeros((64, 64)), rng) for _ in range(8)])
     frames = np.stack([shoot(np.full((64, 64), 800.0), rng) for _ in range(3)])
-    found = clean.clean(capture(frames, dark=dark, flat=flat))
+    found = clean.to_electrons(capture(frames, dark=dark, flat=flat))
     assert (
         abs(found.electrons.mean() - 800) < 800 * 4 * found.gain.gain_sigma_e / GAIN + 2
     )
@@ -105,7 +105,7 @@ def test_full_well_plateau_is_saturation_below_full_scale():
     frames = np.minimum(
         np.stack([shoot(np.linspace(0, 9000, 900).reshape(30, 30), rng)]), 3000
     )
-    found = clean.clean(capture(frames))
+    found = clean.to_electrons(capture(frames))
     assert found.saturated.sum() == (frames == 3000).sum() > 50
 
 
@@ -117,7 +117,7 @@ def test_brackets_merge_to_the_true_rate_with_the_stated_variance():
     z = []
     for _ in range(20):
         frames = np.stack([shoot(rate * t, rng) for t in times])
-        ready = clean.clean(
+        ready = clean.to_electrons(
             capture(
                 frames,
                 dark=np.full((1, 50, 50), int(OFFSET), np.uint16),
@@ -235,7 +235,7 @@ def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
             np.stack([counts(0.0) for _ in range(3)]),
         )
         about = {"gain_e": gain, "read_noise_e": read}
-        found = clean.clean(capture(frames, dark=dark, flat=flat, about=about))
+        found = clean.to_electrons(capture(frames, dark=dark, flat=flat, about=about))
         assert found.scale[0, 0, [0, 59]] == pytest.approx([0.6, 1.4], rel=0.02)
         z.append(found.electrons / np.sqrt(found.variance_e2))
     left, right = np.split(np.array(z), 2, axis=-1)
@@ -257,7 +257,7 @@ def test_rounding_is_off_on_average_where_noise_does_not_hide_it(read_e, least, 
     noise = np.random.default_rng(3).normal(0, read_e, (20, 40_000))
     off = np.abs(np.rint(level + noise).mean(1) - level[:, 0] - noise.mean(1)).max()
     assert least <= off <= most + 0.004
-    assert clean.Gain(1.0, 0.01, read_e).coarse == (off > 0.06)
+    assert clean.SensorNoise(1.0, 0.01, read_e).coarse == (off > 0.06)
 
 
 def test_noise_in_the_dark_is_known_from_two_dark_frames():
@@ -283,5 +283,7 @@ def test_counts_are_coarse_where_rounding_is_off_by_a_twentieth_of_a_count(
         norm.cdf((whole[:, None] + half - light) / noise_counts) for half in (-0.5, 0.5)
     )
     off = np.abs((whole[:, None] * (above - below)).sum(0) - light).max()
-    gain = clean.Gain(gain_e=2.3, gain_sigma_e=0.01, read_noise_e=2.3 * noise_counts)
+    gain = clean.SensorNoise(
+        gain_e=2.3, gain_sigma_e=0.01, read_noise_e=2.3 * noise_counts
+    )
     assert gain.coarse is bool(off > 0.05)

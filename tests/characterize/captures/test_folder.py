@@ -8,7 +8,7 @@ import pytest
 import tifffile
 
 from characterize.captures import capture, folder
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 FRAMES = np.random.default_rng(3).integers(37, 4096, (5, 26, 19)).astype(np.uint16)
 TABLE = "file,depth_mm\r\na0.tif,1.5\r\na1.tif,2.5\r\na2.tif,-3.5\r\n"
@@ -116,7 +116,7 @@ def test_a_kind_of_file_that_is_not_read_is_refused_with_its_cure(
         match=rf"cannot read \{suffix}; need TIFF, PNG or HDF5: save it .*{words}",
     ):
         capture.load(tmp_path / f"s{suffix}")
-    assert folder.cure(".xyz") == ""
+    assert folder.conversion_hint(".xyz") == ""
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ names are said.
 import pytest
 
 from characterize.captures import folder
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 
 def made(path, *names):
@@ -31,7 +31,7 @@ def test_numbers_are_counted_wherever_they_stand_and_words_go_by_their_letters(
         "z10_t2.tif",
     )
     made(tmp_path, *reversed(names), ".hidden.tif", "c.tiff", "d.txt")
-    assert [path.name for path in folder.images(tmp_path, {".tif"})] == [
+    assert [path.name for path in folder.list_images(tmp_path, {".tif"})] == [
         "2.TIF", "10.tif", "a_9.tif", "A_10.tif", "a_10_3.tif", "b.tif", "z2_t10.tif", "z10_t2.tif",
     ]  # fmt: skip
     assert folder._parts("Ab07c") == [("ab", -1), ("", 7), ("c", -1)]
@@ -43,22 +43,22 @@ def test_five_files_that_are_not_read_are_named_and_all_are_counted(
 ):
     names = [f"f{k}.npy" for k in range(count)]
     made(tmp_path, *names, ".g.npy", "a.tif")
-    (words,) = folder.unread(tmp_path, ())
+    (words,) = folder.unread_images_text(tmp_path, ())
     assert (
         words
         == f"{count} files left out, of kinds that are not read: {', '.join(names[:said])}"
     )
-    assert folder.unread(tmp_path, ("dark",)) == (words,)
+    assert folder.unread_images_text(tmp_path, ("dark",)) == (words,)
 
 
 def test_dark_frames_of_another_kind_are_refused_unless_there_are_others(tmp_path):
     made(tmp_path, "Dark.bmp")
-    assert folder.unread(tmp_path, ("dark",)) == (
+    assert folder.unread_images_text(tmp_path, ("dark",)) == (
         "1 files left out, of kinds that are not read: Dark.bmp",
     )
     for beside in ((), ("flat",)):
         with pytest.raises(CaptureError, match=r"Dark\.bmp: cannot read \.bmp"):
-            folder.unread(tmp_path, beside)
+            folder.unread_images_text(tmp_path, beside)
 
 
 @pytest.mark.parametrize(
@@ -92,20 +92,26 @@ def test_the_widest_step_of_the_one_number_that_counts_is_told(tmp_path, names, 
 
 def test_the_likest_name_is_offered_as_it_is_spelt():
     there = ("Frame_01.tif", "frame_02.tif", "dark.tif")
-    assert folder.like("frame_1.TIF", there) == "; did you mean 'Frame_01.tif'?"
-    assert folder.like("frame_02.tiff", there) == "; did you mean 'frame_02.tif'?"
-    assert folder.like("quite another", there) == ""
-    assert folder.like("frame_1.tif", ()) == ""
+    assert (
+        folder.similar_name_hint("frame_1.TIF", there)
+        == "; did you mean 'Frame_01.tif'?"
+    )
+    assert (
+        folder.similar_name_hint("frame_02.tiff", there)
+        == "; did you mean 'frame_02.tif'?"
+    )
+    assert folder.similar_name_hint("quite another", there) == ""
+    assert folder.similar_name_hint("frame_1.tif", ()) == ""
 
 
 def test_a_table_is_found_by_its_first_right_kind(tmp_path):
     made(tmp_path, "stage.json", "Stage.CSV", "capture.yml")
-    assert folder.table(tmp_path, "stage").name == "Stage.CSV"
+    assert folder.find_table(tmp_path, "stage").name == "Stage.CSV"
     (tmp_path / "Stage.CSV").unlink()
-    assert folder.table(tmp_path, "stage").name == "stage.json"
+    assert folder.find_table(tmp_path, "stage").name == "stage.json"
     with pytest.raises(
         CaptureError, match=r"capture\.yml: not read, .*; save it as capture\.toml"
     ):
-        folder.table(tmp_path, "capture")
+        folder.find_table(tmp_path, "capture")
     (tmp_path / "capture.yml").unlink()
-    assert folder.table(tmp_path, "capture") is None
+    assert folder.find_table(tmp_path, "capture") is None

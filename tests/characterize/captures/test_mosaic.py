@@ -14,8 +14,8 @@ import bench_lens as b
 
 from characterize.captures import capture
 from characterize.inference import prepare
-from characterize.model.detector import Grid, transfers
-from metalens.ground.errors import CaptureError
+from characterize.model.detector import DetectorGrid, detector_transfers
+from metalens.core.errors import CaptureError
 
 RAW = np.random.default_rng(31).integers(40, 900, (3, 11, 14)).astype(np.uint16)
 
@@ -58,7 +58,7 @@ def test_an_error_of_the_pitch_is_the_same_share_of_a_mosaic(tmp_path):
     found = capture.load(
         folder(tmp_path, 'channel = "green"\nmosaic = "GBRG"\nwavelength_um = 0.85')
     )
-    known = {k.name: k for k in prepare.stated(found, b.row())}
+    known = {k.name: k for k in prepare.stated_priors(found, b.row())}
     assert known["pixel_percent"].sigma == pytest.approx(2.0)
     placed = dataclasses.replace(found, position_um=np.array([400.0, 500.0, 600.0]))
     assert prepare.setting_of(placed, 48)[0].fill == 0.5
@@ -114,15 +114,18 @@ def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
     a pixel off, to rounding.
     """
     light = np.random.default_rng(5).normal(size=(2, 2 * 4 * (9 + 4), 2 * 4 * (7 + 4)))
-    whole, part = Grid(18, 14, 1.7, 4, margin=4), Grid(9, 7, 3.4, 8, margin=2, fill=0.5)
+    whole, part = (
+        DetectorGrid(18, 14, 1.7, 4, margin=4),
+        DetectorGrid(9, 7, 3.4, 8, margin=2, fill=0.5),
+    )
     for blur, size in ((0.3, 0.0), (0.3, 2.1)):
         sizes = np.full(2, size)
         every = whole.sample(
             np.roll(light, (2, 2), (1, 2)),
-            transfers(whole, blur, sizes, np.ones(2), sized=False)[0],
+            detector_transfers(whole, blur, sizes, np.ones(2), sized=False)[0],
         )
         some = part.sample(
-            light, transfers(part, blur, sizes, np.ones(2), sized=False)[0]
+            light, detector_transfers(part, blur, sizes, np.ones(2), sized=False)[0]
         )
         assert _nearest(some, every) < 1e-9
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from characterize.captures import png
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 MARK = b"\x89PNG\r\n\x1a\n"
 KINDS = {1: 0, 3: 2, 4: 6}  # values of a pixel: kind of colours in the head
@@ -49,11 +49,11 @@ def image(values, bits):
 @pytest.mark.parametrize("bits", [8, 16])
 def test_grey_is_an_image_and_red_stands_before_green_blue_and_alpha(tmp_path, bits):
     values = np.arange(2 * 3 * 4).reshape(2, 3, 4) * (1 if bits == 8 else 1013) + 7
-    grey = png.read(written(tmp_path / "a.png", *image(values[..., :1], bits)))
+    grey = png.read_png(written(tmp_path / "a.png", *image(values[..., :1], bits)))
     assert grey.tolist() == values[..., 0].tolist()
     assert grey.dtype == f"u{bits // 8}"
     for colours in (3, 4):
-        found = png.read(
+        found = png.read_png(
             written(tmp_path / "a.png", *image(values[..., :colours], bits))
         )
         assert found.tolist() == [values[..., :colours].tolist()]
@@ -69,7 +69,7 @@ def test_blocks_of_any_length_may_stand_between_and_bytes_behind_the_last(tmp_pa
         last,
         b"beyond",
     )
-    assert png.read(path).tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert png.read_png(path).tolist() == [[0, 1, 2], [3, 4, 5]]
 
 
 def test_a_block_that_reaches_one_byte_beyond_the_file_is_refused_with_both_ends(
@@ -80,14 +80,14 @@ def test_a_block_that_reaches_one_byte_beyond_the_file_is_refused_with_both_ends
     png._check(written(tmp_path / "a.png", *blocks))
     path = written(tmp_path / "a.png", *blocks[:2], blocks[2][:-1])
     with pytest.raises(CaptureError, match=r"a block ends at byte 62, the file at 61"):
-        png.read(path)
+        png.read_png(path)
     with pytest.raises(
         CaptureError, match=r"a block ends at byte 50, the file at 50"
     ):  # of which none is the last
-        png.read(written(tmp_path / "a.png", *blocks[:2]))
+        png.read_png(written(tmp_path / "a.png", *blocks[:2]))
     longer = struct.pack(">I", 6) + blocks[1][4:]
     with pytest.raises(CaptureError, match=r"a block ends at byte"):
-        png.read(written(tmp_path / "a.png", blocks[0], longer, blocks[2]))
+        png.read_png(written(tmp_path / "a.png", blocks[0], longer, blocks[2]))
 
 
 def test_a_head_claims_at_most_what_the_densest_file_could_hold(tmp_path):
@@ -99,16 +99,18 @@ def test_a_head_claims_at_most_what_the_densest_file_could_hold(tmp_path):
         with pytest.raises(
             CaptureError, match=r"45 bytes, its head claims more or fails"
         ):
-            png.read(written(tmp_path / "a.png", head(width, height), block(b"IEND")))
+            png.read_png(
+                written(tmp_path / "a.png", head(width, height), block(b"IEND"))
+            )
 
 
 def test_the_head_comes_first_and_once(tmp_path):
     first, data, last = image(np.arange(6).reshape(2, 3, 1), 8)
     with pytest.raises(CaptureError, match="a second head"):
-        png.read(written(tmp_path / "a.png", first, first, data, last))
+        png.read_png(written(tmp_path / "a.png", first, first, data, last))
     with pytest.raises(CaptureError, match="its head claims more or fails"):
-        png.read(written(tmp_path / "a.png", data, first, last))
+        png.read_png(written(tmp_path / "a.png", data, first, last))
     for short in (b"", MARK, MARK + first[:-2]):
         (tmp_path / "a.png").write_bytes(short)
         with pytest.raises(CaptureError, match="truncated or not a PNG file"):
-            png.read(tmp_path / "a.png")
+            png.read_png(tmp_path / "a.png")

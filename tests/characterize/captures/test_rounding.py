@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from characterize.captures import Capture, Gain, clean, told
+from characterize.captures import Capture, SensorNoise, quantization_score, to_electrons
 from characterize.captures.electrons import photon_transfer
-from characterize.captures.rounding import Dark
+from characterize.captures.rounding import DarkStatistics
 from characterize.inference import estimate, leastsquares, prepare, search
-from characterize.inference.leastsquares import Data
+from characterize.inference.leastsquares import FitImages
 
 
 def chances(light, noise):
@@ -33,12 +33,14 @@ def test_score_and_information_are_those_of_the_normal_distribution(noise, light
         np.log(chances(light + step, noise)[1][some])
         - np.log(chances(light - step, noise)[1][some])
     ) / (2 * step)
-    score, _ = told((counts - light)[some], np.full(some.sum(), noise))
+    score, _ = quantization_score((counts - light)[some], np.full(some.sum(), noise))
     assert score == pytest.approx(
         slope, rel=5e-3, abs=1e-6
     )  # the step: 1e-7; above a count of noise a line stands for it
     some = chance > 1e-14
-    score, information = told((counts - light)[some], np.full(some.sum(), noise))
+    score, information = quantization_score(
+        (counts - light)[some], np.full(some.sum(), noise)
+    )
     weight = chance[some]
     assert float(weight @ score) == pytest.approx(0, abs=1e-8 / noise)
     wanted = max(float(weight @ score**2), 1e-6)
@@ -51,7 +53,7 @@ def test_score_and_information_are_those_of_the_normal_distribution(noise, light
 def test_dark_level_and_noise_are_found_below_a_count(level, noise):
     rng = np.random.default_rng(3)
     true = level + 0.08 * rng.standard_normal((31, 27))
-    found = Dark.of(np.rint(true + noise * rng.standard_normal((9, 31, 27))))
+    found = DarkStatistics.of(np.rint(true + noise * rng.standard_normal((9, 31, 27))))
     off = found.level - true
     assert found.noise == pytest.approx(
         noise, abs=0.025
@@ -65,7 +67,7 @@ def test_dark_level_and_noise_are_found_below_a_count(level, noise):
 def test_dark_frames_that_all_read_the_same_leave_the_level_open():
     counts = np.full((4, 9, 8), 7.0)
     counts[:, 3, 4] = 61.0  # a hot pixel stays as it reads
-    found = Dark.of(counts)
+    found = DarkStatistics.of(counts)
     assert found.level[3, 4] == 61.0
     assert np.abs(np.delete(found.level, 3 * 8 + 4) - 7).max() < 0.1
     assert 0.05 < found.noise < 0.3
@@ -108,19 +110,21 @@ def test_fit_of_rounded_counts_ends_where_their_likelihood_is_greatest():
     electrons = seen(rng, truth[0] * shape + truth[1], gain, read)
     full = np.ones(shape.shape, bool)
     floor = np.full(shape.shape, read**2 + gain**2 / 12)
-    counts = Data(electrons, full, ~full, floor, np.ones(shape.shape), count_e=gain)
+    counts = FitImages(
+        electrons, full, ~full, floor, np.ones(shape.shape), count_e=gain
+    )
 
     def model(value, jacobian):
         return value[0] * shape + value[1], np.stack(
             [shape, np.ones_like(shape)]
         ) if jacobian else None
 
-    found = leastsquares.fit(model, counts, truth)
+    found = leastsquares.fit_levenberg_marquardt(model, counts, truth)
     plain = found
     for _ in range(6):
         noise = np.sqrt(read**2 + found.image)  # held, as the weights of a fit are
-        found = leastsquares.fit(
-            model, prepare.unrounded(counts, found.image), found.value
+        found = leastsquares.fit_levenberg_marquardt(
+            model, prepare.correct_quantization(counts, found.image), found.value
         )
 
     def unlikely(value):
@@ -149,7 +153,7 @@ def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
     rng = np.random.default_rng(2)
     image = rng.uniform(2, 40, (2, 5, 4))
     full = rng.random(image.shape) < 0.3
-    data = Data(
+    data = FitImages(
         17.0 * np.rint(image / 17.0),
         ~full,
         full,
@@ -160,7 +164,7 @@ def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
         0.0,
         17.0,
     )
-    made = prepare.unrounded(data, image)
+    made = prepare.correct_quantization(data, image)
     assert np.array_equal(made.electrons[full], data.electrons[full])
     assert np.array_equal(made.variance_e2[full], data.variance_e2[full])
     assert made.shared(image)[0] == pytest.approx(data.shared(image)[0])
@@ -174,7 +178,7 @@ def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_i
     step, light, noise = 1700.0, 0.43, 0.05
     electrons = step * np.array([[[0.0, 1.0]]])
     image, full = np.full_like(electrons, light * step), np.ones(electrons.shape, bool)
-    data = Data(
+    data = FitImages(
         electrons,
         full,
         ~full,
@@ -182,7 +186,7 @@ def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_i
         np.ones(electrons.shape),
         count_e=step,
     )
-    made = prepare.unrounded(data, image)
+    made = prepare.correct_quantization(data, image)
     counts, chance = chances(light, noise)
     up, down = (chances(light + sign * 1e-5, noise)[1] for sign in (1, -1))
     some = chance > 1e-14
@@ -212,7 +216,7 @@ def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count
         / gain
     )
     blank = np.full(3, np.nan)
-    found = clean(
+    found = to_electrons(
         Capture(
             frames,
             blank,
@@ -250,7 +254,7 @@ def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(
     electrons = seen(rng, np.full((1, 40, 50), 0.27 * 29.0), 29.0, 4.3)
     full = np.ones(electrons.shape, bool)
     floor = np.full(electrons.shape, 4.3**2 + 29.0**2 / 12)
-    counts = Data(
+    counts = FitImages(
         electrons, full, ~full, floor, np.ones(electrons.shape), count_e=count_e
     )
 
@@ -260,11 +264,15 @@ def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(
         ) if jacobian else None
 
     monkeypatch.setattr(
-        search, "refine", lambda task, value: leastsquares.fit(model, task.data, value)
+        search,
+        "refine_fit",
+        lambda task, value: leastsquares.fit_levenberg_marquardt(
+            model, task.data, value
+        ),
     )
-    task = search.Task(None, counts, np.zeros(1), {}, None)
-    first = leastsquares.fit(model, counts, np.array([3.0]))
-    made, ends = estimate._unrounded(task, [first], Gain(29.0, 0.3, read))
+    task = search.SearchTask(None, counts, np.zeros(1), {}, None)
+    first = leastsquares.fit_levenberg_marquardt(model, counts, np.array([3.0]))
+    made, ends = estimate._unrounded(task, [first], SensorNoise(29.0, 0.3, read))
     assert (made is not task) == exact
     if exact:
         noise = np.sqrt(4.3**2 + ends[0].value[0])

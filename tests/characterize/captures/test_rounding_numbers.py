@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from characterize.captures.rounding import Dark, told
+from characterize.captures.rounding import DarkStatistics, quantization_score
 
 
 def by_sum(off, noise):
@@ -39,18 +39,18 @@ def test_counts_of_unlike_noise_are_told_each_by_its_own():
     """
     off = np.array([[0.2, -1.3, 0.45], [2.6, 0.0, -0.7], [0.31, -0.31, 1.9]])
     noise = np.array([[0.06, 0.9, 0.2], [0.99, 0.31, 0.5], [1.0, 3.7, 1.2]])
-    score, information = told(off, noise)
+    score, information = quantization_score(off, noise)
     for at in np.ndindex(2, 3):
         want = by_sum(off[at], noise[at])
         assert score[at] == pytest.approx(want[0], rel=1e-9, abs=1e-12)
         assert information[at] == pytest.approx(want[1], rel=1e-9)
     assert score[2] == pytest.approx(off[2] / (noise[2] ** 2 + 1 / 12), rel=1e-12)
     assert information[2] == pytest.approx(1 / (noise[2] ** 2 + 1 / 12), rel=1e-12)
-    assert [float(part) for part in told(0.45, 0.2)] == [
+    assert [float(part) for part in quantization_score(0.45, 0.2)] == [
         score[0, 2],
         information[0, 2],
     ]  # plain numbers
-    one = told(np.array([0.45, -0.2]), 0.2)[1]  # one noise for all
+    one = quantization_score(np.array([0.45, -0.2]), 0.2)[1]  # one noise for all
     assert one == pytest.approx([by_sum(0.45, 0.2)[1], by_sum(-0.2, 0.2)[1]], rel=1e-9)
 
 
@@ -58,7 +58,7 @@ def test_what_says_nothing_has_a_millionth():
     """In the middle of a count with 0.05 counts of noise: 1e-18 of information;
     half-way to the next 255.
     """
-    found = told(np.array([0.0, 0.5]), np.array([0.05, 0.05]))[1]
+    found = quantization_score(np.array([0.0, 0.5]), np.array([0.05, 0.05]))[1]
     # of two counts whose chances are one half each: twice phi(0)² / s² over a half
     assert found == pytest.approx([1e-6, 2 / math.pi / 0.05**2], rel=1e-9)
 
@@ -75,7 +75,7 @@ def test_errors_of_dark_levels_are_as_large_as_the_levels_are_off(level, noise):
     told to a twentieth.
     """
     truth, counts = drawn(5, level, 0.09, noise)
-    found = Dark.of(counts)
+    found = DarkStatistics.of(counts)
     off = found.level - truth
     assert (off - off.mean()).std() == pytest.approx(
         np.sqrt((found.error**2).mean()), rel=0.12
@@ -91,7 +91,7 @@ def test_pixels_that_read_alike_have_one_level_and_its_error_by_their_likelihood
     The common level and scatter are those that make all counts likeliest, told by their
     own mean and spread."""
     _, counts = drawn(8, 6.4, 0.1, 0.22)
-    found = Dark.of(counts)
+    found = DarkStatistics.of(counts)
     often = np.stack([(counts == k).sum(0) for k in (5, 6, 7, 8)], -1)
     kinds = np.unique(often.reshape(-1, 4), axis=0)
     levels = {
@@ -138,7 +138,7 @@ def test_hot_pixels_read_as_they_are_with_the_scatter_of_all():
     counts[:, 2, 3] = 40.0
     counts[4, 5, 6] = 11.0
     counts[1, 7, 8] = 10.0  # three off: one of them all
-    found = Dark.of(counts)
+    found = DarkStatistics.of(counts)
     assert found.level[2, 3] == 40.0
     assert found.level[5, 6] == pytest.approx(counts[:, 5, 6].mean())
     assert found.error[2, 3] == found.error[5, 6] == pytest.approx(counts.std() / 3)
@@ -168,7 +168,7 @@ def test_frames_that_read_alike_leave_what_is_usual_to_a_factor_of_two():
         options={"xatol": 1e-4, "fatol": 1e-6},
     )
     noise, scatter = np.exp(best.x)
-    found = Dark.of(np.full((4, 9, 8), 7.0))
+    found = DarkStatistics.of(np.full((4, 9, 8), 7.0))
     assert found.noise == pytest.approx(
         noise, rel=0.02
     )  # the search ends at 1e-3, on 61 levels

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from characterize.captures import stage
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_rows_are_named_as_an_editor_counts_them(tmp_path):
 
 
 def test_frames_of_which_only_names_are_known():
-    rows = stage.Rows.unknown(("a", "b", "c"))
+    rows = stage.StageRows.unknown(("a", "b", "c"))
     assert rows.page == (None, None, None)
     assert rows.angle_rad.tolist() == [[0, 0]] * 3
     assert (
@@ -233,7 +233,7 @@ def test_what_may_be_0_and_tilts_to_either_side_are_taken(tmp_path):
 
 
 def test_images_that_the_table_does_not_name_are_told_and_dark_ones_refused(tmp_path):
-    rows = stage.Rows.unknown(("sub/b.tif", "c.tif"))
+    rows = stage.StageRows.unknown(("sub/b.tif", "c.tif"))
     every = [tmp_path / f"{name}.tif" for name in "abcdefgh"]
     (told,) = stage.left_out(every, rows)
     assert told.startswith("6 images that ")
@@ -259,8 +259,8 @@ def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
 
 def test_entries_that_nothing_reads_are_named():
     """Where the sensor's window lay is not read: the axis is sought in the frames."""
-    (said,) = stage.unread(
+    (said,) = stage.unread_keys_text(
         {"pixel_um": 3.0, "roi_x_px": 12, "window": "fixed", "operator": "K"}
     )
     assert said.endswith(": roi_x_px, operator")
-    assert not stage.unread({"wavelength_um": 0.53, "gain_e": 2.3})
+    assert not stage.unread_keys_text({"wavelength_um": 0.53, "gain_e": 2.3})

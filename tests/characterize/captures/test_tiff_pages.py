@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from characterize.captures import capture, tiff_pages
-from characterize.captures.colour import Colours
-from metalens.ground.errors import CaptureError
+from characterize.captures.colour import ColourChannels
+from metalens.core.errors import CaptureError
 
 cv2 = pytest.importorskip("cv2")
 image = pytest.importorskip("PIL.Image")
@@ -26,7 +26,7 @@ def written(tmp_path, frames=FRAMES, **about):
 
 
 def test_plain_frames_are_read_as_they_are(tmp_path):
-    assert np.array_equal(tiff_pages.read(written(tmp_path)), FRAMES)
+    assert np.array_equal(tiff_pages.read_tiff(written(tmp_path)), FRAMES)
 
 
 def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(
@@ -37,7 +37,7 @@ def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_to
         tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None
     )
     names, frames, _ = capture._all_frames(
-        [stack, tmp_path / "b.tif"], tmp_path, Colours(), None
+        [stack, tmp_path / "b.tif"], tmp_path, ColourChannels(), None
     )
     assert names == ("a.tif[0]", "a.tif[1]", "a.tif[2]", "b.tif")
     assert np.array_equal(frames, np.stack([*FRAMES, FRAMES[1]]))
@@ -66,24 +66,26 @@ def test_frames_that_are_compressed_with_loss_or_by_a_stranger_are_refused_by_na
     with tifffile.TiffFile(path, mode="r+") as file:
         file.pages[2].tags[259].overwrite(code)
     with pytest.raises(CaptureError, match=f"frame 2 is {words}"):
-        tiff_pages.read(path)
+        tiff_pages.read_tiff(path)
 
 
 def test_frames_together_may_claim_no_more_than_is_held(tmp_path, monkeypatch):
     monkeypatch.setattr(tiff_pages, "_MOST_BYTES", FRAMES.nbytes)
-    assert len(tiff_pages.read(written(tmp_path))) == 3
+    assert len(tiff_pages.read_tiff(written(tmp_path))) == 3
     monkeypatch.setattr(tiff_pages, "_MOST_BYTES", FRAMES.nbytes - 1)
     with pytest.raises(CaptureError, match=r"frame 2 claims \(6, 5\) values"):
-        tiff_pages.read(written(tmp_path))
+        tiff_pages.read_tiff(written(tmp_path))
 
 
 def test_planes_are_images_or_the_colours_of_one(tmp_path):
     path = written(tmp_path, FRAMES[None], planarconfig="separate")
-    assert np.array_equal(tiff_pages.read(path), FRAMES)
+    assert np.array_equal(tiff_pages.read_tiff(path), FRAMES)
     assert np.array_equal(
-        tiff_pages.read(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None]
+        tiff_pages.read_tiff(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None]
     )
-    assert np.array_equal(tiff_pages.read(written(tmp_path), coloured=True), FRAMES)
+    assert np.array_equal(
+        tiff_pages.read_tiff(written(tmp_path), coloured=True), FRAMES
+    )
 
 
 @pytest.mark.parametrize(
@@ -130,7 +132,7 @@ def test_what_imagej_lays_behind_the_head_of_one_image_is_a_stack(
     )
     path = tmp_path / "a.tif"
     path.write_bytes(head + FRAMES.astype(order + "u2").tobytes())
-    assert np.array_equal(tiff_pages.read(path), FRAMES)
+    assert np.array_equal(tiff_pages.read_tiff(path), FRAMES)
     found = capture.load(path)
     assert found.position_um == pytest.approx([0.0, 0.3, 0.6])
     assert found.frames.dtype.isnative
@@ -147,7 +149,7 @@ def test_pages_of_unlike_types_are_refused(tmp_path):
     with pytest.raises(
         CaptureError, match="frame 1 is uint8, frame 0 uint16; keep one type a file"
     ):
-        tiff_pages.read(tmp_path / "a.tif")
+        tiff_pages.read_tiff(tmp_path / "a.tif")
 
 
 @pytest.mark.skipif(
@@ -168,7 +170,7 @@ def test_packed_values_are_refused_by_their_width(tmp_path):
     with pytest.raises(
         CaptureError, match="values of frame 0 are 12 bits wide, packed"
     ):
-        tiff_pages.read(tmp_path / "a.tif")
+        tiff_pages.read_tiff(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize(
@@ -205,7 +207,7 @@ def test_frames_that_other_programs_packed_are_read_as_the_counts_they_are(
         compression=packing,
         tiffinfo={317: predictor},
     )
-    found = tiff_pages.read(tmp_path / "a.tif")
+    found = tiff_pages.read_tiff(tmp_path / "a.tif")
     assert found.dtype == frames.dtype
     assert np.array_equal(found, frames)
 
@@ -213,7 +215,7 @@ def test_frames_that_other_programs_packed_are_read_as_the_counts_they_are(
 def test_packed_colours_come_red_first(tmp_path):
     colours = np.random.default_rng(5).integers(0, 256, (1, 9, 11, 3)).astype(np.uint8)
     image.fromarray(colours[0]).save(tmp_path / "a.tif", compression="tiff_lzw")
-    assert np.array_equal(tiff_pages.read(tmp_path / "a.tif"), colours)
+    assert np.array_equal(tiff_pages.read_tiff(tmp_path / "a.tif"), colours)
 
 
 def test_a_plain_frame_behind_a_packed_one_stays_itself(tmp_path):
@@ -223,7 +225,7 @@ def test_a_plain_frame_behind_a_packed_one_stays_itself(tmp_path):
         for frame, packing in zip(frames, ("tiff_lzw", None), strict=True):
             frame.save(file, format="TIFF", compression=packing)
             file.newFrame()
-    assert np.array_equal(tiff_pages.read(tmp_path / "a.tif"), FRAMES[:2])
+    assert np.array_equal(tiff_pages.read_tiff(tmp_path / "a.tif"), FRAMES[:2])
 
 
 @pytest.mark.skipif(
@@ -234,7 +236,7 @@ def test_packed_frames_that_opencv_would_set_upright_are_refused(tmp_path, way_u
     """Mirrored, or turned on its side: plain ones come as they are stored."""
     path = tmp_path / "a.tif"
     image.fromarray(FRAMES[0]).save(path, tiffinfo={274: way_up})
-    assert np.array_equal(tiff_pages.read(path)[0], FRAMES[0])
+    assert np.array_equal(tiff_pages.read_tiff(path)[0], FRAMES[0])
     image.fromarray(FRAMES[0]).save(
         path, compression="tiff_lzw", tiffinfo={274: way_up}
     )
@@ -242,4 +244,4 @@ def test_packed_frames_that_opencv_would_set_upright_are_refused(tmp_path, way_u
         CaptureError,
         match=r"compressed \(LZW\) and damaged, turned or of a kind .* plain or deflated",
     ):
-        tiff_pages.read(path)
+        tiff_pages.read_tiff(path)

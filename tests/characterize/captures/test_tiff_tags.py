@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from characterize.captures import tiff_tags
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 tifffile = pytest.importorskip("tifffile")
 FRAMES = np.arange(4 * 6 * 5, dtype=np.uint16).reshape(4, 6, 5)
@@ -32,7 +32,7 @@ def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit,
     tifffile.imwrite(
         tmp_path / "a.tif", FRAMES, imagej=True, resolution=(8.0, 5.0), metadata=about
     )
-    found = tiff_tags.read(tmp_path / "a.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.tif")
     if um is None:
         assert (len(found.position_um), math.isnan(found.pixel_um), found.notes) == (
             0,
@@ -63,7 +63,7 @@ def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(
     tifffile.imwrite(
         tmp_path / "a.tif", FRAMES, imagej=True, metadata={"axes": "ZYX"} | about
     )
-    found = tiff_tags.read(tmp_path / "a.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.tif")
     assert found.position_um.tolist() == steps
     assert math.isnan(found.pixel_um)
     assert len(found.notes) == bool(steps)
@@ -77,7 +77,7 @@ def test_two_channels_are_refused(tmp_path):
         metadata={"axes": "ZCYX"},
     )
     with pytest.raises(CaptureError, match="2 channels in one file"):
-        tiff_tags.read(tmp_path / "a.tif")
+        tiff_tags.read_tags(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_ome_gives_positions_and_the_pixel_along_x(tmp_path, unit, um):
     tifffile.imwrite(
         tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about | {"Plane": planes}
     )
-    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.ome.tif")
     assert found.pixel_um == pytest.approx(0.37 * um, rel=1e-12)
     assert found.position_um == pytest.approx([3500.0, 1.5, -2e-3, 8250.0], rel=1e-12)
     assert found.notes == (f"pixel of {0.37 * um:.4g} um from the tags of the file",)
@@ -106,7 +106,7 @@ def test_ome_without_positions_gives_steps_of_the_height_of_a_voxel(tmp_path, un
     about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeZ": 2.5}
     about |= {} if unit is None else {"PhysicalSizeZUnit": unit}
     tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about)
-    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.ome.tif")
     assert found.position_um == pytest.approx(2.5 * um * np.arange(4), rel=1e-12)
     assert found.notes[0] == f"stage step of {2.5 * um:.4g} um from the OME tags"
 
@@ -132,7 +132,7 @@ def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
     for words in (turned, written.replace('"', "'"), *spelt):
         assert words != written
         tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
-        found = tiff_tags.read(tmp_path / "a.ome.tif")
+        found = tiff_tags.read_tags(tmp_path / "a.ome.tif")
         assert found.pixel_um == pytest.approx(0.37, rel=1e-12)
         assert found.position_um == pytest.approx(2.5 * np.arange(4), rel=1e-12)
 
@@ -146,7 +146,7 @@ def test_ome_tags_that_are_no_xml_are_told(tmp_path):
     )
     words = tifffile.tiffcomment(tmp_path / "a.ome.tif").replace("<Pixels", "<Pixels<")
     tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
-    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.ome.tif")
     assert (len(found.position_um), "are no XML" in found.notes[0]) == (0, True)
 
 
@@ -170,7 +170,7 @@ def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(
         tifffile.imwrite(
             tmp_path / "a.tif", stack, metadata={"axes": axes, **sizes}, **{kind: True}
         )
-        assert tiff_tags.read(tmp_path / "a.tif").position_um == pytest.approx(
+        assert tiff_tags.read_tags(tmp_path / "a.tif").position_um == pytest.approx(
             0.3 * np.array(steps), rel=1e-12
         )
 
@@ -183,7 +183,7 @@ def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tm
         metadata={"axes": "ZCYX"},
     )
     with pytest.raises(CaptureError, match="2 channels in one file"):
-        tiff_tags.read(tmp_path / "a.ome.tif")
+        tiff_tags.read_tags(tmp_path / "a.ome.tif")
     colours = np.repeat(FRAMES[..., None], 3, -1)
     tifffile.imwrite(
         tmp_path / "b.ome.tif",
@@ -192,13 +192,13 @@ def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tm
         photometric="rgb",
         metadata={"axes": "ZYXS"},
     )
-    assert len(tiff_tags.read(tmp_path / "b.ome.tif").position_um) == 0
+    assert len(tiff_tags.read_tags(tmp_path / "b.ome.tif").position_um) == 0
 
 
 def test_a_plain_file_tells_nothing(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.tif", FRAMES, photometric="minisblack", metadata=None
     )
-    found = tiff_tags.read(tmp_path / "a.tif")
+    found = tiff_tags.read_tags(tmp_path / "a.tif")
     assert (len(found.position_um), found.notes) == (0, ())
     assert math.isnan(found.pixel_um)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from characterize.captures import between, turn
+from characterize.captures import orient_frames, relative_orientation
 
 FRAME = np.arange(16.0).reshape(1, 4, 4) ** 2
 
@@ -15,6 +15,9 @@ def test_what_lies_between_two_orientations_leads_from_one_to_the_other(first):
     """
     for second in range(8):
         assert np.array_equal(
-            turn(turn(FRAME, first), between(first, second)), turn(FRAME, second)
+            orient_frames(
+                orient_frames(FRAME, first), relative_orientation(first, second)
+            ),
+            orient_frames(FRAME, second),
         )
-    assert between(first, first) == 0
+    assert relative_orientation(first, first) == 0

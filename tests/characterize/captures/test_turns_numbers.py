@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from characterize.captures.turns import MIRRORED, TURNS, between, turn
+from characterize.captures.turns import (
+    MIRRORED,
+    TURNS,
+    orient_frames,
+    relative_orientation,
+)
 
 FRAMES = np.array([[[1, 2, 3], [4, 5, 6]], [[11, 12, 13], [14, 15, 16]]])
 # of the first frame: turned against the clock as it is drawn, rows from the top
@@ -22,16 +27,19 @@ LYING = {
 @pytest.mark.parametrize("orientation", LYING)
 def test_every_frame_of_a_stack_is_turned_alike(orientation):
     want = np.array(LYING[orientation])
-    assert turn(FRAMES, orientation).tolist() == [want.tolist(), (want + 10).tolist()]
+    assert orient_frames(FRAMES, orientation).tolist() == [
+        want.tolist(),
+        (want + 10).tolist(),
+    ]
 
 
 def test_what_lies_between_is_the_one_that_leads_there():
     """Quarters add up; behind a mirror they count the other way, as two mirrors about
     axes 45° apart turn by 90°.
     """
-    assert [between(0, k) for k in range(8)] == list(range(8))
-    assert [between(1, k) for k in range(8)] == [3, 0, 1, 2, 5, 6, 7, 4]
-    assert [between(6, k) for k in range(8)] == [6, 7, 4, 5, 2, 3, 0, 1]
+    assert [relative_orientation(0, k) for k in range(8)] == list(range(8))
+    assert [relative_orientation(1, k) for k in range(8)] == [3, 0, 1, 2, 5, 6, 7, 4]
+    assert [relative_orientation(6, k) for k in range(8)] == [6, 7, 4, 5, 2, 3, 0, 1]
 
 
 def test_every_way_has_its_words():

@@ -18,7 +18,7 @@ from characterize.inference import asbuilt
 from metalens import lens as lenses
 from metalens import psf
 from metalens.cli import main
-from metalens.ground import store
+from metalens.core import store
 
 TRUTH = """
 depths_um = [400.0, 600.0, 1000.0]

@@ -13,13 +13,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.captures import turn
-from characterize.captures.electrons import clean
+from characterize.captures import orient_frames
+from characterize.captures.electrons import to_electrons
 from characterize.inference import arrange as arranging
 from characterize.inference import estimate, search
 from characterize.inference.prepare import data_of, setting_of
-from characterize.inference.search import Task
-from characterize.model import vector
+from characterize.inference.search import SearchTask
+from characterize.model import parameter_vector
 from characterize.model.forward import ForwardModel
 from metalens import design, profiles
 from metalens.cell import Cell
@@ -33,11 +33,11 @@ def test_frames_in_order_stay_so_in_windows_that_the_light_fills(side):
     shots = b.capture(b.electrons())
     middle = slice(8 - side // 2, 8 + side // 2)
     shots = dataclasses.replace(shots, frames=shots.frames[:, middle, middle])
-    frames = clean(shots)
+    frames = to_electrons(shots)
     setting, window = setting_of(shots, 64)
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
     with np.errstate(over="raise", invalid="raise", divide="raise"):
-        found = arranging.arrange(model, data_of(frames, window), scan_um=20.0)
+        found = arranging.find_arrangement(model, data_of(frames, window), scan_um=20.0)
     assert not found.reordered
     assert not found.clearly
 
@@ -57,22 +57,33 @@ def helix():
 def task_of(shots, lens):
     """What a fit begins with."""
     setting, window = setting_of(shots, 64)
-    model, data = ForwardModel(lens, setting, b.RESPONSE), data_of(clean(shots), window)
-    return Task(model, data, vector(), {}, arranging.arrange(model, data, scan_um=60.0))
+    model, data = (
+        ForwardModel(lens, setting, b.RESPONSE),
+        data_of(to_electrons(shots), window),
+    )
+    return SearchTask(
+        model,
+        data,
+        parameter_vector(),
+        {},
+        arranging.find_arrangement(model, data, scan_um=60.0),
+    )
 
 
 def laid(way, *, peak_e=6000.0):
     """How frames of a helix as made seem to lie whose camera lies some way, and how a
     fit takes them.
     """
-    light = bench.irradiance(helix(), b.truth(), b.RESPONSE)
-    shots = b.capture(light * (peak_e / light.max()) + bench.background(b.truth()))
+    light = bench.bench_irradiance(helix(), b.truth(), b.RESPONSE)
+    shots = b.capture(
+        light * (peak_e / light.max()) + bench.background_plane(b.truth())
+    )
     shots = dataclasses.replace(
-        shots, frames=np.ascontiguousarray(turn(shots.frames, way))
+        shots, frames=np.ascontiguousarray(orient_frames(shots.frames, way))
     )
     whole = task_of(shots, helix())
     found = whole.found
-    return found, search.oriented(
+    return found, search.choose_orientation(
         [estimate._as_laid(whole, one) for one in (found, *found.others)]
     ).found
 
@@ -126,10 +137,10 @@ def test_a_turn_is_taken_where_it_is_better_once_both_fits_have_gone_on(
     monkeypatch.setattr(
         search, "_short", lambda task, few, begins: [shorts[task.found.orientation]]
     )
-    monkeypatch.setattr(search, "starts", lambda task, **_: [])
+    monkeypatch.setattr(search, "starting_points", lambda task, **_: [])
 
     def gone_on(images, data, begin, **_):
         return types.SimpleNamespace(merit=ends[int(begin[0])])
 
     monkeypatch.setattr(search.leastsquares, "fit", gone_on)
-    assert search.oriented(tasks).found.orientation == int(turned)
+    assert search.choose_orientation(tasks).found.orientation == int(turned)

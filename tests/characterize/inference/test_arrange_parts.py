@@ -5,11 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.captures import Spectra, above_rim, likeness, turn
+from characterize.captures import (
+    FrameSpectra,
+    above_rim,
+    normalized_cross_correlation,
+    orient_frames,
+)
 from characterize.inference import arrange
-from characterize.inference.arrange import Arrangement
-from characterize.inference.leastsquares import Data
-from characterize.model import PLACE, vector
+from characterize.inference.arrange import FrameArrangement
+from characterize.inference.leastsquares import FitImages
+from characterize.model import PLACE, parameter_vector
 
 RNG = np.random.default_rng(23)
 
@@ -20,7 +25,7 @@ def laid(**more):
         "order": np.array([2, 0, 1]), "reordered": True, "order_seen": True, "orientation": 5, "clearly": True,
         "alike": (),
     }  # fmt: skip
-    return Arrangement(**(usual | more))
+    return FrameArrangement(**(usual | more))
 
 
 @pytest.mark.parametrize("shift", [(2, -3), (-1, 4), (0, 0)])
@@ -28,7 +33,7 @@ def test_a_shifted_picture_is_alike_at_its_shift(shift):
     picture = np.zeros((11, 14))
     picture[4:8, 5:9] = RNG.uniform(1, 3, (4, 4))
     moved = np.roll(picture, shift, (0, 1))
-    score, found = likeness(1.7 * moved, picture, 0.0)
+    score, found = normalized_cross_correlation(1.7 * moved, picture, 0.0)
     assert score == pytest.approx(1, rel=1e-9)
     assert found == shift
     assert arrange._distance(moved, picture) == pytest.approx(0, abs=1e-9)
@@ -48,8 +53,10 @@ def test_noise_is_taken_off_the_norm_and_never_more_than_nine_tenths():
         (5 * power**0.5, 0.1 * power),
     ):
         want = min(cross / np.sqrt(left * (other**2).sum()), 1.0)
-        assert likeness(picture, other, noise)[0] == pytest.approx(want, rel=1e-9)
-    assert likeness(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
+        assert normalized_cross_correlation(picture, other, noise)[0] == pytest.approx(
+            want, rel=1e-9
+        )
+    assert normalized_cross_correlation(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
 
 
 def test_a_scan_sees_the_likeness_of_frames_in_their_order():
@@ -59,8 +66,11 @@ def test_a_scan_sees_the_likeness_of_frames_in_their_order():
     light, expected = RNG.normal(0, 1, (2, 3, 7, 10)) ** 3
     expected[2] = 0
     noise, back = np.array([0.3, 60.0, 1.1]), np.array([2, 1, 0])
-    plain = [likeness(light[j], expected[i], noise[j])[0] for i, j in enumerate(back)]
-    spectra = Spectra.of(light, noise), Spectra.of(expected, np.zeros(3))
+    plain = [
+        normalized_cross_correlation(light[j], expected[i], noise[j])[0]
+        for i, j in enumerate(back)
+    ]
+    spectra = FrameSpectra.of(light, noise), FrameSpectra.of(expected, np.zeros(3))
     assert spectra[0].alike(spectra[1], back) == pytest.approx(np.mean(plain), rel=1e-9)
 
 
@@ -115,17 +125,21 @@ def test_turned_pictures_are_turned_back(orientation):
         k: next(
             j
             for j in range(8)
-            if np.array_equal(arrange.turn(arrange.turn(expected, k), j), expected)
+            if np.array_equal(
+                arrange.orient_frames(arrange.orient_frames(expected, k), j), expected
+            )
         )
         for k in range(8)
     }
-    light = arrange.turn(expected, back[orientation])
+    light = arrange.orient_frames(expected, back[orientation])
     found, clearly = arrange._orientation(light, (expected, expected), np.zeros(3))
     assert (found, clearly) == (orientation, orientation != 0)
     upright, aside = (
         np.pad(expected, ((0, 0), (y, y), (x, x))) for y, x in ((0, 2), (2, 0))
     )
-    wide = arrange.turn(aside if orientation % 2 else upright, back[orientation])
+    wide = arrange.orient_frames(
+        aside if orientation % 2 else upright, back[orientation]
+    )
     assert wide.shape == upright.shape
     assert arrange._orientation(wide, (upright, aside), np.zeros(3)) == (
         orientation,
@@ -143,9 +157,11 @@ def test_of_order_and_turn_the_least_is_said_that_explains_the_frames(way):
     back = next(
         k
         for k in range(8)
-        if np.array_equal(arrange.turn(arrange.turn(expected, turned), k), expected)
+        if np.array_equal(
+            arrange.orient_frames(arrange.orient_frames(expected, turned), k), expected
+        )
     )
-    light = arrange.turn(expected, turned) if way[1] else expected
+    light = arrange.orient_frames(expected, turned) if way[1] else expected
     light = light[np.argsort(order)] if way[0] else light
     assert (
         arrange._plainest(light, (expected, expected), np.zeros(4), order, back) == way
@@ -163,17 +179,18 @@ def test_of_ways_that_explain_frames_alike_the_order_is_said():
 
 def test_turns_by_hand():
     frame = np.array([[[1, 2, 3], [4, 5, 6]]])
-    assert arrange.turn(frame, 1)[0].tolist() == [[3, 6], [2, 5], [1, 4]]
-    assert arrange.turn(frame, 4)[0].tolist() == [[3, 2, 1], [6, 5, 4]]
-    assert arrange.turn(frame, 5)[0].tolist() == [[1, 4], [2, 5], [3, 6]]
-    assert arrange.turn(frame, 3)[0].tolist() == [[4, 1], [5, 2], [6, 3]]
+    assert arrange.orient_frames(frame, 1)[0].tolist() == [[3, 6], [2, 5], [1, 4]]
+    assert arrange.orient_frames(frame, 4)[0].tolist() == [[3, 2, 1], [6, 5, 4]]
+    assert arrange.orient_frames(frame, 5)[0].tolist() == [[1, 4], [2, 5], [3, 6]]
+    assert arrange.orient_frames(frame, 3)[0].tolist() == [[4, 1], [5, 2], [6, 3]]
     stack = np.concatenate([frame, frame + 10, frame + 20])
-    both = arrange.rearranged(stack, laid())
+    both = arrange.rearrange_frames(stack, laid())
     assert both[0].tolist() == [[21, 24], [22, 25], [23, 26]]
     assert (
-        arrange.rearranged(stack, laid(clearly=False))[1].tolist() == frame[0].tolist()
+        arrange.rearrange_frames(stack, laid(clearly=False))[1].tolist()
+        == frame[0].tolist()
     )
-    assert arrange.rearranged(stack, laid(reordered=False))[0].tolist() == [
+    assert arrange.rearrange_frames(stack, laid(reordered=False))[0].tolist() == [
         [1, 4],
         [2, 5],
         [3, 6],
@@ -251,7 +268,7 @@ class _Stack:
 
 def _seen(frames):
     shape = frames.shape
-    return Data(
+    return FitImages(
         frames,
         np.ones(shape, bool),
         np.zeros(shape, bool),
@@ -263,10 +280,10 @@ def _seen(frames):
 @pytest.mark.parametrize("distance_um", [75.0, -50.0])
 def test_a_wrong_distance_is_not_taken_for_another_order(distance_um):
     model = _Stack()
-    frames = model.images(vector({"distance_um": distance_um}))[0]
-    blind = arrange.arrange(model, _seen(frames), scan_um=30.0)
+    frames = model.images(parameter_vector({"distance_um": distance_um}))[0]
+    blind = arrange.find_arrangement(model, _seen(frames), scan_um=30.0)
     assert blind.reordered  # by the stage alone the stack seems shuffled
-    found = arrange.arrange(model, _seen(frames), scan_um=30.0, reach_um=200.0)
+    found = arrange.find_arrangement(model, _seen(frames), scan_um=30.0, reach_um=200.0)
     assert (found.reordered, found.clearly) == (False, False)
     assert found.distance_um == pytest.approx(distance_um)
     assert found.likeness > 0.999
@@ -275,8 +292,11 @@ def test_a_wrong_distance_is_not_taken_for_another_order(distance_um):
 def test_frames_that_are_shuffled_are_put_in_order_at_any_distance():
     model = _Stack()
     shuffle = np.array([4, 7, 1, 0, 8, 2, 6, 3, 5])
-    found = arrange.arrange(
-        model, _seen(model.images(vector())[0][shuffle]), scan_um=30.0, reach_um=200.0
+    found = arrange.find_arrangement(
+        model,
+        _seen(model.images(parameter_vector())[0][shuffle]),
+        scan_um=30.0,
+        reach_um=200.0,
     )
     assert found.reordered
     assert shuffle[found.order].tolist() == list(range(9))
@@ -290,10 +310,12 @@ def test_turned_frames_are_held_against_those_of_a_camera_on_its_side_where_it_l
     upright, aside = RNG.uniform(0, 1, (2, 3, 9, 9)) ** 4
     wanted = aside if way % 2 else upright
     (back,) = [
-        k for k in range(8) if np.array_equal(turn(turn(wanted, k), way), wanted)
+        k
+        for k in range(8)
+        if np.array_equal(orient_frames(orient_frames(wanted, k), way), wanted)
     ]
     assert arrange._orientation(
-        1.9 * turn(wanted, back), (upright, aside), np.zeros(3)
+        1.9 * orient_frames(wanted, back), (upright, aside), np.zeros(3)
     ) == (way, way > 0)
 
 

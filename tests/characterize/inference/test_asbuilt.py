@@ -18,21 +18,27 @@ import bench_lens as b
 import characterize
 from characterize.inference import asbuilt
 from characterize.inference.asbuilt import AsBuilt
-from characterize.inference.estimate import Options
+from characterize.inference.estimate import FitOptions
 from characterize.model import made
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import NAMES, PARAMETERS, PLACE, Known, vector
-from characterize.model.pillars import Pillars
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import (
+    NAMES,
+    PARAMETERS,
+    PLACE,
+    KnownValue,
+    parameter_vector,
+)
+from characterize.model.pillars import PillarResponse
 from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
+from metalens.core.errors import CaptureError, ConfigError, FitError
 from metalens.fabrication import Solved, sensitivity
-from metalens.ground.errors import CaptureError, ConfigError, FitError
 from metalens.psf.of_lens import View
 
-SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
-USUAL = Options(scan_um=60.0)
+SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+USUAL = FitOptions(scan_um=60.0)
 GLASS = {"glass_um": 40.0, "glass_tilt_x_deg": 5.0, "glass_tilt_y_deg": -3.0}
 
 
@@ -64,7 +70,7 @@ def test_a_fit_is_the_same_bytes_for_any_number_of_threads(fitted):
 
 
 def against_all_pillars(model, **more):
-    x = vector(b.VALUES | more | {"background_e": 0.0, "background_x_e": 0.0})
+    x = parameter_vector(b.VALUES | more | {"background_e": 0.0, "background_x_e": 0.0})
     found, want = model.images(x)[0], b.light(**more)
     scale = (found * want).sum() / (found**2).sum()
     return np.abs(scale * found - want).max() / want.max()
@@ -93,7 +99,7 @@ def test_uneven_light_agrees_with_the_sum_over_every_pillar(model):
 
 
 def test_low_rank_pillars_know_their_error():
-    pillars = Pillars(b.lens(), b.RESPONSE)
+    pillars = PillarResponse(b.lens(), b.RESPONSE)
     assert len(pillars.basis) < 16
     assert pillars.error < 1e-3
 
@@ -110,7 +116,7 @@ FILMS = ("pedestal_nm", "cap_nm")  # of pillars in layers
     "name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES, *FILMS)]
 )
 def test_derivatives_match_finite_differences(model, name):
-    x = vector(
+    x = parameter_vector(
         b.VALUES
         | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0}
         | GLASS
@@ -152,7 +158,7 @@ def of_rectangles():
 def test_derivatives_by_sides_edges_and_turn_match_finite_differences(
     of_rectangles, name
 ):
-    x = vector(
+    x = parameter_vector(
         b.VALUES
         | {"log_gain": 10.0, "width_nm": 3.0, "length_nm": -2.0, "turn_deg": 0.7}
     )
@@ -163,12 +169,12 @@ def test_a_point_source_has_a_slope_by_its_size(model):
     """Light changes as the square of the size: no slope at 0. That of 0.3 pixels is
     taken, twice the chord to there.
     """
-    x = vector(b.VALUES)
+    x = parameter_vector(b.VALUES)
     slope = model.images(x, ["pinhole_um"])[1][0]
     for i, depth in enumerate(b.DEPTHS):
         size = 0.3 * 1.5 * depth * 1.004 / 112.0
         chord = (
-            model.images(vector(b.VALUES | {"pinhole_um": size}))[0]
+            model.images(parameter_vector(b.VALUES | {"pinhole_um": size}))[0]
             - model.images(x)[0]
         )[i] / size
         assert np.abs(slope[i] - 2 * chord).max() < 0.1 * np.abs(2 * chord).max()
@@ -293,7 +299,10 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
     assert np.array_equal(stack.intensity, fitted.psf().intensity)
     true = b.truth().vector()
     want = psf.psf_stack(
-        *(f(made.pillars(b.lens(), b.RESPONSE, true)) for f in (np.angle, np.abs)),
+        *(
+            f(made.as_built_transmission(b.lens(), b.RESPONSE, true))
+            for f in (np.angle, np.abs)
+        ),
         pitch_um=0.4,
         wavelength_um=0.85 + 0.4e-3,
         sensor_distance_um=112.0,
@@ -334,7 +343,7 @@ def clipped(low, high):
 def test_samples_have_the_posterior_covariance_but_for_what_bounds_cut_off(fitted):
     """A bias along x may be 2 sigma from its bound: 3 % of its spread lies on it."""
     count = 20000
-    rows = asbuilt.usual(fitted.names, fitted.design)
+    rows = asbuilt.usual_parameters(fitted.names, fitted.design)
     low, high = (
         np.array([getattr(row, side) for row in rows]) - fitted.value
         for side in ("low", "high")
@@ -413,15 +422,15 @@ def test_missing_numbers_are_refused(change, words):
 
 def test_unknown_parameters_name_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'height_nm'"):
-        Known("heigth_nm", 0.0)
+        KnownValue("heigth_nm", 0.0)
 
 
 def test_what_is_never_fitted_is_stated_by_its_size_alone():
-    assert Known("stitching_nm", 0.0, 8.0).sigma == 8.0
+    assert KnownValue("stitching_nm", 0.0, 8.0).sigma == 8.0
     with pytest.raises(ConfigError, match="value = 0"):
-        Known("stitching_nm", 3.0, 8.0)
+        KnownValue("stitching_nm", 3.0, 8.0)
     with pytest.raises(ConfigError, match="never fitted"):
-        vector({"stitching_nm": 0.0})
+        parameter_vector({"stitching_nm": 0.0})
 
 
 def test_what_is_stated_is_not_reckoned_with():
@@ -432,7 +441,7 @@ def test_what_is_stated_is_not_reckoned_with():
     shots = b.capture(b.electrons())
     shots = dataclasses.replace(shots, about=shots.about | stated)
     options = dataclasses.replace(
-        USUAL, known=(Known("stitching_nm", 0.0), Known("sidewall_deg", 0.0))
+        USUAL, known=(KnownValue("stitching_nm", 0.0), KnownValue("sidewall_deg", 0.0))
     )
     found = characterize.fit(
         shots, b.lens(), options, response=dataclasses.replace(b.RESPONSE, error=0.23)

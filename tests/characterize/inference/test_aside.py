@@ -13,8 +13,8 @@ import bench_lens as b
 
 from characterize.bench import bench
 from characterize.inference import residual, search, verdict
-from characterize.inference.leastsquares import Data
-from characterize.model import ForwardModel, Known, Setting, vector
+from characterize.inference.leastsquares import FitImages
+from characterize.model import ForwardModel, FrameSetting, KnownValue, parameter_vector
 
 DEPTHS, ANGLES = (420.0, 600.0, 980.0), (-5.0, 0.0, 5.0)
 VALUES = {
@@ -29,10 +29,10 @@ FREE = {*VALUES, "astigmatism_rad", "stage_zero_um", "tilt_x_deg", "log_gain"}
 
 def test_places_aside_lie_in_the_widest_gap_and_half_a_step_beyond():
     angles = np.array([[0.0, 0.0], [0.02, 0.0], [0.02, 0.06], [0.0, 0.0]])
-    between, beyond = verdict.aside(angles)
+    between, beyond = verdict.largest_angle_gap(angles)
     assert between == pytest.approx([0.02, 0.03])
     assert beyond == pytest.approx([0.02, 0.09])
-    assert verdict.aside(angles[[0, 3]]) is None
+    assert verdict.largest_angle_gap(angles[[0, 3]]) is None
 
 
 def test_an_angle_left_out_is_predicted_as_well_as_stated():
@@ -44,23 +44,25 @@ def test_an_angle_left_out_is_predicted_as_well_as_stated():
     fifth each, of two degrees a draw that count. The reduced model adds 5e-4 of an
     image to 1 %.
     """
-    known = tuple(Known(name, value) for name, value in VALUES.items())
-    truth = bench.Truth(
+    known = tuple(KnownValue(name, value) for name, value in VALUES.items())
+    truth = bench.HiddenLens(
         DEPTHS,
         ANGLES,
         peak_e=4000.0,
         parameter=known,
-        camera=bench.Camera(pixel_um=1.5, pixels=16),
+        camera=bench.BenchCamera(pixel_um=1.5, pixels=16),
     )
-    light = bench.irradiance(b.lens(8.0), truth, b.RESPONSE)
+    light = bench.bench_irradiance(b.lens(8.0), truth, b.RESPONSE)
     light *= 4000.0 / light.max()
     depth, angle = truth.stated
     outer, rng = angle[:, 0] != 0, np.random.default_rng(17)
-    setting = Setting(depth[outer], angle[outer], np.ones(6), 1.5, 16, 16)
+    setting = FrameSetting(depth[outer], angle[outer], np.ones(6), 1.5, 16, 16)
     held = {
-        p.name: Known(p.name, p.start) for p in search.PARAMETERS if p.name not in FREE
+        p.name: KnownValue(p.name, p.start)
+        for p in search.PARAMETERS
+        if p.name not in FREE
     }
-    start = vector(
+    start = parameter_vector(
         {"crosstalk_px": float(truth.vector()[search.PLACE["crosstalk_px"]])}
     )
     model, seen = (
@@ -70,12 +72,14 @@ def test_an_angle_left_out_is_predicted_as_well_as_stated():
     middle, stated, missed = None, [], []
     for _ in range(6):
         frames = rng.poisson(light[outer]) + rng.normal(0, 2.0, seen.shape)
-        data = Data(frames, seen, ~seen, np.full(seen.shape, 4.0), np.ones(seen.shape))
-        task = search.Task(model, data, start, held, None, free=("tilt_x_deg",))
+        data = FitImages(
+            frames, seen, ~seen, np.full(seen.shape, 4.0), np.ones(seen.shape)
+        )
+        task = search.SearchTask(model, data, start, held, None, free=("tilt_x_deg",))
         if middle is None:
             middle = _middle(task, angle)
             begin = _begin(task, light[outer])
-        best = search.refine(task, begin)
+        best = search.refine_fit(task, begin)
         found = SimpleNamespace(
             draws=np.empty((0, len(best.value))), covariance=best.covariance, best=best
         )
@@ -96,7 +100,7 @@ def _middle(task, angle):
         angle_rad=np.zeros((3, 2)),
         exposure=np.ones(3),
     )
-    return residual.problem(
+    return residual.residual_phase_problem(
         ForwardModel(task.model.lens, s, task.model.response), task.names, task.start
     )
 

@@ -5,8 +5,8 @@ left when another is held.
 import numpy as np
 import pytest
 
-from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import Valley
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.inference.posterior import LocalMode
 
 RNG = np.random.default_rng(13)
 SIGMA, BENT, SHAPE = 0.37, 0.07, (2, 5, 7)
@@ -27,15 +27,15 @@ def model(x, jacobian):
 def valley(**bounds):
     everywhere = np.ones(SHAPE, bool)
     seen = model(MODE, False)[0] + SIGMA * RNG.uniform(-2, 2, SHAPE)
-    data = Data(
+    data = FitImages(
         seen, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15)
     )
-    free = Prior.none(MODE)
-    return Valley(
+    free = GaussianPrior.none(MODE)
+    return LocalMode(
         model,
         data,
         MODE,
-        Prior(free.mean, free.sigma, bounds.get("low", free.low), free.high),
+        GaussianPrior(free.mean, free.sigma, bounds.get("low", free.low), free.high),
     )
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy import optimize
 
 from characterize.inference import constrained, leastsquares
-from characterize.inference.constrained import Ball
-from characterize.inference.leastsquares import Data, Prior, Settings
+from characterize.inference.constrained import BallConstraint
+from characterize.inference.leastsquares import FitImages, GaussianPrior, SolverSettings
 
 FREE = np.full(4, np.inf)
 
@@ -27,7 +27,7 @@ def test_bounded_step_is_that_of_an_independent_solver():
     low, high = np.full(4, -0.4), np.array([0.3, 0.2, 0.5, 0.1])
     want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-12).x
     free = np.linalg.lstsq(jacobian, target, rcond=None)[0]
-    found = constrained.step(
+    found = constrained.constrained_step(
         jacobian.T @ jacobian,
         -jacobian.T @ target,
         np.zeros(4),
@@ -43,8 +43,8 @@ def test_bounded_step_is_that_of_an_independent_solver():
 
 def test_step_into_a_ball_of_equal_curvature_is_the_projection():
     goal = np.array([3.0, 4.0, 0.5, 0.0])
-    ball = Ball(np.array([0, 1]), 1.0)
-    found = constrained.step(
+    ball = BallConstraint(np.array([0, 1]), 1.0)
+    found = constrained.constrained_step(
         np.eye(4), -goal, np.zeros(4), low=-FREE, high=FREE, ball=ball, tolerance=1e-8
     )
     assert np.abs(found - [0.6, 0.8, 0.5, 0.0]).max() < 1e-6
@@ -55,7 +55,7 @@ def test_a_step_goes_as_far_as_the_ball():
     """Of numbers 0 and 2 alone, from inside and from the rim: outwards no farther,
     across its own way.
     """
-    ball = Ball(np.array([0, 2]), 1.5)
+    ball = BallConstraint(np.array([0, 2]), 1.5)
     x, step = np.array([0.4, 9.0, -0.7]), np.array([2.0, -3.0, -1.1])
     share = ball.share(x, step)
     assert 0 < share < 1
@@ -71,7 +71,7 @@ def test_a_step_goes_as_far_as_the_ball():
 def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():
     jacobian, target = problem(3)
     shape = (1, 5, 6)
-    data = Data(
+    data = FitImages(
         target.reshape(shape),
         np.ones(shape, bool),
         np.zeros(shape, bool),
@@ -85,9 +85,9 @@ def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():
         ) if wanted else None
 
     low, high = np.full(4, -0.3), np.full(4, 0.3)
-    prior = Prior(np.zeros(4), FREE, low, high)
-    settings = Settings(huber=1e9, bounded=True, iterations=5)
-    found = leastsquares.fit(
+    prior = GaussianPrior(np.zeros(4), FREE, low, high)
+    settings = SolverSettings(huber=1e9, bounded=True, iterations=5)
+    found = leastsquares.fit_levenberg_marquardt(
         model, data, np.zeros(4), prior=prior, settings=settings
     ).value
     want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-12).x
@@ -97,7 +97,7 @@ def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():
 
 
 def test_limits_that_leave_no_room_give_no_step():
-    found = constrained.step(
+    found = constrained.constrained_step(
         np.eye(4), np.ones(4), np.zeros(4), low=np.zeros(4), high=np.zeros(4)
     )
     assert not found.any()
@@ -115,7 +115,7 @@ def test_a_step_is_found_to_a_share_of_sigma_however_long_it_is(far):
         far * np.array([0.3, 0.2, 0.5, 0.1]),
     )
     want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-14).x
-    found = constrained.step(
+    found = constrained.constrained_step(
         jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high
     )
     sigma = 1 / np.sqrt(np.diag(jacobian.T @ jacobian))
@@ -133,7 +133,7 @@ def test_derivatives_of_the_ball_are_differences():
         np.array([2.3, 0.7, 4.1]),
         np.array([0.9, -0.4, 1.7]),
     )
-    excess = constrained._limit(Ball(np.array([0, 2]), 1.3), x, size)
+    excess = constrained._limit(BallConstraint(np.array([0, 2]), 1.3), x, size)
     slope, h = np.full(3, 9.0), 1e-3
     value = excess(s, slope)
     assert value == pytest.approx(

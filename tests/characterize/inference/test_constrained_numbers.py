@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from characterize.inference import constrained
-from characterize.inference.constrained import Ball, Led
+from characterize.inference.constrained import BallConstraint, ProfiledQuadratic
 
 
 def drawn(seed, p, *, far=1.0):
@@ -48,7 +48,7 @@ def test_a_step_from_beside_the_middle_is_that_of_an_independent_solver_in_any_u
         on = np.isclose(x + want, low, rtol=1e-12) | np.isclose(
             x + want, high, rtol=1e-12
         )
-        found = constrained.step(
+        found = constrained.constrained_step(
             columns.T @ columns,
             -columns.T @ target,
             x,
@@ -72,7 +72,7 @@ def test_25_parameters_step_to_a_thousandth_of_sigma_however_far_apart_the_bound
     for seed in range(4):
         columns, target, x, low, high = drawn(seed, 25, far=far)
         want = independent(columns, target, low - x, high - x)
-        found = constrained.step(
+        found = constrained.constrained_step(
             columns.T @ columns, -columns.T @ target, x, low=low, high=high
         )
         own = np.sqrt((columns**2).sum(0))
@@ -90,7 +90,7 @@ def test_a_place_that_rounding_put_beyond_its_bound_steps_along_it(side):
     x = np.array([np.nextafter(0.7, 1.0), 0.2])
     goal = np.array([3.0, 2.0])
     low, high = (-np.full(2, 9.0), wall) if side > 0 else (-wall, np.full(2, 9.0))
-    found = constrained.step(
+    found = constrained.constrained_step(
         np.eye(2), -side * (goal - x), side * x, low=low, high=high, tolerance=1e-8
     )
     assert side * x + found == pytest.approx(side * np.array([0.7, 2.0]), abs=1e-6)
@@ -122,12 +122,12 @@ def test_a_step_onto_a_ball_solves_the_equation_of_lagrange(seed):
     """
     rng = np.random.default_rng([seed, 8])
     columns = rng.standard_normal((9, 4)) * np.array([0.2, 3.0, 0.7, 40.0])
-    curvature, ball = columns.T @ columns, Ball(np.array([0, 2]), 1.3)
+    curvature, ball = columns.T @ columns, BallConstraint(np.array([0, 2]), 1.3)
     x, goal = np.array([0.4, -5.0, -0.6, 2.0]), np.array([4.0, 1.0, 2.5, 2.2])
     gradient = curvature @ (x - goal)
     assert not ball.inside(goal)
     wide = np.full(4, np.inf)
-    found = constrained.step(
+    found = constrained.constrained_step(
         curvature, gradient, x, low=-wide, high=wide, ball=ball, tolerance=1e-9
     )
     own = np.sqrt(np.diag(curvature))
@@ -135,10 +135,10 @@ def test_a_step_onto_a_ball_solves_the_equation_of_lagrange(seed):
         lagrange(curvature, gradient, x, ball) * own, abs=1e-5
     )
     assert np.linalg.norm((x + found)[[0, 2]]) == pytest.approx(1.3, rel=1e-6)
-    wider = Ball(
+    wider = BallConstraint(
         ball.index, float(np.linalg.norm(goal[[0, 2]])) + 0.01
     )  # the free least lies inside
-    found = constrained.step(
+    found = constrained.constrained_step(
         curvature, gradient, x, low=-wide, high=wide, ball=wider, tolerance=1e-9
     )
     assert found * own == pytest.approx((goal - x) * own, abs=1e-5)
@@ -147,10 +147,10 @@ def test_a_step_onto_a_ball_solves_the_equation_of_lagrange(seed):
 def test_a_ball_and_a_bound_hold_at_once():
     """|s - (3, 4, 5)|² inside |(s₀, s₁)| = 2, s₁ at most 1.2 and s₂ at most 0.5: s₀ = √(4 - 1.44) = 1.6."""
     goal, far = np.array([3.0, 4.0, 5.0]), np.full(3, 99.0)
-    ball = Ball(np.array([0, 1]), 2.0)
+    ball = BallConstraint(np.array([0, 1]), 2.0)
     high = np.array([99.0, 1.2, 0.5])
     x = np.array([0.3, 0.9, -1.0])
-    found = constrained.step(
+    found = constrained.constrained_step(
         np.eye(3), x - goal, x, low=-far, high=high, ball=ball, tolerance=1e-9
     )
     assert x + found == pytest.approx([1.6, 1.2, 0.5], abs=1e-6)
@@ -159,7 +159,7 @@ def test_a_ball_and_a_bound_hold_at_once():
 @pytest.mark.parametrize("radius", [0.3, 50.0])
 def test_a_ball_holds_to_a_thousand_millionth_of_its_radius(radius):
     """Direction (0.6, 0.8) of numbers 2 and 0; the one between counts for nothing."""
-    ball = Ball(np.array([2, 0]), radius)
+    ball = BallConstraint(np.array([2, 0]), radius)
 
     def at(share):
         return np.array([0.8 * radius * share, 1e9, 0.6 * radius * share])
@@ -173,7 +173,7 @@ def test_nothing_to_gain_is_no_step():
     """At the least itself, in the middle of the bounds."""
     far = np.array([3.0, 7.0])
     curvature = np.array([[2.0, 0.4], [0.4, 5.0]])
-    assert not constrained.step(
+    assert not constrained.constrained_step(
         curvature, np.zeros(2), np.array([1.0, 2.0]), low=-far, high=far
     ).any()
 
@@ -183,7 +183,7 @@ CURVATURE, GRADIENT = np.array([[4.0, 2.0], [2.0, 3.0]]), np.array([1.0, -2.0])
 
 def led(low=-9.0, high=9.0, i=0):
     """4t² + 4tu + 3u² + 2t - 4u, t led and u between bounds."""
-    return Led(
+    return ProfiledQuadratic(
         CURVATURE, GRADIENT, i, low=np.array([-9.0, low]), high=np.array([9.0, high])
     )
 

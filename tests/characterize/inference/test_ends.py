@@ -14,9 +14,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import ends, explore, posterior, search, verdict
-from characterize.inference.leastsquares import Data, Prior, Settings, fit
-from characterize.inference.posterior import REACH, Valley
-from characterize.model import PARAMETERS, PLACE, Known
+from characterize.inference.leastsquares import (
+    FitImages,
+    GaussianPrior,
+    SolverSettings,
+    fit_levenberg_marquardt,
+)
+from characterize.inference.posterior import REACH, LocalMode
+from characterize.model import PARAMETERS, PLACE, KnownValue
 from tests.referees.one_profile import profile
 
 RNG = np.random.default_rng(21)
@@ -28,7 +33,7 @@ NOISE = 0.7
 
 def seen(images):
     everywhere = np.ones(images.shape, bool)
-    return Data(
+    return FitImages(
         images,
         everywhere,
         ~everywhere,
@@ -59,10 +64,10 @@ def test_ends_of_a_bent_valley_are_those_of_what_is_straight_in_the_data(top):
     middle = math.exp(1.5)
     assert 0.5 < reach / middle < 0.7  # ends far from alike
     low, high = math.log(middle - reach), math.log(middle + reach)
-    prior = Prior(
+    prior = GaussianPrior(
         np.zeros(2), np.full(2, np.inf), np.array([-9.0, -99.0]), np.array([top, 99.0])
     )
-    found, better = profile(Valley(bent, data, truth, prior), 0)
+    found, better = profile(LocalMode(bent, data, truth, prior), 0)
     assert better is None
     assert not found.parabolic
     # a search ends within 0.08 of the root of the rise, 4 % of it, and goes the rest by
@@ -93,9 +98,11 @@ def test_ends_on_a_flat_tail_are_not_where_a_quarter_of_a_sigma_is_left(slope):
         ) if jacobian else None
 
     mode, want = np.array([0.0, 0.7]), math.expm1(REACH * NOISE / slope)
-    prior = Prior(mode, np.full(2, np.inf), np.array([-0.95, -99.0]), np.full(2, 1e9))
-    valley = Valley(flat, seen(flat(mode, False)[0]), mode, prior)
-    found = ends.end(
+    prior = GaussianPrior(
+        mode, np.full(2, np.inf), np.array([-0.95, -99.0]), np.full(2, 1e9)
+    )
+    valley = LocalMode(flat, seen(flat(mode, False)[0]), mode, prior)
+    found = ends.find_limit(
         valley, 0, 1, REACH, most=2 * REACH * float(valley.sigma[0])
     )  # no farther a step than a search
     assert found.place == pytest.approx(want, rel=0.03)
@@ -111,16 +118,19 @@ def test_without_an_end_in_time_it_is_the_farthest_place_that_was_tried(share, s
     def straight(x, jacobian):
         return np.tensordot(x, SHAPES, 1), SHAPES if jacobian else None
 
-    valley = Valley(
-        straight, seen(straight(truth, False)[0]), truth, Prior.none(np.zeros(2))
+    valley = LocalMode(
+        straight,
+        seen(straight(truth, False)[0]),
+        truth,
+        GaussianPrior.none(np.zeros(2)),
     )
     sigma = float(valley.sigma[0])
     for begin, way in ((None, 0.0), (truth + sign * 0.3 * valley.along(0), 0.3)):
-        found = ends.end(valley, 0, sign, REACH, begin=begin, most=share * sigma)
+        found = ends.find_limit(valley, 0, sign, REACH, begin=begin, most=share * sigma)
         assert (found.place - truth[0]) / sigma == pytest.approx(
             sign * min(way + 40 * share, REACH), rel=1e-6
         )
-    whole = ends.end(valley, 0, sign, REACH, most=0.5 * sigma)
+    whole = ends.find_limit(valley, 0, sign, REACH, most=0.5 * sigma)
     assert (whole.place - truth[0]) / sigma == pytest.approx(sign * REACH, rel=1e-6)
 
 
@@ -136,8 +146,10 @@ def test_steps_to_and_fro_give_the_farthest_place_that_holds(sign):
             x[0] != truth[0]
         ), SHAPES if jacobian else None
 
-    valley = Valley(torn, seen(torn(truth, False)[0]), truth, Prior.none(np.zeros(2)))
-    assert ends.end(valley, 0, sign, REACH).place == truth[0]
+    valley = LocalMode(
+        torn, seen(torn(truth, False)[0]), truth, GaussianPrior.none(np.zeros(2))
+    )
+    assert ends.find_limit(valley, 0, sign, REACH).place == truth[0]
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -153,11 +165,11 @@ def test_an_end_that_others_have_passed_is_given_up_and_one_beyond_them_is_not(s
         return bent(x, jacobian)
 
     def ended(reached):
-        valley = Valley(
-            counted, seen(bent(truth, False)[0]), truth, Prior.none(np.zeros(2))
+        valley = LocalMode(
+            counted, seen(bent(truth, False)[0]), truth, GaussianPrior.none(np.zeros(2))
         )
         asked.clear()
-        return ends.end(valley, 0, sign, REACH, beyond=reached), len(asked)
+        return ends.find_limit(valley, 0, sign, REACH, beyond=reached), len(asked)
 
     whole, images = ended(-math.inf)
     way = abs(whole.place - 1.5)
@@ -173,11 +185,11 @@ def test_along_a_valley_the_rest_goes_with_the_covariance():
     """One sigma of the first parameter moves it by sigma and raises the parabola by 1;
     nothing cheaper does.
     """
-    valley = Valley(
+    valley = LocalMode(
         bent,
         seen(bent(np.array([1.5, 0.6]), False)[0]),
         np.array([1.5, 0.6]),
-        Prior.none(np.zeros(2)),
+        GaussianPrior.none(np.zeros(2)),
     )
     for i in (0, 1):
         step = valley.along(i)
@@ -253,11 +265,11 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
         return lambda x, jacobian: (bright + x[0] * picture + x[1] * 100, None)
 
     monkeypatch.setattr(verdict.residual, "problem", problem)
-    monkeypatch.setattr(verdict, "between", lambda model: model)
+    monkeypatch.setattr(verdict, "models_between_depths", lambda model: model)
     monkeypatch.setattr(verdict, "_SHOWN", 4000)
     wide = np.full(2, np.inf)
     covariance = np.diag([0.09, 4.0])
-    prior = Prior(np.zeros(2), wide, -wide, wide)
+    prior = GaussianPrior(np.zeros(2), wide, -wide, wide)
     model = SimpleNamespace(quick=lambda: "quick")
     about = SimpleNamespace(
         model=model, names=("bias_nm", "background_e"), prior=prior, start=None
@@ -272,7 +284,9 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
     assert verdict.predicted_error(about, found) == pytest.approx(
         (want, want), rel=0.05
     )
-    about.prior = Prior(np.zeros(2), wide, np.array([0.7, -9.0]), np.array([0.7, 9.0]))
+    about.prior = GaussianPrior(
+        np.zeros(2), wide, np.array([0.7, -9.0]), np.array([0.7, 9.0])
+    )
     assert verdict.predicted_error(about, found) == pytest.approx((0, 0), abs=1e-12)
 
 
@@ -288,10 +302,10 @@ def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not
         40.0,
         90 * shape[1, 3, 1] + 4 * sigma[1, 3, 1],
     )  # brighter than it, or not yet
-    data = Data(image, usable, full, sigma**2, np.full(shape.shape, 1e15))
-    found = fit(
+    data = FitImages(image, usable, full, sigma**2, np.full(shape.shape, 1e15))
+    found = fit_levenberg_marquardt(
         lambda x, slopes: (x[0] * shape, shape[None] if slopes else None), data, np.array([80.0]),
-        settings=Settings(huber=3.0, step_tolerance=1e-9),
+        settings=SolverSettings(huber=3.0, step_tolerance=1e-9),
     )  # fmt: skip
     left = (image - found.value[0] * shape) / sigma
     weight = np.minimum(1, 3 / np.abs(left)) * usable
@@ -308,8 +322,8 @@ def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not
 def test_metrology_with_an_error_takes_the_place_of_what_is_usual():
     names = ("bias_nm", "height_nm", "distance_um", "background_e")
     known = {
-        "bias_nm": Known("bias_nm", 3.1, 0.7),
-        "height_nm": Known("height_nm", -4.2, 0.0),
+        "bias_nm": KnownValue("bias_nm", 3.1, 0.7),
+        "height_nm": KnownValue("height_nm", -4.2, 0.0),
     }
     got = search.prior_of(names, known, b.row(sensor_distance_um=1800.0))
     table = [PARAMETERS[PLACE[name]] for name in names]
@@ -333,8 +347,12 @@ def test_reversed_starts_turn_biases_beyond_their_sigma_and_take_the_rest_along(
     sigma = np.sqrt(np.diag(covariance))
     value = np.array([1.4 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
     wide = np.full(4, 1e9)
-    about = SimpleNamespace(names=names, prior=Prior(np.zeros(4), wide, -wide, wide))
-    got = search.reversals(about, SimpleNamespace(value=value, covariance=covariance))
+    about = SimpleNamespace(
+        names=names, prior=GaussianPrior(np.zeros(4), wide, -wide, wide)
+    )
+    got = search.bias_reversals(
+        about, SimpleNamespace(value=value, covariance=covariance)
+    )
     assert len(got) == 3  # all of the field, and each alone
     for start, some in zip(got, ([0, 2], [0], [2]), strict=True):
         rest = [i for i in range(4) if i not in some]
@@ -344,7 +362,7 @@ def test_reversed_starts_turn_biases_beyond_their_sigma_and_take_the_rest_along(
         assert start[some] == pytest.approx(-value[some])
         assert start[rest] == pytest.approx(value[rest] + gain @ (-2 * value[some]))
     value = np.array([0.9 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
-    both, one = search.reversals(
+    both, one = search.bias_reversals(
         about, SimpleNamespace(value=value, covariance=covariance)
     )
     assert both[[0, 2]] == pytest.approx(-value[[0, 2]])
@@ -371,7 +389,7 @@ def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
     class Believed:
         mode, bottom, least, above = np.zeros(2), np.zeros(3), 0.0, 0.0
         slopes = np.array([[1.0, 0.0], [-2.0, 2.0], [0.0, 0.0]])
-        prior = Prior(
+        prior = GaussianPrior(
             np.zeros(2), np.full(2, np.inf), np.array([1.19, -9.0]), np.full(2, 9.0)
         )
 
@@ -386,7 +404,7 @@ def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
                 else np.array([[2.2, 0.0], [1.22, 0.0], [0.0, 1.0]])
             )
 
-    found = ends.end(Believed(), 0, 1, 1.96, begin=np.array([1.2, 0.1]))
+    found = ends.find_limit(Believed(), 0, 1, 1.96, begin=np.array([1.2, 0.1]))
     assert len(asked) == 2
     assert found.place == pytest.approx(1.96, rel=1e-6)
 
@@ -413,7 +431,7 @@ def test_slopes_that_missed_more_than_is_left_to_go_are_asked_for_anew(
             0.0,
             np.array([[1.0], [0.0]]),
         )
-        prior = Prior(
+        prior = GaussianPrior(
             np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0)
         )
 
@@ -425,7 +443,7 @@ def test_slopes_that_missed_more_than_is_left_to_go_are_asked_for_anew(
             return self.slopes
 
     length = math.hypot(1, missed)
-    found = ends.end(Torn(), 0, 1, length + left, most=1.0)
+    found = ends.find_limit(Torn(), 0, 1, length + left, most=1.0)
     assert found.place == pytest.approx(
         math.sqrt((length + left) ** 2 - missed**2), rel=1e-6
     )
@@ -440,7 +458,7 @@ def test_a_mode_begins_first_where_it_foretells_what_the_walk_does_and_begins_co
     A begin that reaches 0.09 sigma beyond the first one's end is not worth it."""
     valley, other = (SimpleNamespace(mode=np.array([1.0, at]), sigma=np.array([0.5, size]), above=above)
                      for at, size, above in ((2.0, 1.0, 0.0), (2.5, 2.0, 3.0)))  # fmt: skip
-    found = object.__new__(ends.Search)
+    found = object.__new__(ends.LimitSearch)
     found._valleys, found._level = {-1: valley, -2: other, 3: valley}, 4.0
     for reach, first in ((4.04, [(-1, 4.0)]), (4.06, []), (4.49, [(-2, 4.5)])):
         places = [(3, np.array([9.0, reach])), (5, np.array([9.0, 3.1]))]
@@ -476,8 +494,8 @@ def test_a_begin_is_tried_where_it_promises_more_or_none_before_was_found(
         tried.append(others)
         return SimpleNamespace(place=3.95, done=done or len(tried) > 1)
 
-    monkeypatch.setattr(ends, "end", reached)
-    found, place = object.__new__(ends.Search), np.array([9.0, 4.0])
+    monkeypatch.setattr(ends, "find_limit", reached)
+    found, place = object.__new__(ends.LimitSearch), np.array([9.0, 4.0])
     found._level, found._by, found._valleys = (
         4.0,
         place if walked else None,
@@ -499,7 +517,9 @@ class Steep:
     """
 
     mode, above, least = np.zeros(2), 0.0, 9.0
-    prior = Prior(np.zeros(2), np.full(2, np.inf), np.full(2, -9.0), np.full(2, 9.0))
+    prior = GaussianPrior(
+        np.zeros(2), np.full(2, np.inf), np.full(2, -9.0), np.full(2, 9.0)
+    )
 
     def __init__(self):
         self.images = 0
@@ -518,12 +538,12 @@ def test_an_end_that_steps_get_no_nearer_to_is_found_where_it_was_foretold():
     was foretold, it is sought.
     """
     valley, begin = Steep(), np.array([1.9, 0.8])
-    found = ends.end(valley, 0, 1, 1.96, begin=begin, promised=1.95)
+    found = ends.find_limit(valley, 0, 1, 1.96, begin=begin, promised=1.95)
     assert found.done
     assert found.place == pytest.approx(1.96, rel=0.05)
     assert found.place < 1.96  # on the way to a place beside the valley
     sought = Steep()
-    ends.end(sought, 0, 1, 1.96, begin=begin, promised=2.3)
+    ends.find_limit(sought, 0, 1, 1.96, begin=begin, promised=2.3)
     assert valley.images < 10 < sought.images
 
 
@@ -534,8 +554,12 @@ def test_a_step_outwards_is_as_long_as_asked_and_no_longer_than_its_limits(most,
     """r = (x, y - x): from (0, 0) as far as x = 5 with y along, five sigma; its length,
     or that of x, may be held.
     """
-    here = posterior.Spot(np.zeros(2), np.zeros(2), np.array([[1.0, 0.0], [-1.0, 1.0]]))
-    step, least, size = ends._outwards(here, 0, 1, 25.0, Prior.none(np.zeros(2)), most)
+    here = posterior.ResidualPoint(
+        np.zeros(2), np.zeros(2), np.array([[1.0, 0.0], [-1.0, 1.0]])
+    )
+    step, least, size = ends._outwards(
+        here, 0, 1, 25.0, GaussianPrior.none(np.zeros(2)), most
+    )
     assert step == pytest.approx([reach, reach])
     assert (least, size) == pytest.approx((0.0, 0.7 if most[1] < 1 else 5.0))
 
@@ -544,16 +568,16 @@ def test_two_ends_make_a_profile_whose_sides_are_not_confused():
     """By hand: points of both sides in order, about the mode; the high end was not
     found.
     """
-    low = ends.End(-1.9, [(-1.2, 2.6), (-0.4, 0.7)], [], steps=5)
-    high = ends.End(3.7, [(1.4, 1.1)], [], steps=2, done=False)
-    found = ends.joined([low, high], 0.3, 0.8, 2.5)
+    low = ends.ConfidenceLimit(-1.9, [(-1.2, 2.6), (-0.4, 0.7)], [], steps=5)
+    high = ends.ConfidenceLimit(3.7, [(1.4, 1.1)], [], steps=2, done=False)
+    found = ends.join_limits([low, high], 0.3, 0.8, 2.5)
     assert (found.low, found.high, found.found) == (-1.9, 3.7, (True, False))
     assert found.value.tolist() == [-1.2, -0.4, 0.3, 1.4]
     assert found.rise.tolist() == [2.6, 0.7, 0.0, 1.1]
     assert not found.parabolic  # 3.4 / 2 and 2.2 / 2 = 1.1
-    assert ends.plain(-1.9, 2.1, 0.3, 2.0)  # 0.9 and 1.1
-    assert not ends.plain(-1.9, 1.9, 0.3, 2.0)  # 0.8
-    assert not ends.plain(-2.1, 2.1, 0.3, 2.0)  # 1.2
+    assert ends.is_parabolic(-1.9, 2.1, 0.3, 2.0)  # 0.9 and 1.1
+    assert not ends.is_parabolic(-1.9, 1.9, 0.3, 2.0)  # 0.8
+    assert not ends.is_parabolic(-2.1, 2.1, 0.3, 2.0)  # 1.2
 
 
 def test_ends_met_at_once_have_the_curve_of_the_parabola():
@@ -561,10 +585,12 @@ def test_ends_met_at_once_have_the_curve_of_the_parabola():
     of one step.
     """
     met = [
-        ends.End(0.3 + side * 1.96 * 0.8, [(9.0, 9.0)], [], steps=1, done=side > 0)
+        ends.ConfidenceLimit(
+            0.3 + side * 1.96 * 0.8, [(9.0, 9.0)], [], steps=1, done=side > 0
+        )
         for side in (-1, 1)
     ]
-    found = ends.joined(met, 0.3, 0.8, 1.96)
+    found = ends.join_limits(met, 0.3, 0.8, 1.96)
     assert found.value == pytest.approx([-1.7, -1.268, -0.5, 0.3, 1.1, 1.868, 2.3])
     assert found.rise == pytest.approx(((found.value - 0.3) / 0.8) ** 2)
     assert found.parabolic

@@ -9,8 +9,8 @@ import pytest
 from scipy import optimize
 
 from characterize.inference import constrained, ends
-from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import REACH, Valley
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.inference.posterior import REACH, LocalMode
 
 ROUNDING = 1e-9
 COUNT = 4
@@ -58,14 +58,14 @@ def test_least_between_bounds_is_the_best_of_all_ways_to_hold_them(seed):
         0.07 if seed % 3 == 0 else low[seed % COUNT]
     )
     curvature, gradient = columns.T @ columns, -columns.T @ target
-    found = constrained.between(curvature, gradient, low, high)
+    found = constrained.bounded_quadratic_step(curvature, gradient, low, high)
     assert found == pytest.approx(enumerated(curvature, gradient, low, high), abs=1e-12)
     assert ((found >= low) & (found <= high)).all()
 
 
 def test_what_is_not_known_at_all_does_not_move():
     curvature = np.diag([2.0, 0.0, 1.0])
-    found = constrained.between(
+    found = constrained.bounded_quadratic_step(
         curvature,
         np.array([2.0, 0.0, -3.0]),
         np.full(3, -5.0),
@@ -81,7 +81,7 @@ def valley(seed):
     curvature, gradient = columns.T @ columns, -columns.T @ target
     mode = enumerated(curvature, gradient, low, high)
     everywhere = np.ones((1, 3, 4), bool)
-    data = Data(
+    data = FitImages(
         target.reshape(1, 3, 4),
         everywhere,
         ~everywhere,
@@ -94,7 +94,9 @@ def valley(seed):
             COUNT, 1, 3, 4
         ) if jacobian else None
 
-    return Valley(model, data, mode, Prior(np.zeros(COUNT), wide, low, high)), (
+    return LocalMode(
+        model, data, mode, GaussianPrior(np.zeros(COUNT), wide, low, high)
+    ), (
         curvature,
         gradient,
         low,
@@ -133,7 +135,7 @@ def test_ends_reach_as_far_as_the_best_way_to_hold_the_others_lets_them(seed):
             want = bound
             if far != about.mode[i] and above(far) > 0:
                 want = optimize.brentq(above, about.mode[i], far, xtol=1e-12)
-            found = ends.end(about, i, sign, REACH)
+            found = ends.find_limit(about, i, sign, REACH)
             assert found.lower is None
             assert found.place == pytest.approx(want, abs=1e-6 * about.sigma[i])
             for place, rise in found.seen:

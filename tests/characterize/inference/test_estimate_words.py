@@ -3,7 +3,7 @@
 import numpy as np
 
 from characterize.inference import arrange
-from characterize.inference.arrange import Arrangement
+from characterize.inference.arrange import FrameArrangement
 
 
 def told(**how):
@@ -15,7 +15,9 @@ def told(**how):
         "alike": (),
     }
     return arrange.laid_words(
-        Arrangement(0.0, 110.0, (0.0, 0.0), 0.9, np.array([2, 0, 1]), **about | how)
+        FrameArrangement(
+            0.0, 110.0, (0.0, 0.0), 0.9, np.array([2, 0, 1]), **about | how
+        )
     )
 
 

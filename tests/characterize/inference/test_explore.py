@@ -16,9 +16,9 @@ from characterize.inference import (
     residual,
     verdict,
 )
-from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.leastsquares import FitImages, GaussianPrior
 from characterize.model import MODES, PLACE, prior_rad
-from characterize.model.forward import Setting
+from characterize.model.forward import FrameSetting
 from characterize.model.parameters import NAMES
 
 REACH = 1.959964
@@ -35,7 +35,7 @@ class Straight:
 
     def __init__(self, bright, pictures, depth=DEPTH):
         self.bright, self.pictures = bright, pictures
-        self.setting = Setting(
+        self.setting = FrameSetting(
             depth,
             np.zeros((len(depth), 2)),
             np.ones(len(depth)),
@@ -62,7 +62,7 @@ class Straight:
 
 def task(model, data=None, names=NAMED):
     wide = np.full(len(names), np.inf)
-    prior = Prior(np.zeros(len(names)), wide, -wide, wide)
+    prior = GaussianPrior(np.zeros(len(names)), wide, -wide, wide)
     return SimpleNamespace(
         model=model, data=data, names=names, prior=prior, start=START
     )
@@ -115,7 +115,7 @@ def test_predicted_error_is_the_sine_between_the_images():
 
 def test_frames_in_between_lie_half_way_in_inverse_depth():
     model = Straight(np.ones((5, 2, 2)), np.ones((3, 5, 2, 2)))
-    got = verdict.between(model).setting.depth_um
+    got = verdict.models_between_depths(model).setting.depth_um
     rising = np.sort(DEPTH)
     middle = 2 / (1 / rising[1:] + 1 / rising[:-1])
     want = dict(zip(rising, [*middle, middle[-1]], strict=True))
@@ -138,7 +138,7 @@ def test_frames_left_out_are_judged_with_what_the_others_know():
     )
     frames[2, 1, 2] += 30 * sigma
     everywhere = np.ones(bright.shape, bool)
-    data = Data(
+    data = FitImages(
         frames,
         everywhere,
         ~everywhere,
@@ -195,7 +195,7 @@ def test_modes_of_a_phase_that_nobody_knows_take_information_away():
 
 def test_misfit_of_hidden_frames_is_capped_at_six_sigma():
     image = np.full((1, 2, 3), 40.0)
-    data = Data(
+    data = FitImages(
         image + np.array([[[1.0, -3.0, 80.0], [5.0, 7.0, 9.0]]]),
         np.array([[[True, True, True], [True, False, True]]]),
         np.array([[[False, False, False], [True, False, False]]]),
@@ -233,7 +233,7 @@ def test_profiles_and_draws_are_the_same_bytes_for_any_number_of_threads(
     everywhere = np.ones(seen.shape, bool)
     about = task(
         model,
-        Data(
+        FitImages(
             seen,
             everywhere,
             ~everywhere,
@@ -241,15 +241,17 @@ def test_profiles_and_draws_are_the_same_bytes_for_any_number_of_threads(
             np.full(seen.shape, 1e15),
         ),
     )
-    images = residual.problem(model, NAMED, START)
-    mode = leastsquares.fit(images, about.data, np.zeros(3), prior=about.prior)
+    images = residual.residual_phase_problem(model, NAMED, START)
+    mode = leastsquares.fit_levenberg_marquardt(
+        images, about.data, np.zeros(3), prior=about.prior
+    )
     before, found = torch.get_num_threads(), []
     for count in (1, 3):
-        one = posterior.Valley(images, about.data, mode.value, about.prior)
+        one = posterior.LocalMode(images, about.data, mode.value, about.prior)
         torch.set_num_threads(count)
         try:
             profiles, _ = explore._profiles(about, one, mode, {}, followed=False)
-            drawn = posterior.draws([one], 7)
+            drawn = posterior.draw_posterior([one], 7)
         finally:
             torch.set_num_threads(before)
         assert not profiles["bias_nm"].parabolic

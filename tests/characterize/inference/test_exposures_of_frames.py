@@ -13,13 +13,19 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.captures import clean
+from characterize.captures import to_electrons
 from characterize.inference import prepare, search
-from characterize.inference.search import Task, refine
-from characterize.model import PLACE, ForwardModel, Setting, background, vector
+from characterize.inference.search import SearchTask, refine_fit
+from characterize.model import (
+    PLACE,
+    ForwardModel,
+    FrameSetting,
+    background_planes,
+    parameter_vector,
+)
 
 DEPTHS, EXPOSURE = (420.0, 600.0, 1050.0), np.array([0.4, 1.0, 0.25])
-SETTING = Setting(np.array(DEPTHS), np.zeros((3, 2)), EXPOSURE, 1.5, 16, 16)
+SETTING = FrameSetting(np.array(DEPTHS), np.zeros((3, 2)), EXPOSURE, 1.5, 16, 16)
 PLANE = {"background_e": 60.0, "background_x_e": 9.0, "background_y_e": -14.0}
 
 
@@ -35,16 +41,18 @@ def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_su
     setting = dataclasses.replace(SETTING, dark_known=dark_known)
     model, x = (
         ForwardModel(b.lens(), setting, b.RESPONSE),
-        vector(PLANE | {"log_gain": 12.0}),
+        parameter_vector(PLANE | {"log_gain": 12.0}),
     )
-    assert background(x, setting)[:, 3, 11] == pytest.approx(
+    assert background_planes(x, setting)[:, 3, 11] == pytest.approx(
         glow * (60 + 9 * 7 / 16 + 14 * 9 / 16)
     )
     slopes = model.images(x, list(PLANE))[1]
     for name, slope in zip(PLANE, slopes, strict=True):
         step = np.zeros_like(x)
         step[PLACE[name]] = 2.0
-        told = (background(x + step, setting) - background(x - step, setting)) / 4
+        told = (
+            background_planes(x + step, setting) - background_planes(x - step, setting)
+        ) / 4
         assert slope == pytest.approx(told, abs=1e-9)
 
 
@@ -52,11 +60,11 @@ def shot(model):
     """(x, data): 6000 electrons at the peak of the longest exposure, each frame by its
     own, shot and read noise.
     """
-    x = vector(b.VALUES | PLANE | {"log_gain": 1.0})
+    x = parameter_vector(b.VALUES | PLANE | {"log_gain": 1.0})
     longest = dataclasses.replace(model.setting, exposure=np.ones(3))
-    light = ForwardModel(b.lens(), longest, b.RESPONSE).images(x)[0] - background(
-        x, longest
-    )
+    light = ForwardModel(b.lens(), longest, b.RESPONSE).images(x)[
+        0
+    ] - background_planes(x, longest)
     scale = 6000 / light.max()
     y, across = ((np.arange(16) - 7.5) / 8 for _ in range(2))
     electrons = EXPOSURE[:, None, None] * (
@@ -82,12 +90,12 @@ def test_a_fit_of_them_explains_the_frames_and_begins_at_their_background():
     model = ForwardModel(b.lens(), SETTING, b.RESPONSE)
     x, data = shot(model)
     found = SimpleNamespace(shift_px=np.zeros(2), stage_zero_um=0.0, distance_um=0.0)
-    task = Task(model, data, x, {}, found)
-    first = search.starts(task, biases_nm=(0.0,))[0]
+    task = SearchTask(model, data, x, {}, found)
+    first = search.starting_points(task, biases_nm=(0.0,))[0]
     assert first[PLACE["background_e"]] == pytest.approx(
         60, abs=12
     )  # a median: the blur's rim is in it
-    end = refine(task, x[[PLACE[name] for name in task.names]])
+    end = refine_fit(task, x[[PLACE[name] for name in task.names]])
     assert end.chi2_per_dof == pytest.approx(1, abs=0.2)
     for name, value in PLANE.items():
         i = task.names.index(name)
@@ -104,11 +112,11 @@ def test_exposures_of_one_depth_are_not_made_one_where_nobody_says_what_is_count
     )  # fmt: skip
     blind = dataclasses.replace(twice, about={"gain_e": 2.0})
     for capture, count, known in ((twice, 5, True), (blind, 10, False)):
-        after, merged = prepare.merged(capture, clean(capture))
+        after, merged = prepare.merge_exposures(capture, to_electrons(capture))
         assert len(after.frames) == len(merged.electrons) == count
         assert any("fitted one by one" in words for words in merged.corrections) == (
             not known
         )
         assert prepare.setting_of(after, 16)[0].dark_known == known
     alike = dataclasses.replace(blind, exposure_s=np.full(10, 2.0))
-    assert len(prepare.merged(alike, clean(alike))[0].frames) == 5
+    assert len(prepare.merge_exposures(alike, to_electrons(alike))[0].frames) == 5

@@ -14,7 +14,7 @@ import bench_lens as b
 from pictured import Pictured
 
 from characterize.inference import explore, leastsquares, search
-from characterize.inference.leastsquares import Prior
+from characterize.inference.leastsquares import GaussianPrior
 from characterize.model import PLACE
 
 NAMED = ("bias_nm", "bias_x_nm", "bias_y_nm", "bias_r_nm", "background_e")
@@ -36,7 +36,7 @@ SIGMA, WIDE = (
     np.array([15.0, 6.0, 6.0, 6.0, np.inf]),
     np.array([26.0, 20.0, 20.0, 20.0, 99.0]),
 )
-PRIOR = Prior(np.zeros(5), SIGMA, -WIDE, WIDE)
+PRIOR = GaussianPrior(np.zeros(5), SIGMA, -WIDE, WIDE)
 
 
 def products(field):
@@ -92,10 +92,10 @@ def test_a_field_of_bias_and_its_reverse_are_both_found_from_either_or_another_v
     seen = products(truth)[0] + NOISE * rng.standard_normal(7)
     frames = BRIGHT + np.tensordot(np.append(seen, 1.3), PICTURES, 1)
     about = b.given(Field(), frames, NOISE, NAMED, PRIOR)
-    mode = leastsquares.fit(
+    mode = leastsquares.fit_levenberg_marquardt(
         about.problem(), about.data, np.append(truth, 1.3), prior=PRIOR
     )
-    found = explore.explore(about, search.mirrored(about, [mode]))
+    found = explore.explore_posterior(about, search.add_mirrored_starts(about, [mode]))
     begins = rng.uniform(-0.9, 0.9, (24, 4)) * np.minimum(WIDE[:4], 12.0)
     best = min((least(seen, begin) for begin in begins), key=lambda one: one[0])
     reached = least(seen, found.best.value[:4])[0]

@@ -16,14 +16,14 @@ import bench_lens as b
 
 import characterize
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
-from characterize.inference.estimate import Options
-from characterize.model.parameters import Known
+from characterize.bench.bench import BenchCamera, HiddenLens
+from characterize.inference.estimate import FitOptions
+from characterize.model.parameters import KnownValue
 from metalens import design, profiles
 from metalens.cell.record import Cell
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 
-USUAL = Options(scan_um=60.0)
+USUAL = FitOptions(scan_um=60.0)
 
 
 def fit(shots, strength_rad=0.0, options=USUAL):
@@ -74,9 +74,11 @@ def test_opposite_astigmatism_is_not_mistaken_for_the_true_one(wave):
         "height_nm": -2.5,
         "crosstalk_px": 0.2,
     }
-    known = tuple(Known(name, value) for name, value in values.items())
-    truth = Truth(depths, parameter=known, camera=Camera(pixel_um=1.5, pixels=12))
-    light = bench.irradiance(b.lens(), truth, b.RESPONSE)
+    known = tuple(KnownValue(name, value) for name, value in values.items())
+    truth = HiddenLens(
+        depths, parameter=known, camera=BenchCamera(pixel_um=1.5, pixels=12)
+    )
+    light = bench.bench_irradiance(b.lens(), truth, b.RESPONSE)
     shots = b.capture(np.concatenate([light, light[:1]]) * (4000 / light.max()))
     n = len(depths)
     shots = dataclasses.replace(
@@ -134,7 +136,9 @@ def test_reversed_order_is_recovered():
     ],
 )
 def test_stage_errors_are_found(name, value):
-    found = fit(b.capture(b.electrons(**{name: value})), options=Options(scan_um=100.0))
+    found = fit(
+        b.capture(b.electrons(**{name: value})), options=FitOptions(scan_um=100.0)
+    )
     assert right(found, **{name: value})
 
 
@@ -156,10 +160,12 @@ def far_lens(twist=False):
 
 def far_shots(twist=False, **more):
     values = b.VALUES | {"stage_zero_um": 0.0, "background_x_e": 0.0} | more
-    known = tuple(Known(name, value) for name, value in values.items())
-    truth = Truth(FAR, parameter=known, camera=Camera(pixel_um=3.0, pixels=24))
-    light = bench.irradiance(far_lens(twist), truth, b.RESPONSE)
-    shots = b.capture(light * (6000 / light.max()) + bench.background(truth))
+    known = tuple(KnownValue(name, value) for name, value in values.items())
+    truth = HiddenLens(
+        FAR, parameter=known, camera=BenchCamera(pixel_um=3.0, pixels=24)
+    )
+    light = bench.bench_irradiance(far_lens(twist), truth, b.RESPONSE)
+    shots = b.capture(light * (6000 / light.max()) + bench.background_plane(truth))
     return dataclasses.replace(shots, position_um=np.array(FAR), pixel_um=3.0)
 
 

@@ -12,9 +12,9 @@ import bench_lens as b
 
 from characterize.bench import bench
 from characterize.inference import search
-from characterize.inference.arrange import Arrangement
-from characterize.inference.leastsquares import Data
-from characterize.model import ForwardModel, Known, Setting, vector
+from characterize.inference.arrange import FrameArrangement
+from characterize.inference.leastsquares import FitImages
+from characterize.model import ForwardModel, FrameSetting, KnownValue, parameter_vector
 
 DEPTHS, PLACE_UM = (420.0, 600.0, 980.0), (1.05, -1.2)
 FREE = {
@@ -33,28 +33,35 @@ def task():
     and 0.8 pixels off; windows are
     held where it is not."""
     known = (
-        *(Known(f"decentre_{a}_um", v) for a, v in zip("xy", PLACE_UM, strict=True)),
-        Known("coma_x_rad", 0.13),
+        *(
+            KnownValue(f"decentre_{a}_um", v)
+            for a, v in zip("xy", PLACE_UM, strict=True)
+        ),
+        KnownValue("coma_x_rad", 0.13),
     )
-    truth = bench.Truth(
+    truth = bench.HiddenLens(
         DEPTHS,
         peak_e=6e4,
         parameter=known,
-        camera=bench.Camera(pixel_um=1.5, pixels=16),
+        camera=bench.BenchCamera(pixel_um=1.5, pixels=16),
     )
-    light = bench.irradiance(b.lens(8.0), truth, b.RESPONSE)
+    light = bench.bench_irradiance(b.lens(8.0), truth, b.RESPONSE)
     light = light * (6e4 / light.max())
     seen = np.ones(light.shape, bool)
-    data = Data(light, seen, ~seen, np.full(light.shape, 9.0), np.ones(light.shape))
-    setting = Setting(np.array(DEPTHS), np.zeros((3, 2)), np.ones(3), 1.5, 16, 16)
+    data = FitImages(
+        light, seen, ~seen, np.full(light.shape, 9.0), np.ones(light.shape)
+    )
+    setting = FrameSetting(np.array(DEPTHS), np.zeros((3, 2)), np.ones(3), 1.5, 16, 16)
     held = {
-        p.name: Known(p.name, p.start) for p in search.PARAMETERS if p.name not in FREE
+        p.name: KnownValue(p.name, p.start)
+        for p in search.PARAMETERS
+        if p.name not in FREE
     }
-    start = vector(
+    start = parameter_vector(
         {"crosstalk_px": float(truth.vector()[search.PLACE["crosstalk_px"]])}
     )
-    found = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
-    return search.Task(
+    found = FrameArrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
+    return search.SearchTask(
         ForwardModel(b.lens(8.0), setting, b.RESPONSE), data, start, held, found
     )
 
@@ -66,13 +73,13 @@ def test_a_fit_whose_windows_were_held_off_its_decentre_is_put_there_and_finds_n
     is missed, 0.03 rad at 7 um
     from the middle, passes for 2e-3 rad, and for 0.01 um of decentre."""
     begun = task()
-    first = search.refine(
+    first = search.refine_fit(
         begun,
-        search.starts(begun, biases_nm=(0.0,))[0][
+        search.starting_points(begun, biases_nm=(0.0,))[0][
             [search.PLACE[n] for n in begun.names]
         ],
     )
-    there, ends = search.placed(begun, [first])
+    there, ends = search.place_windows(begun, [first])
     trefoil = [i for i, name in enumerate(there.names) if name.startswith("trefoil")]
     assert there.model.grid.middle_um == pytest.approx(PLACE_UM, abs=0.03)
     assert (
@@ -86,7 +93,7 @@ def test_a_fit_whose_windows_were_held_off_its_decentre_is_put_there_and_finds_n
     near = dataclasses.replace(
         there, model=there.model.about((PLACE_UM[0] + 0.13, PLACE_UM[1] - 0.13))
     )
-    kept, same = search.placed(near, ends)
+    kept, same = search.place_windows(near, ends)
     assert kept is near  # within a tenth of a pixel
     assert same is ends
 
@@ -97,9 +104,9 @@ def test_most_of_the_way_to_the_best_is_gone_by_the_quick_model():
     """
     begun = task()
     begun = dataclasses.replace(begun, model=begun.model.about(PLACE_UM))
-    best = search.refine(
+    best = search.refine_fit(
         begun,
-        search.starts(begun, biases_nm=(0.0,))[0][
+        search.starting_points(begun, biases_nm=(0.0,))[0][
             [search.PLACE[n] for n in begun.names]
         ],
     )

@@ -21,7 +21,7 @@ def test_the_density_of_a_parabola_is_a_normal_distribution_also_beyond_its_ends
     curve = np.stack([value, ((value - 1.3) / 0.7) ** 2])[:, order]
     at = np.array([[-6.2, 0.5, 1.3], [1.9, 4.4, 7.3]])
     want = np.exp(-(((at - 1.3) / 0.7) ** 2) / 2) / (0.7 * math.sqrt(2 * math.pi))
-    assert knowable.density(curve, at) == pytest.approx(
+    assert knowable.profile_density(curve, at) == pytest.approx(
         want, rel=2e-4
     )  # 2001 points over 16 sigma: h² / 12 of 1
 
@@ -36,19 +36,19 @@ def test_a_valley_that_is_steeper_to_one_side_has_two_halves_of_normal_distribut
     )
     at = np.array([-2.0, -1.0, -0.25, 0.0, 1.0, 3.0, 5.0])
     root = np.where(at < 0, at / 0.5, at / 2.0)
-    assert knowable.density(curve, at) == pytest.approx(
+    assert knowable.profile_density(curve, at) == pytest.approx(
         np.exp(-(root**2) / 2) / whole, rel=1e-4
     )
     below = np.array([[-1.5, 0.0, 4.0], [9.0, -1e-9, 4.0]])  # rounding of the least
-    assert knowable.density(below, at) == pytest.approx(
-        knowable.density(curve, at), rel=1e-9
+    assert knowable.profile_density(below, at) == pytest.approx(
+        knowable.profile_density(curve, at), rel=1e-9
     )
 
 
 def test_the_slope_beyond_an_end_is_that_of_the_last_two_points():
     """Roots -4, -1, 0, 3, 4 at -3, -1, 0, 1, 3: 1.5 and 0.5 a unit beyond."""
     curve = np.array([[-3.0, -1.0, 0.0, 1.0, 3.0], [16.0, 1.0, 0.0, 9.0, 16.0]])
-    found = knowable.density(curve, np.array([-3.0, -3.4, 3.0, 3.8]))
+    found = knowable.profile_density(curve, np.array([-3.0, -3.4, 3.0, 3.8]))
     assert found[1] / found[0] == pytest.approx(math.exp((16.0 - 4.6**2) / 2), rel=1e-9)
     assert found[3] / found[2] == pytest.approx(math.exp((16.0 - 4.4**2) / 2), rel=1e-9)
 
@@ -56,7 +56,7 @@ def test_the_slope_beyond_an_end_is_that_of_the_last_two_points():
 def words(first, second, size, prior=np.inf):
     sigma = np.array([0.3, 2.0])
     covariance = np.array([[1, size], [size, 1.0]]) * np.outer(sigma, sigma)
-    return knowable.degeneracies((first, second), covariance, np.full(2, prior))
+    return knowable.correlated_pairs((first, second), covariance, np.full(2, prior))
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,9 @@ def test_pairs_go_together_beyond_nine_tenths(size, told):
 
 @pytest.mark.parametrize(("prior", "told"), [(2.0 / 0.79, 0), (2.0 / 0.81, 1)])
 def test_a_parameter_comes_from_its_prior_where_four_fifths_of_it_are_left(prior, told):
-    found = knowable.degeneracies(("bias_nm",), np.array([[4.0]]), np.array([prior]))
+    found = knowable.correlated_pairs(
+        ("bias_nm",), np.array([[4.0]]), np.array([prior])
+    )
     assert (
         found
         == [
@@ -104,13 +106,15 @@ def test_a_parameter_comes_from_its_prior_where_four_fifths_of_it_are_left(prior
 def test_the_tightest_pair_comes_first_and_units_are_those_of_the_parameters():
     names = ("bias_nm", "height_nm", "index")
     correlation = np.array([[1, 0.92, 0.9], [0.92, 1, 0.97], [0.9, 0.97, 1.0]])
-    found = knowable.degeneracies(names, correlation, np.full(3, np.inf))
+    found = knowable.correlated_pairs(names, correlation, np.full(3, np.inf))
     assert [line.split(" go together")[0] for line in found] == [
         "height_nm and index",
         "bias_nm and height_nm",
     ]
     scale = np.array([PARAMETERS[PLACE[name]].scale for name in names])
-    values, vectors = knowable.directions(names, np.diag([3.0, -1e-12, 7.0]) / scale**2)
+    values, vectors = knowable.information_eigenvectors(
+        names, np.diag([3.0, -1e-12, 7.0]) / scale**2
+    )
     assert values == pytest.approx(
         [0.0, 3.0, 7.0], abs=1e-11
     )  # what is negative is rounding

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.captures import Gain
+from characterize.captures import SensorNoise
 from characterize.inference import arrange, leastsquares, residual, verdict
-from characterize.inference.arrange import Arrangement, _Frames
-from characterize.inference.leastsquares import Data, Prior
-from characterize.model import vector
+from characterize.inference.arrange import FrameArrangement, _Frames
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.model import parameter_vector
 
 RNG = np.random.default_rng(34)
 DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3, 35e3, 20e3])
@@ -28,13 +28,13 @@ DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3, 35e3, 20e3])
 )
 def test_an_orientation_is_named_as_it_is_done(orientation, words, mirrored, quarters):
     """Left and right first, then quarter turns."""
-    found = Arrangement(
+    found = FrameArrangement(
         0, 0, (0, 0), 1, np.arange(3), False, True, orientation, True, ()
     )
     assert found.words == words
     frame = np.arange(6.0).reshape(2, 3)
     made = np.rot90(frame[:, ::-1] if mirrored else frame, quarters)
-    assert np.array_equal(arrange.turn(frame, orientation), made)
+    assert np.array_equal(arrange.orient_frames(frame, orientation), made)
 
 
 def spot(width):
@@ -54,7 +54,9 @@ def test_a_stack_end_to_end_is_worth_a_twentieth_less_than_one_as_stated(
     monkeypatch.setattr(arrange, "_expected", lambda model, x, clipped: (stack, aside))
     seen = 5.3 * (stack[::-1] if turned else stack)
     frames = _Frames(None, None, seen, np.zeros(4), np.zeros(4), np.arange(4)[::-1])
-    assert frames.scanned(vector(), np.zeros(1))[1] == pytest.approx(want, abs=1e-6)
+    assert frames.scanned(parameter_vector(), np.zeros(1))[1] == pytest.approx(
+        want, abs=1e-6
+    )
 
 
 def test_every_second_depth_is_left_out_and_then_the_others(monkeypatch):
@@ -63,7 +65,7 @@ def test_every_second_depth_is_left_out_and_then_the_others(monkeypatch):
     """
     n, seen = len(DEPTH), []
     everywhere = np.ones((n, 3, 4), bool)
-    data = Data(
+    data = FitImages(
         DEPTH[:, None, None] * everywhere,
         everywhere,
         ~everywhere,
@@ -81,17 +83,19 @@ def test_every_second_depth_is_left_out_and_then_the_others(monkeypatch):
 
     hidden = []
     monkeypatch.setattr(
-        residual, "problem", lambda here, names, base: here.setting.depth_um
+        residual,
+        "residual_phase_problem",
+        lambda here, names, base: here.setting.depth_um,
     )
-    monkeypatch.setattr(leastsquares, "fit", fit)
+    monkeypatch.setattr(leastsquares, "fit_levenberg_marquardt", fit)
     monkeypatch.setattr(
         residual,
         "_misfit",
         lambda images, rest, x: hidden.append((rest.electrons[:, 0, 0], images)) or 9.0,
     )
-    known = Prior.none(np.zeros(2))
+    known = GaussianPrior.none(np.zeros(2))
     assert (
-        residual.attempt(
+        residual.fit_residual_phase(
             model,
             data,
             ("bias_nm", "height_nm"),
@@ -126,7 +130,9 @@ def test_pixels_beyond_six_sigma_are_told_where_there_are_more_than_one_in_fifty
     rest.ravel()[: round(1000 * share)] = -away
     one = SimpleNamespace(converged=True, image=900 * np.eye(9)[None], residual_sigma=rest, chi2_per_dof=1.0,
                           value=np.zeros(2))  # fmt: skip
-    found = verdict.problems(("bias_nm", "coma_x_rad"), one, Gain(1.3, 0.01, 2.0))
+    found = verdict.fit_problems(
+        ("bias_nm", "coma_x_rad"), one, SensorNoise(1.3, 0.01, 2.0)
+    )
     assert [
         f"{share:.1%} of the pixels" in words for words in found if "sigma" in words
     ] == [True] * said

@@ -80,7 +80,7 @@ MIXED, CORNERS, HELD = (
 def test_least_is_where_it_was_put(p, shares, condition):
     for seed in range(12):
         *problem, answer, kinds = made(seed, p, condition, shares=shares)
-        found = constrained.between(*problem)
+        found = constrained.bounded_quadratic_step(*problem)
         assert_least(*problem, found)
         held = np.isin(kinds, (LOW, HIGH, SHUT))
         size = 1 / np.sqrt(np.diag(problem[0]))
@@ -99,8 +99,8 @@ def test_least_does_not_depend_on_units_nor_on_the_weight_of_all(seed):
     curvature, gradient, low, high, *_ = made(seed, 17, 1e8, shares=MIXED)
     unit = 2.0 ** np.random.default_rng(seed).integers(-9, 9, 17)
     weight = 4.0 ** (seed - 10)
-    want = constrained.between(curvature, gradient, low, high)
-    found = constrained.between(
+    want = constrained.bounded_quadratic_step(curvature, gradient, low, high)
+    found = constrained.bounded_quadratic_step(
         curvature * np.outer(unit, unit) * weight,
         gradient * unit * weight,
         low / unit,
@@ -116,7 +116,7 @@ def test_combinations_that_are_not_known_end_between_the_bounds_all_the_same(see
     """
     curvature, gradient, low, high, answer, _ = made(seed, 9, 1e3, shares=MIXED)
     twice = [np.tile(a, 2) for a in (gradient, low / 2, high / 2)]
-    found = constrained.between(np.tile(curvature, (2, 2)), *twice)
+    found = constrained.bounded_quadratic_step(np.tile(curvature, (2, 2)), *twice)
     assert_least(np.tile(curvature, (2, 2)), *twice, found)
     own = np.sqrt(np.diag(curvature))
     assert (np.abs(found[:9] + found[9:] - answer) * own).max() < 1e-9 * (
@@ -130,7 +130,7 @@ def test_a_start_with_all_held_that_would_leave_is_left_again():
     """
     curvature = np.array([[1.0, 0.9], [0.9, 1.0]])
     gradient = -curvature @ np.array([4.0, -3.0])
-    found = constrained.between(
+    found = constrained.bounded_quadratic_step(
         curvature, gradient, np.array([-9.0, -1.0]), np.array([0.5, 9.0])
     )
     assert found == pytest.approx([0.5, 0.15], abs=1e-12)  # y = -3 + 0.9 (4 - 0.5)

@@ -9,7 +9,13 @@ import pytest
 from scipy import special
 
 from characterize.inference import constrained, leastsquares
-from characterize.inference.leastsquares import Data, Prior, Settings, fit, invert
+from characterize.inference.leastsquares import (
+    FitImages,
+    GaussianPrior,
+    SolverSettings,
+    fit_levenberg_marquardt,
+    invert_information,
+)
 
 
 @pytest.mark.parametrize("huber", [6.0, 2.6])
@@ -28,7 +34,7 @@ def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
     )
     usable, saturated = np.ones(shape.shape, bool), np.zeros(shape.shape, bool)
     usable[0, 4, 4], saturated[0, 0, 6] = False, True
-    data = Data(
+    data = FitImages(
         170.0 * shape + noise,
         usable,
         saturated,
@@ -40,7 +46,9 @@ def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
     def model(x, slopes):
         return x[0] * shape, shape[None] if slopes else None
 
-    found = fit(model, data, np.array([150.0]), settings=Settings(huber=huber))
+    found = fit_levenberg_marquardt(
+        model, data, np.array([150.0]), settings=SolverSettings(huber=huber)
+    )
     left = (data.electrons - found.value[0] * shape) / sigma
     left = np.where(saturated, np.maximum(left, 0), left)[usable]
     # scipy halves the square; the light's own noise, 170 / 1e12 of a variance, is left
@@ -61,12 +69,12 @@ def test_the_variance_of_a_pixel_has_three_parts():
         np.array([[[3.1, 4.7], [2.2, 9.3]]]),
         np.array([[[1.7, 0.6], [1.1, 2.3]]]),
     )
-    data = Data(image, image > 0, image < 0, floor, scale, 0.03)
+    data = FitImages(image, image > 0, image < 0, floor, scale, 0.03)
     want = [
         [[3.1 + 57 / 1.7 + (0.03 * 57) ** 2, 4.7], [2.2, 9.3 + 1300 / 2.3 + 39.0**2]]
     ]
     assert data.variance(image) == pytest.approx(np.array(want), rel=1e-12)
-    seen = Data(
+    seen = FitImages(
         image,
         image > 0,
         image < 0,
@@ -90,13 +98,13 @@ def test_silent_pixels_weigh_nothing_and_far_ones_by_their_distance():
     saturated = np.array([[[True, True, False, False, False]]])
     usable = np.array([[[True, True, True, True, False]]])
     sigma = np.array([[[1.0, 2.0, 1.6, 4.0, 5.0]]])
-    data = Data(seen, usable, saturated, sigma**2, np.full(level.shape, 1e30))
-    free = Prior.none(np.zeros(1))
+    data = FitImages(seen, usable, saturated, sigma**2, np.full(level.shape, 1e30))
+    free = GaussianPrior.none(np.zeros(1))
     state = leastsquares._state(
         data,
         (np.zeros(1), level, np.ones((1, *level.shape))),
         free,
-        Settings(huber=2.5),
+        SolverSettings(huber=2.5),
     )
     assert state.residual.ravel() == pytest.approx([0.0, 1.5, 2.0, -10.0, 17.8])
     assert state.weight.ravel() == pytest.approx([0.0, 1.0, 1.0, 0.25, 0.0])
@@ -106,7 +114,7 @@ def test_silent_pixels_weigh_nothing_and_far_ones_by_their_distance():
 
 def test_some_frames_keep_what_belongs_to_them():
     stack = np.arange(24.0).reshape(3, 2, 4)
-    data = Data(stack, stack > 5, stack > 20, stack + 0.3, stack + 0.7, 0.02)
+    data = FitImages(stack, stack > 5, stack > 20, stack + 0.3, stack + 0.7, 0.02)
     part = data.planes(np.array([0, 2]))
     assert part.model_error == 0.02
     for name, want in (
@@ -132,21 +140,21 @@ def test_a_straight_model_has_the_covariance_of_normal_equations():
     image = (
         31.0 * shapes[0] + 17.0 * shapes[1] + sigma * rng.standard_normal(sigma.shape)
     )
-    data = Data(
+    data = FitImages(
         image, usable, np.zeros_like(usable), sigma**2, np.full(sigma.shape, 1e15)
     )
     wide = np.full(2, np.inf)
-    prior = Prior(np.array([0.0, 14.0]), np.array([np.inf, 0.21]), -wide, wide)
+    prior = GaussianPrior(np.array([0.0, 14.0]), np.array([np.inf, 0.21]), -wide, wide)
 
     def model(x, slopes):
         return np.tensordot(x, shapes, 1), shapes if slopes else None
 
-    found = fit(
+    found = fit_levenberg_marquardt(
         model,
         data,
         np.array([20.0, 20.0]),
         prior=prior,
-        settings=Settings(step_tolerance=1e-6),
+        settings=SolverSettings(step_tolerance=1e-6),
     )
     columns = (shapes / sigma * usable).reshape(2, -1)
     told, information = np.diag([0.0, 0.21**-2]), columns @ columns.T
@@ -167,7 +175,7 @@ def test_a_straight_model_has_the_covariance_of_normal_equations():
 def test_parameters_of_unlike_units_are_inverted_alike():
     matrix = np.array([[3.0, 0.8, -0.1], [0.8, 2.0, 0.3], [-0.1, 0.3, 1.4]])
     units = np.array([1e-7, 3.0, 4e8])
-    assert invert(matrix / np.outer(units, units)) / np.outer(
+    assert invert_information(matrix / np.outer(units, units)) / np.outer(
         units, units
     ) == pytest.approx(np.linalg.inv(matrix))
 
@@ -190,7 +198,7 @@ def test_a_step_too_short_to_show_in_rounded_images_changes_no_slopes(away):
     truth, sigma = np.array([1.0, -0.37]), 550.0
     image = np.tensordot(truth, shapes, 1)
     everywhere = np.ones(image.shape, bool)
-    data = Data(
+    data = FitImages(
         image,
         everywhere,
         ~everywhere,
@@ -206,8 +214,8 @@ def test_a_step_too_short_to_show_in_rounded_images_changes_no_slopes(away):
     scaled = shapes.reshape(2, -1) / sigma
     size, turn = np.linalg.eigh(scaled @ scaled.T)
     begin = truth + away * turn @ (np.array([0.8, -0.6]) / np.sqrt(size))
-    found = fit(
-        rounded, data, begin, settings=Settings(secant=True, step_tolerance=1e-4)
+    found = fit_levenberg_marquardt(
+        rounded, data, begin, settings=SolverSettings(secant=True, step_tolerance=1e-4)
     )
     assert found.slopes == pytest.approx(shapes, rel=1e-12)
     assert found.converged
@@ -222,7 +230,7 @@ def test_longer_steps_bring_slopes_up_to_date():
         0.01 * float(np.linalg.norm(shape)) * np.exp(0.4) / 1.2
     )  # of a parameter: 0.012
     everywhere = np.ones(shape.shape, bool)
-    data = Data(
+    data = FitImages(
         np.exp(0.4) * shape,
         everywhere,
         ~everywhere,
@@ -237,8 +245,8 @@ def test_longer_steps_bring_slopes_up_to_date():
             :, None, None, None
         ] * shape if slopes else None
 
-    settings = Settings(secant=True, near=np.inf, finish=False, iterations=1)
-    found = fit(model, data, np.array([0.39]), settings=settings)
+    settings = SolverSettings(secant=True, near=np.inf, finish=False, iterations=1)
+    found = fit_levenberg_marquardt(model, data, np.array([0.39]), settings=settings)
     (begin, end) = asked
     want = (np.exp(end) - np.exp(begin)) / (end - begin)
     assert end - begin > 0.1 * 0.012
@@ -256,7 +264,7 @@ def test_a_jacobian_brought_up_to_date_explains_the_step_and_keeps_what_lies_acr
     before = rng.normal(size=(3, 2, 4, 5))
     image, later = rng.normal(40, 3, (2, 2, 4, 5))
     usable = rng.uniform(size=image.shape) > 0.2
-    data = Data(
+    data = FitImages(
         image + 1.3,
         usable,
         np.zeros_like(usable),
@@ -265,14 +273,16 @@ def test_a_jacobian_brought_up_to_date_explains_the_step_and_keeps_what_lies_acr
     )
     wide = np.full(3, np.inf)
     prior, x = (
-        Prior(np.zeros(3), np.array([0.3, np.inf, 2.0]), -wide, wide),
+        GaussianPrior(np.zeros(3), np.array([0.3, np.inf, 2.0]), -wide, wide),
         np.array([0.2, -1.0, 3.0]),
     )
-    state = leastsquares._state(data, (x, image, before), prior, Settings(), travel=0.4)
+    state = leastsquares._state(
+        data, (x, image, before), prior, SolverSettings(), travel=0.4
+    )
     step = rng.normal(size=3)
     step *= size / np.sqrt(step @ state.curvature @ step)
     found = leastsquares._secant(
-        data, state, step, later, prior, Settings(), moved=size
+        data, state, step, later, prior, SolverSettings(), moved=size
     )
     assert found.x == pytest.approx(x + step)
     assert found.travel == pytest.approx(0.4 + size)
@@ -296,15 +306,17 @@ def test_what_a_jacobian_did_not_foresee_is_a_share_of_the_change_in_sigma_of_pi
     """
     image, slopes = np.array([[[10.0, 20.0, 30.0]]]), np.array([[[[1.0, 1.5, 9.0]]]])
     usable = np.array([[[True, True, False]]])
-    data = Data(
+    data = FitImages(
         image,
         usable,
         ~usable & False,
         np.array([[[2.0, 3.0, 1.0]]]) ** 2,
         np.full((1, 1, 3), 1e30),
     )
-    free = Prior.none(np.zeros(1))
-    state = leastsquares._state(data, (np.zeros(1), image, slopes), free, Settings())
+    free = GaussianPrior.none(np.zeros(1))
+    state = leastsquares._state(
+        data, (np.zeros(1), image, slopes), free, SolverSettings()
+    )
     got = leastsquares._missed(
         state, np.array([2.0]), image + np.array([[[5.0, 3.0, -70.0]]])
     )
@@ -320,7 +332,7 @@ def test_where_no_step_lowers_the_misfit_one_of_ten_tolerances_is_settled(
     5 / 10078.7 = 4.961e-4 sigma."""
     shape = np.full((1, 1, 5), 1 / math.sqrt(5))
     everywhere = np.ones(shape.shape, bool)
-    data = Data(
+    data = FitImages(
         5 * shape,
         everywhere,
         ~everywhere,
@@ -331,7 +343,9 @@ def test_where_no_step_lowers_the_misfit_one_of_ten_tolerances_is_settled(
     def model(x, slopes):
         return -x[0] * shape, shape[None] if slopes else None
 
-    found = fit(model, data, np.zeros(1), settings=Settings(step_tolerance=tolerance))
+    found = fit_levenberg_marquardt(
+        model, data, np.zeros(1), settings=SolverSettings(step_tolerance=tolerance)
+    )
     assert found.converged is settled
     assert found.reason == (
         "last step moved 0.0005 sigma" if settled else "no step lowers the misfit"
@@ -346,7 +360,7 @@ def test_what_bounds_hold_back_is_told_in_sigma():
     """
     shapes = np.array([[2.0, 0.0, 0.3], [0.4, 1.5, 0.0]])[:, None, None]
     everywhere = np.ones((1, 1, 3), bool)
-    data = Data(
+    data = FitImages(
         np.tensordot([7.0, 2.5], shapes, 1),
         everywhere,
         ~everywhere,
@@ -354,9 +368,14 @@ def test_what_bounds_hold_back_is_told_in_sigma():
         everywhere * 1e15,
     )
     wide = np.full(2, np.inf)
-    bounds = Prior(np.zeros(2), wide, -wide, np.array([4.0, np.inf]))
-    found = fit(lambda x, slopes: (np.tensordot(x, shapes, 1), shapes if slopes else None), data, np.zeros(2),
-                prior=bounds, settings=Settings(step_tolerance=1e-9))  # fmt: skip
+    bounds = GaussianPrior(np.zeros(2), wide, -wide, np.array([4.0, np.inf]))
+    found = fit_levenberg_marquardt(
+        lambda x, slopes: (np.tensordot(x, shapes, 1), shapes if slopes else None),
+        data,
+        np.zeros(2),
+        prior=bounds,
+        settings=SolverSettings(step_tolerance=1e-9),
+    )
     flat = shapes.reshape(2, -1)
     covariance = 1.3 * np.linalg.inv(flat @ flat.T)
     held = 2.5 + (flat[0] @ flat[1]) / (flat[1] @ flat[1]) * 3.0
@@ -371,18 +390,24 @@ def test_a_step_that_leaves_the_ball_ends_on_it():
     """
     shapes = np.eye(2)[:, None, None]
     everywhere = np.ones((1, 1, 2), bool)
-    data = Data(
+    data = FitImages(
         np.array([[[3.0, 4.5]]]),
         everywhere,
         ~everywhere,
         np.ones((1, 1, 2)),
         np.full((1, 1, 2), 1e15),
     )
-    settings = Settings(
-        step_tolerance=1e-6, bounded=True, ball=constrained.Ball(np.arange(2), 2.0)
+    settings = SolverSettings(
+        step_tolerance=1e-6,
+        bounded=True,
+        ball=constrained.BallConstraint(np.arange(2), 2.0),
     )
-    found = fit(lambda x, slopes: (x[None, None], shapes if slopes else None), data, np.array([0.3, -0.2]),
-                settings=settings)  # fmt: skip
+    found = fit_levenberg_marquardt(
+        lambda x, slopes: (x[None, None], shapes if slopes else None),
+        data,
+        np.array([0.3, -0.2]),
+        settings=settings,
+    )
     assert found.value == pytest.approx(
         np.array([3.0, 4.5]) * 2 / math.hypot(3.0, 4.5), rel=1e-4
     )
@@ -395,7 +420,7 @@ def test_exact_slopes_are_made_where_a_step_ended():
     shape = np.random.default_rng(2).uniform(0.5, 1.5, (1, 6, 5))
     everywhere = np.ones(shape.shape, bool)
     light = np.full(shape.shape, 1e-4), np.full(shape.shape, 1e15)
-    data = Data(np.exp(0.9) * shape, everywhere, ~everywhere, *light)
+    data = FitImages(np.exp(0.9) * shape, everywhere, ~everywhere, *light)
     tried, exact = [], []
 
     def model(x, slopes):
@@ -404,7 +429,9 @@ def test_exact_slopes_are_made_where_a_step_ended():
             :, None, None, None
         ] * shape if slopes else None
 
-    found = fit(model, data, np.array([0.6]), settings=Settings(secant=True))
+    found = fit_levenberg_marquardt(
+        model, data, np.array([0.6]), settings=SolverSettings(secant=True)
+    )
     assert len(exact) > 1
     assert exact[0] == 0.6
     assert set(exact[1:]) <= set(tried)
@@ -420,7 +447,7 @@ def test_pixels_beyond_the_outlier_limit_on_either_side_are_no_part_of_chi_squar
     image[0, 1, 2] += 25 * 1.3
     image[0, 3, 6] -= 25 * 1.3
     everywhere = np.ones(image.shape, bool)
-    data = Data(
+    data = FitImages(
         image,
         everywhere,
         ~everywhere,
@@ -428,7 +455,7 @@ def test_pixels_beyond_the_outlier_limit_on_either_side_are_no_part_of_chi_squar
         np.full(image.shape, 1e15),
     )
     ones = np.ones((1, *image.shape))
-    found = fit(
+    found = fit_levenberg_marquardt(
         lambda x, slopes: (x[0] * ones[0], ones if slopes else None),
         data,
         np.array([6.0]),

@@ -13,13 +13,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.inference.leastsquares import Data
+from characterize.inference.leastsquares import FitImages
 from characterize.inference.prepare import LeftOut, lit_part
-from characterize.model import PLACE, ForwardModel, Setting, vector
+from characterize.model import PLACE, ForwardModel, FrameSetting, parameter_vector
 
 ROWS, COLUMNS = slice(9, 22), slice(6, 20)
 ANGLES = np.array([[0.0, 0.0], [0.11, -0.07]])
-SETTING = Setting(np.array([560.0, 650.0]), ANGLES, np.array([1.0, 1.3]), 1.5, 29, 28)
+SETTING = FrameSetting(
+    np.array([560.0, 650.0]), ANGLES, np.array([1.0, 1.3]), 1.5, 29, 28
+)
 HIDDEN = b.VALUES | {
     "background_e": 7.0,
     "background_x_e": 3.0,
@@ -50,11 +52,15 @@ def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has
     Few terms leave 2 % of the field out where that is dim, and less than a percent of
     the brightest light.
     """
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
+    )
     whole = ForwardModel(b.lens(), setting, b.RESPONSE)
     few = whole.quick(*lit)
-    want = bench.irradiance(b.lens(), b.truth(), b.RESPONSE)
-    got = few.images(vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}))[0]
+    want = bench.bench_irradiance(b.lens(), b.truth(), b.RESPONSE)
+    got = few.images(
+        parameter_vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
+    )[0]
     seen = (slice(None), *(lit or (slice(None), slice(None))))
     want, got = want[seen], got[seen]
     got = got * (got * want).sum() / (got**2).sum()
@@ -65,7 +71,7 @@ def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has
 def test_derivatives_of_a_part_are_differences_of_its_own_images(part):
     names, x = (
         ("bias_x_nm", "coma_y_rad", "decentre_x_um", "distance_um"),
-        vector(HIDDEN),
+        parameter_vector(HIDDEN),
     )
     slopes = part.images(x, names)[1]
     for name, step, got in zip(names, (0.2, 5e-3, 1e-2, 5e-2), slopes, strict=True):
@@ -82,7 +88,7 @@ def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in
     """Two frames of a bright pixel, 900 electrons over 90, and of dim ones that tell
     1e-6 and 1e-3 of what it does.
     """
-    x = vector({"background_e": 5.0, "background_x_e": 2.0})
+    x = parameter_vector({"background_e": 5.0, "background_x_e": 2.0})
     plane = (
         np.broadcast_to(5.0 + 2.0 * (np.arange(28) - 14) / 14, (2, 29, 28))
         * SETTING.exposure[:, None, None]
@@ -92,7 +98,7 @@ def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in
     light[0, 20, 25] = 900.0 * 1e-3  # 1e-6 of what the bright one tells
     light[1, 8, 7] = 900.0 * 0.03
     noise = np.full(light.shape, 90.0)
-    data = Data(
+    data = FitImages(
         light,
         np.ones(light.shape, bool),
         np.zeros(light.shape, bool),
@@ -128,14 +134,14 @@ def test_each_of_four_sides_may_hold_a_quarter_of_thirty_parts_in_a_million(
         dim,
     )
     noise = np.full(light.shape, 1e4)  # beside which the noise of the light is none
-    data = Data(
+    data = FitImages(
         light,
         np.ones(light.shape, bool),
         np.zeros(light.shape, bool),
         noise,
         np.full(light.shape, 1e9),
     )
-    assert lit_part(model, data, vector({}), light) == taken
+    assert lit_part(model, data, parameter_vector({}), light) == taken
 
 
 def test_beside_the_part_images_go_straight_on_and_within_it_what_is_left_out_stays():

@@ -11,9 +11,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import explore, leastsquares
-from characterize.inference.leastsquares import Prior
+from characterize.inference.leastsquares import GaussianPrior
 from characterize.model import PLACE
-from characterize.model.setting import Setting
+from characterize.model.setting import FrameSetting
 
 NAMED = ("bias_nm", "bias_x_nm", "background_e")
 RNG = np.random.default_rng(7)
@@ -32,7 +32,7 @@ class Forked:
 
     def __init__(self, index=None):
         self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(
+        self.setting = FrameSetting(
             np.linspace(21e3, 29e3, 5)[index],
             np.zeros((len(index), 2)),
             np.ones(len(index)),
@@ -74,13 +74,13 @@ class Forked:
 
 def test_both_signs_of_a_gradient_that_the_walk_met_lie_in_its_interval():
     model, wide = Forked(), np.array([30.0, 40.0, 9.0])
-    known = Prior(np.zeros(3), np.array([15.0, 20.0, 0.02]), -wide, wide)
+    known = GaussianPrior(np.zeros(3), np.array([15.0, 20.0, 0.02]), -wide, wide)
     task = b.given(model, BRIGHT.copy(), NOISE, NAMED, known)
-    end = leastsquares.fit(
+    end = leastsquares.fit_levenberg_marquardt(
         task.problem(), task.data, np.array([HIGH, 0.0, 0.0]), prior=known
     )
     assert end.value[0] == pytest.approx(HIGH, abs=1.0)
-    found = explore.explore(task, [end])
+    found = explore.explore_posterior(task, [end])
     roots = np.roots([1, LEAN, -25])
     assert found.best.value[0] == pytest.approx(LOW, abs=0.5)
     # both roots, with what the prior pulls them by (25 / 20² of -2 ln L, against a

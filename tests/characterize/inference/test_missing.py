@@ -16,23 +16,23 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.captures import clean
+from characterize.captures import to_electrons
 from characterize.inference import causes, estimate, missing
-from characterize.inference.estimate import Options
+from characterize.inference.estimate import FitOptions
 from characterize.inference.missing import (
     CHANCE,
-    Fitted,
-    Lean,
-    Looked,
-    look,
-    untold,
-    words,
+    FitAtMode,
+    ScoreTest,
+    ScoreTests,
+    run_score_tests,
+    score_test_text,
+    undetectable_effects,
 )
 from characterize.inference.prepare import data_of
-from characterize.inference.search import Task, refine
-from characterize.model import PLACE, ForwardModel, Setting, vector
+from characterize.inference.search import SearchTask, refine_fit
+from characterize.model import PLACE, ForwardModel, FrameSetting, parameter_vector
+from metalens.core.errors import FitError
 from metalens.fabrication import WavefrontError, maps
-from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap
 
 rng = np.random.default_rng(20)
@@ -48,7 +48,7 @@ def fit_of(rest, shared=ALONE):
     """
     known = SLOPES @ SLOPES.T + PRIOR
     mode = np.linalg.solve(known, SLOPES @ rest)
-    return Fitted(
+    return FitAtMode(
         ("one", "two", "three", "four"),
         SLOPES,
         known,
@@ -101,7 +101,7 @@ def test_what_the_fit_makes_up_for_is_not_seen_but_said():
     assert told.startswith("7 um would be taken for")
     assert "one +2.3 " in told
     assert "three -0.41 " in told
-    assert untold([Lean("hidden", 0.0, 0, 1.0, told)]) == [
+    assert undetectable_effects([ScoreTest("hidden", 0.0, 0, 1.0, told)]) == [
         f"hidden is not fitted: {told}"
     ]
     own = CHANGES[0] - CHANGES[0] @ np.linalg.pinv(SLOPES) @ SLOPES
@@ -130,7 +130,7 @@ def errors_of(causes, shared, common, draws=3000):
             + rng.normal(size=len(causes)) @ causes
         )
         errors.append(solve @ (SLOPES @ rest) - truth)
-        looked = Looked(
+        looked = ScoreTests(
             [], fit_of(rest, shared), {"first": causes[:1], "others": causes[1:]}
         )
         reckoned.append(looked.reckoned().sigma)
@@ -187,7 +187,7 @@ def test_what_is_reckoned_with_knows_that_errors_of_dark_are_one_in_all_frames()
 def test_each_cause_has_its_share():
     fit = fit_of(rng.normal(size=900))
     cause = 2.3 * SLOPES[0] - 0.41 * SLOPES[2]
-    looked = Looked([], fit, {"hidden": cause[None], "twice": 2 * cause[None]})
+    looked = ScoreTests([], fit, {"hidden": cause[None], "twice": 2 * cause[None]})
     found = looked.reckoned()
     assert found.causes == ("hidden", "twice")
     assert found.by_cause[0, [0, 2]] == pytest.approx(
@@ -201,11 +201,11 @@ def test_each_cause_has_its_share():
         (frozenset(), False),
         (frozenset({"loud"}), True),
     ):  # no frame bounds what is known roughly
-        shift = Looked([], fit, {"loud": loud[None]}, roughly).reckoned().sigma[0]
+        shift = ScoreTests([], fit, {"loud": loud[None]}, roughly).reckoned().sigma[0]
         assert (
             shift == pytest.approx(abs(float(fit.moved_by(loud[None])[0, 0])), rel=1e-9)
         ) == more
-    assert Looked([], fit, {}).reckoned().sigma.tolist() == [0, 0, 0, 0]
+    assert ScoreTests([], fit, {}).reckoned().sigma.tolist() == [0, 0, 0, 0]
 
 
 def lean_of(light, seed):
@@ -213,17 +213,19 @@ def lean_of(light, seed):
     parameters.
     """
     shots = b.capture(light, seed=seed)
-    seen = data_of(clean(shots), (slice(None), slice(None)))
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    seen = data_of(to_electrons(shots), (slice(None), slice(None)))
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
+    )
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
-    start = vector(b.VALUES)
+    start = parameter_vector(b.VALUES)
     bare = model.images(
-        vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
+        parameter_vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
     )[0]
     start[PLACE["log_gain"]] = np.log((light.max() - 20.0) / bare.max())
-    task = Task(model, seen, start, {}, None)
+    task = SearchTask(model, seen, start, {}, None)
     place = [PLACE[name] for name in task.names]
-    return look(task, refine(task, start[place])).leans
+    return run_score_tests(task, refine_fit(task, start[place])).leans
 
 
 def shifted(light):
@@ -254,7 +256,9 @@ def test_write_fields_moved_alike_are_a_lean_and_single_ones_are_not():
     fields = causes.write_fields(lens)
     t = np.linspace(-1, 1, 33)
     u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 0.97] for part in np.meshgrid(t, t))
-    every = np.concatenate([causes.smooth(u, v, 27), maps(WavefrontError, u, v)])
+    every = np.concatenate(
+        [causes.smooth_phase_changes(u, v, 27), maps(WavefrontError, u, v)]
+    )
     found = fields[:16].sum(0) @ every
     r = 20.0 * np.hypot(u, v)
     want = (
@@ -278,7 +282,7 @@ def test_faults_of_a_bench_are_named(cause):
     found = lean_of(FAULTS[cause](b.electrons()), 4)
     told = [one.cause for one in found if one.chance < CHANCE] or found[:2]
     assert any(str(one).startswith(cause) for one in told[:2]), told
-    assert words(found)
+    assert score_test_text(found)
 
 
 def test_a_patch_without_pillars_is_named_with_its_place():
@@ -290,8 +294,10 @@ def test_a_patch_without_pillars_is_named_with_its_place():
     holed = dataclasses.replace(
         b.lens(), diameters=DiameterMap(np.where(gone, 0, d.diameter_um), d.pitch_um)
     )
-    light = bench.irradiance(holed, b.truth(), b.RESPONSE)
-    first = lean_of(light * (6000.0 / light.max()) + bench.background(b.truth()), 6)[0]
+    light = bench.bench_irradiance(holed, b.truth(), b.RESPONSE)
+    first = lean_of(
+        light * (6000.0 / light.max()) + bench.background_plane(b.truth()), 6
+    )[0]
     assert first.chance < CHANCE
     x, y = map(
         float, re.search(r"patch .* about x (\S+), y (\S+) um", first.cause).groups()
@@ -335,25 +341,25 @@ def test_blur_along_one_direction_changes_light_by_its_second_derivatives(turn_d
 
 def test_a_refusal_names_what_the_residuals_lean_to():
     leans = [
-        Lean("a ghost", 90.0, 1, 1e-9),
-        Lean("a lamp", 40.0, 4, 1e-6),
-        Lean("a drift", 2.0, 1, 0.2),
+        ScoreTest("a ghost", 90.0, 1, 1e-9),
+        ScoreTest("a lamp", 40.0, 4, 1e-6),
+        ScoreTest("a drift", 2.0, 1, 0.2),
     ]
     with pytest.raises(
         FitError,
         match=r"refused: a bad fit; residuals lean towards a ghost.*; a lamp.* explain",
     ):
-        estimate._refuse(["a bad fit"], Options(), leans)
+        estimate._refuse(["a bad fit"], FitOptions(), leans)
     with pytest.raises(FitError, match=r"refused: a bad fit$"):
-        estimate._refuse(["a bad fit"], Options(), leans[2:])
-    estimate._refuse([], Options(), leans)
-    estimate._refuse(["a bad fit"], Options(insist=True), leans)
+        estimate._refuse(["a bad fit"], FitOptions(), leans[2:])
+    estimate._refuse([], FitOptions(), leans)
+    estimate._refuse(["a bad fit"], FitOptions(insist=True), leans)
 
 
 def test_a_clean_bench_is_called_clean_and_glass_is_declared():
     found = lean_of(b.electrons(), 5)
-    assert not words(found)
+    assert not score_test_text(found)
     wall = next(one for one in found if one.cause.startswith("a side wall"))
     assert wall.chi2 < 16
-    glass = next(one for one in untold(found) if "plate of glass" in one)
+    glass = next(one for one in undetectable_effects(found) if "plate of glass" in one)
     assert "distance_um" in glass or "stage_zero_um" in glass

@@ -45,12 +45,14 @@ def looked(monkeypatch, chi2_per_dof, patched=False):
     )
     monkeypatch.setattr(missing.causes, "changes", lambda *_: ())
     monkeypatch.setattr(
-        missing, "_ghost", lambda *_: missing.Lean("ghost", 0.0, 0, 1.0)
+        missing, "_ghost", lambda *_: missing.ScoreTest("ghost", 0.0, 0, 1.0)
     )
     monkeypatch.setattr(
-        missing, "_patch", lambda *_: missing.Lean("patch", 4.0, int(patched), 0.03)
+        missing,
+        "_patch",
+        lambda *_: missing.ScoreTest("patch", 4.0, int(patched), 0.03),
     )
-    return missing.look(task, mode)
+    return missing.run_score_tests(task, mode)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +107,7 @@ def test_a_change_of_which_the_fit_leaves_less_than_a_thousandth_of_the_square_i
     """
     slopes = np.array([4.0, 0.5, 20.0, 7.0])[:, None] * np.eye(4, IMAGE.size)
     rest = draw.normal(size=IMAGE.size)
-    fit = missing.Fitted(
+    fit = missing.FitAtMode(
         tuple("abcd"),
         slopes,
         slopes @ slopes.T,

@@ -8,9 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from characterize.inference.knowable import density
-from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import REACH, Valley, draws, log_evidence, shares
+from characterize.inference.knowable import profile_density
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.inference.posterior import (
+    REACH,
+    LocalMode,
+    draw_posterior,
+    log_evidence,
+    mode_probabilities,
+)
 from tests.referees.one_profile import profile
 
 NOISE = 0.7
@@ -21,7 +27,7 @@ def data(images, seed=1):
     """Noise of one size on noise-free images."""
     noise = NOISE * np.random.default_rng(seed).standard_normal(images.shape)
     everywhere = np.ones(images.shape, bool)
-    return Data(
+    return FitImages(
         images + noise,
         everywhere,
         ~everywhere,
@@ -61,7 +67,7 @@ def best(seen):
 def test_a_straight_model_has_the_parabola_s_interval():
     seen = data(straight(np.array([1.3, -0.4]), False)[0])
     mode, covariance = best(seen)
-    valley = Valley(straight, seen, mode, Prior.none(mode))
+    valley = LocalMode(straight, seen, mode, GaussianPrior.none(mode))
     found, better = profile(valley, 1)
     reach = REACH * np.sqrt(covariance[1, 1])
     assert better is None
@@ -77,8 +83,11 @@ def test_half_the_volume_of_a_valley_is_that_of_its_covariance():
     alike = np.stack([SHAPES[0], SHAPES[0] + 0.6 * SHAPES[1]])
     seen = data(np.tensordot([1.3, -0.4], alike, 1))
     mode = np.array([1.3, -0.4])
-    valley = Valley(
-        lambda x, j: (np.tensordot(x, alike, 1), alike), seen, mode, Prior.none(mode)
+    valley = LocalMode(
+        lambda x, j: (np.tensordot(x, alike, 1), alike),
+        seen,
+        mode,
+        GaussianPrior.none(mode),
     )
     a, b, both = (
         (one * other).sum() / NOISE**2
@@ -96,7 +105,7 @@ def test_moved_by_one_sigma_a_parameter_takes_the_others_to_their_best():
     """
     seen = data(straight(np.array([1.3, -0.4]), False)[0])
     mode, covariance = best(seen)
-    valley = Valley(straight, seen, mode, Prior.none(mode))
+    valley = LocalMode(straight, seen, mode, GaussianPrior.none(mode))
     for i in (0, 1):
         held, free = SHAPES[i].ravel(), SHAPES[1 - i].ravel()
         moved = mode[i] + math.sqrt(covariance[i, i])
@@ -113,8 +122,8 @@ def test_errors_of_dark_and_flat_spread_the_estimate_as_the_whole_covariance_of_
     x, floor, light = np.array([1.3, -0.4]), 0.21, 0.17
     images = 3.0 + straight(x, False)[0]
     seen = dataclasses.replace(data(images), common_floor=floor, common_light=light)
-    valley = Valley(
-        lambda x, j: (3.0 + straight(x, j)[0], SHAPES), seen, x, Prior.none(x)
+    valley = LocalMode(
+        lambda x, j: (3.0 + straight(x, j)[0], SHAPES), seen, x, GaussianPrior.none(x)
     )
     n = images[0].size
     alike = np.kron(np.ones((3, 3)), np.eye(n))
@@ -131,12 +140,12 @@ def test_a_prior_narrows_the_interval_as_information_adds():
     seen = data(straight(np.array([1.3, -0.4]), False)[0])
     flat, covariance = best(seen)
     wide = np.full(2, np.inf)
-    prior = Prior(np.array([0.0, -0.35]), np.array([np.inf, 0.03]), -wide, wide)
+    prior = GaussianPrior(np.array([0.0, -0.35]), np.array([np.inf, 0.03]), -wide, wide)
     information = np.linalg.inv(covariance) + np.diag([0, 0.03**-2])
     mode = np.linalg.solve(
         information, np.linalg.inv(covariance) @ flat + np.array([0, -0.35 / 0.03**2])
     )
-    found, _ = profile(Valley(straight, seen, mode, prior), 1)
+    found, _ = profile(LocalMode(straight, seen, mode, prior), 1)
     assert (found.high - found.low) / 2 == pytest.approx(
         REACH * np.sqrt(np.linalg.inv(information)[1, 1]), rel=1e-6
     )
@@ -158,7 +167,7 @@ def test_a_bent_valley_is_followed_to_its_ends():
         asked.append(jacobian)
         return bent(x, jacobian)
 
-    found, better = profile(Valley(counted, seen, mode, Prior.none(mode)), 0)
+    found, better = profile(LocalMode(counted, seen, mode, GaussianPrior.none(mode)), 0)
     reach = REACH * np.sqrt(covariance[0, 0])
     ends = back(amplitude[0] - reach), back(amplitude[0] + reach)
     assert better is None
@@ -196,7 +205,7 @@ def test_slopes_met_along_one_way_count_by_how_far_a_place_lies_that_way_in_sigm
     exact = dataclasses.replace(
         data(np.zeros(SHAPES[0].shape)), electrons=np.zeros(SHAPES[0].shape)
     )
-    valley = Valley(bowed, exact, mode, Prior.none(mode))
+    valley = LocalMode(bowed, exact, mode, GaussianPrior.none(mode))
     valley.slopes_at(place)
     assert asked.count(True) == 2  # of the mode, and of the place
     across = np.array(
@@ -219,7 +228,9 @@ def test_draws_of_a_bent_valley_have_the_data_s_spread():
     seen = data(bent(np.array([-1.1, 0.8]), False)[0])
     amplitude, covariance = best(seen)
     mode = np.array([-2 + 2 * np.sqrt(1 + amplitude[0]), amplitude[1]])
-    some = draws([Valley(bent, seen, mode, Prior.none(mode))], 400, seed=3)
+    some = draw_posterior(
+        [LocalMode(bent, seen, mode, GaussianPrior.none(mode))], 400, seed=3
+    )
     f = some[:, 0] + 0.25 * some[:, 0] ** 2
     assert f.mean() == pytest.approx(
         amplitude[0], abs=4 * np.sqrt(covariance[0, 0] / 400)
@@ -233,9 +244,11 @@ def test_two_lenses_alike_are_drawn_alike():
     seen = data(double(np.array([1.4, -0.6]), False)[0])
     amplitude, _ = best(seen)
     modes = [np.array([sign * np.sqrt(amplitude[0]), amplitude[1]]) for sign in (1, -1)]
-    valleys = [Valley(double, seen, mode, Prior.none(mode)) for mode in modes]
-    assert shares(valleys) == pytest.approx([0.5, 0.5], abs=1e-6)
-    some = draws(valleys, 200, seed=4)
+    valleys = [
+        LocalMode(double, seen, mode, GaussianPrior.none(mode)) for mode in modes
+    ]
+    assert mode_probabilities(valleys) == pytest.approx([0.5, 0.5], abs=1e-6)
+    some = draw_posterior(valleys, 200, seed=4)
     assert 70 < (some[:, 0] > 0).sum() < 130  # binomial: 7 is one sigma
 
 
@@ -243,7 +256,7 @@ def test_a_profile_that_falls_below_its_mode_says_where():
     seen = data(bent(np.array([-1.1, 0.8]), False)[0])
     amplitude, _ = best(seen)
     wrong = np.array([-2 + 2 * np.sqrt(1 + amplitude[0]) + 0.35, amplitude[1]])
-    valley = Valley(bent, seen, wrong, Prior.none(wrong))
+    valley = LocalMode(bent, seen, wrong, GaussianPrior.none(wrong))
     place, misfit = valley.descend(wrong)
     assert misfit < valley.least - 5
     assert place[0] + 0.25 * place[0] ** 2 == pytest.approx(amplitude[0], abs=0.02)
@@ -252,11 +265,11 @@ def test_a_profile_that_falls_below_its_mode_says_where():
 def test_the_density_of_a_parabola_is_the_normal_one_and_of_a_bent_profile_two_halves():
     at, z = np.linspace(2.0, 6.0, 41), np.array([-2.5, -1.0, 0.0, 1.0, 2.5])
     want = np.exp(-(((at - 4.1) / 0.7) ** 2) / 2) / (0.7 * math.sqrt(2 * math.pi))
-    assert density(np.array([4.1 + 0.7 * z, z**2]), at) == pytest.approx(
+    assert profile_density(np.array([4.1 + 0.7 * z, z**2]), at) == pytest.approx(
         want, rel=0.014
     )  # tails beyond 2.5 sigma: 1.2 %
     bent = np.array([4.1 + np.where(z > 0, 1.1, 0.3) * z, z**2])
-    left, middle, right = density(bent, np.array([4.1 - 0.6, 4.1, 4.1 + 2.2]))
+    left, middle, right = profile_density(bent, np.array([4.1 - 0.6, 4.1, 4.1 + 2.2]))
     assert left == pytest.approx(right, rel=1e-12)  # two sigma of its own side each
     assert left / middle == pytest.approx(math.exp(-2), rel=1e-12)
     assert middle == pytest.approx(2 / (1.4 * math.sqrt(2 * math.pi)), rel=0.014)
@@ -284,7 +297,7 @@ def test_a_profile_ends_right_where_the_slopes_of_the_mode_have_turned_round():
     mode = np.array([0.3, 7.0, -4.0])
     seen = data(turned(mode, False)[0])
     exact = dataclasses.replace(seen, electrons=turned(mode, False)[0])
-    found, better = profile(Valley(turned, exact, mode, Prior.none(mode)), 0)
+    found, better = profile(LocalMode(turned, exact, mode, GaussianPrior.none(mode)), 0)
     reach = REACH * NOISE / 0.35
     assert turn * reach > math.radians(90)
     assert better is None

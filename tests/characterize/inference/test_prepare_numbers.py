@@ -13,10 +13,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.captures import Capture, Frames, Gain
+from characterize.captures import Capture, ElectronFrames, SensorNoise
 from characterize.inference import prepare
-from characterize.inference.leastsquares import Data
-from metalens.ground.errors import CaptureError
+from characterize.inference.leastsquares import FitImages
+from metalens.core.errors import CaptureError
 
 RNG = np.random.default_rng(67)
 
@@ -33,9 +33,9 @@ def capture(frames, depth_um, exposure_s, *, angle_rad=None, **more):
 
 def electrons(shape):
     every = np.ones(shape, bool)
-    return Frames(
+    return ElectronFrames(
         RNG.uniform(50, 90, shape), every, ~every, RNG.uniform(2, 3, shape), np.ones((1, 1, 1)),
-        Gain(1.0, 0.01, 2.0), (), common_floor=0.3, common_light=0.02,
+        SensorNoise(1.0, 0.01, 2.0), (), common_floor=0.3, common_light=0.02,
     )  # fmt: skip
 
 
@@ -49,16 +49,16 @@ def test_exposures_of_one_place_and_angle_are_one_frame_in_the_order_of_the_firs
     counts = np.arange(5.0)[:, None, None] + counted
     before = capture(counts, depth, exposure, angle_rad=angle, about={"offset": 0.0})
     every = np.ones(counted.shape, bool)
-    frames = Frames(
+    frames = ElectronFrames(
         counted,
         every,
         ~every,
         2.0 + 0 * counted,
         np.ones((1, 1, 1)) + 0 * counted,
-        Gain(1, 0, 2),
+        SensorNoise(1, 0, 2),
         (),
     )
-    after, merged = prepare.merged(before, frames)
+    after, merged = prepare.merge_brackets(before, frames)
     assert after.names == ("frame 0", "frame 1", "frame 3")
     assert after.position_um.tolist() == [27e3, 22e3, 22e3]
     assert after.exposure_s.tolist() == [0.8, 0.7, 0.3]
@@ -78,7 +78,7 @@ def test_frames_stay_where_each_has_its_place_or_time_or_place_is_not_known(
     depth, exposure
 ):
     before, frames = capture(np.ones((3, 4, 6)), depth, exposure), electrons((3, 4, 6))
-    assert prepare.merged(before, frames) == (before, frames)
+    assert prepare.merge_brackets(before, frames) == (before, frames)
 
 
 def pictured(places):
@@ -236,7 +236,7 @@ def test_terms_are_left_out_while_chi_square_rises_by_less_than_a_fiftieth(size,
         moved = exact + 100 * cut * size * up + np.where(usable, 0, 1e3 * cut)
         return SimpleNamespace(images=lambda x: (moved, None), rough=model, cut=cut)
 
-    data = Data(
+    data = FitImages(
         exact,
         usable,
         np.zeros(exact.shape, bool),

@@ -11,14 +11,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference.prepare import stated
+from characterize.inference.prepare import stated_priors
 
 
 def said(**about):
     capture = SimpleNamespace(
         wavelength_um=0.8523, fill=1.0, pixel_um=0.75, about=about
     )
-    return {one.name: (one.value, one.sigma) for one in stated(capture, b.row())}
+    return {one.name: (one.value, one.sigma) for one in stated_priors(capture, b.row())}
 
 
 def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
@@ -36,7 +36,7 @@ def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
 def test_half_a_nanometre_of_wavelength_where_nothing_is_said_and_as_much_of_a_long_one():
     assert said() == {"wavelength_nm": (pytest.approx(2.3), 0.5)}
     capture = SimpleNamespace(wavelength_um=10.603, fill=1.0, pixel_um=12.0, about={})
-    (one,) = stated(capture, b.row(wavelength_um=10.6))
+    (one,) = stated_priors(capture, b.row(wavelength_um=10.6))
     assert (one.value, one.sigma) == (
         pytest.approx(3.0),
         pytest.approx(0.5 * 10.6 / 0.85),

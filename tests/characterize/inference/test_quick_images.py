@@ -13,8 +13,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import leastsquares, search
-from characterize.inference.arrange import Arrangement
-from characterize.model import ForwardModel, Known, Setting, moments, vector
+from characterize.inference.arrange import FrameArrangement
+from characterize.model import (
+    ForwardModel,
+    FrameSetting,
+    KnownValue,
+    moments,
+    parameter_vector,
+)
 
 DEPTHS = (560.0, 600.0, 640.0)
 FREE = {
@@ -34,15 +40,17 @@ def fitted():
     there.
     """
     data, model = b.near_focus(DEPTHS, bias_nm=6.0, stage_zero_um=4.0, coma_x_rad=0.2)
-    start = vector({"crosstalk_px": 0.2})
+    start = parameter_vector({"crosstalk_px": 0.2})
     held = {
-        p.name: Known(p.name, p.start) for p in search.PARAMETERS if p.name not in FREE
+        p.name: KnownValue(p.name, p.start)
+        for p in search.PARAMETERS
+        if p.name not in FREE
     }
-    found = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
-    about = search.Task(model, data, start, held, found)
-    begin = search.starts(about, biases_nm=(0.0,))[0]
-    mode = search.refine(about, begin[[search.PLACE[name] for name in about.names]])
-    return about, mode, search.anchored(about, mode)
+    found = FrameArrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
+    about = search.SearchTask(model, data, start, held, found)
+    begin = search.starting_points(about, biases_nm=(0.0,))[0]
+    mode = search.refine_fit(about, begin[[search.PLACE[name] for name in about.names]])
+    return about, mode, search.correct_surrogate(about, mode)
 
 
 def test_it_is_the_whole_model_at_its_place_and_its_part_for_some_frames():
@@ -97,7 +105,9 @@ def test_a_fit_by_it_from_afar_ends_where_that_of_the_whole_model_does():
     begin = mode.value + 6 * np.sqrt(np.diag(mode.covariance)) * np.where(
         np.arange(len(mode.value)) % 2, 1, -1
     )
-    found = leastsquares.fit(quick.problem(), about.data, begin, prior=about.prior)
+    found = leastsquares.fit_levenberg_marquardt(
+        quick.problem(), about.data, begin, prior=about.prior
+    )
     assert (
         np.abs(found.value - mode.value) / np.sqrt(np.diag(mode.covariance))
     ).max() < 0.1
@@ -111,7 +121,7 @@ def test_terms_of_the_usual_distance_are_turned_and_as_bright_as_own_ones():
     of one term differs from that
     of an own one by less than half of what one term leaves out, and is as bright."""
     angles = np.array([[0.0, 0.0], [0.21, -0.13]])
-    setting = Setting(np.array([600.0, 600.0]), angles, np.ones(2), 1.5, 16, 16)
+    setting = FrameSetting(np.array([600.0, 600.0]), angles, np.ones(2), 1.5, 16, 16)
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
     assert len(model.groups) == 2
     for group in model.groups:
@@ -141,7 +151,9 @@ def test_a_quick_model_has_fewer_samples_and_terms_and_rougher_slopes_than_its_o
     for pixel_um, whole, fewer in ((1.5, 2, 2), (2.6, 3, 2), (1.3, 2, 1)):
         one = ForwardModel(
             b.lens(),
-            Setting(np.array([600.0]), np.zeros((1, 2)), np.ones(1), pixel_um, 8, 8),
+            FrameSetting(
+                np.array([600.0]), np.zeros((1, 2)), np.ones(1), pixel_um, 8, 8
+            ),
             b.RESPONSE,
         )
         assert (one.grid.oversample, one.quick().grid.oversample) == (whole, fewer), (

@@ -15,22 +15,22 @@ import bench_lens as b
 import characterize
 from characterize.bench import bench
 from characterize.inference import asbuilt
-from characterize.inference.estimate import Options
+from characterize.inference.estimate import FitOptions
 from characterize.model import made, thinplate
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import vector
-from metalens.ground.errors import FitError
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import parameter_vector
+from metalens.core.errors import FitError
 from metalens.lens.record import DiameterMap
 
 T = np.linspace(-1, 1, 81)
 U, V = np.meshgrid(T, T)
 INSIDE = np.hypot(U, V) <= 1
-SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
-USUAL = Options(scan_um=60.0)
+SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+USUAL = FitOptions(scan_um=60.0)
 
 
 def test_modes_have_unit_rms_and_hold_nothing_that_parameters_do():
-    modes = thinplate.basis(U, V)[:, INSIDE]
+    modes = thinplate.thin_plate_basis(U, V)[:, INSIDE]
     gram = modes @ modes.T / INSIDE.sum()
     assert (
         np.abs(gram - np.eye(len(gram))).max() < 0.02
@@ -52,7 +52,7 @@ def test_modes_have_unit_rms_and_hold_nothing_that_parameters_do():
 
 def test_phase_on_a_grid_is_the_sum_of_its_modes():
     modes = np.random.default_rng(0).normal(0, 0.1, thinplate.MODES)
-    want = np.tensordot(modes, thinplate.basis(U, V), 1)
+    want = np.tensordot(modes, thinplate.thin_plate_basis(U, V), 1)
     assert np.abs(thinplate.phase_rad(modes, T, T) - want).max() < 1e-4
 
 
@@ -61,31 +61,31 @@ def test_the_reduced_model_and_every_pillar_agree_on_it():
     derivatives by differences.
     """
     modes = np.random.default_rng(1).normal(0, 0.08, thinplate.MODES)
-    x = vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
+    x = parameter_vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0})
     whole = ForwardModel(b.lens(), SETTING, b.RESPONSE)
     before = whole.groups
-    model = whole.with_residual(modes, thinplate.basis)
+    model = whole.with_residual(modes, thinplate.thin_plate_basis)
     assert whole.groups is before  # a lens with a phase is another lens
     assert not any(len(group.residual) for group in before)
     found, slope = model.images(x, ["residual_3"])
-    plain = made.pillars(b.lens(), b.RESPONSE, x)
-    turned = made.pillars(b.lens(), b.RESPONSE, x, modes=modes)
-    old = made.pillars
-    made.pillars = lambda lens, response, values, **more: old(
+    plain = made.as_built_transmission(b.lens(), b.RESPONSE, x)
+    turned = made.as_built_transmission(b.lens(), b.RESPONSE, x, modes=modes)
+    old = made.as_built_transmission
+    made.as_built_transmission = lambda lens, response, values, **more: old(
         lens, response, values, modes=modes, **more
     )
     try:
-        want = bench.irradiance(
+        want = bench.bench_irradiance(
             b.lens(), b.truth(background_e=0.0, background_x_e=0.0), b.RESPONSE
         )
     finally:
-        made.pillars = old
+        made.as_built_transmission = old
     assert np.abs(turned - plain).max() > 0.3
     found = found * (found * want).sum() / (found**2).sum()
     assert np.abs(found - want).max() < 1e-3 * want.max()
     step = np.eye(thinplate.MODES)[3] * 1e-3
     up, down = (
-        model.with_residual(modes + s, thinplate.basis).images(x)[0]
+        model.with_residual(modes + s, thinplate.thin_plate_basis).images(x)[0]
         for s in (step, -step)
     )
     difference = (up - down) / 2e-3
@@ -106,8 +106,8 @@ def bumped(height_nm):
 
 
 def shots_of(lens, peak_e=8000.0):
-    light = bench.irradiance(lens, b.truth(), b.RESPONSE)
-    return b.capture(light * (peak_e / light.max()) + bench.background(b.truth()))
+    light = bench.bench_irradiance(lens, b.truth(), b.RESPONSE)
+    return b.capture(light * (peak_e / light.max()) + bench.background_plane(b.truth()))
 
 
 def test_a_patch_of_wrong_pillars_is_kept_as_a_phase_that_unseen_frames_confirm(
@@ -121,7 +121,7 @@ def test_a_patch_of_wrong_pillars_is_kept_as_a_phase_that_unseen_frames_confirm(
     )
     assert len(found.residual_modes) == thinplate.MODES
     assert any("beyond the parameters is kept" in words for words in found.cautions)
-    phase = np.tensordot(found.residual_modes, thinplate.basis(U, V), 1)
+    phase = np.tensordot(found.residual_modes, thinplate.thin_plate_basis(U, V), 1)
     true = np.exp(-((U - 0.45) ** 2 + (V + 0.3) ** 2) / 0.04) - np.exp(
         -((U + 0.4) ** 2 + (V - 0.5) ** 2) / 0.05
     )

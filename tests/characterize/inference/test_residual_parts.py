@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from characterize.inference import leastsquares, residual
-from characterize.inference.leastsquares import Data, Prior
+from characterize.inference.leastsquares import FitImages, GaussianPrior
 from characterize.model import MODES, PLACE, prior_rad
 
 RNG = np.random.default_rng(53)
@@ -24,7 +24,7 @@ def test_chi_square_is_of_good_pixels_none_of_which_counts_more_than_six_sigma()
     electrons = image + np.array([9.0, -13.0, 100.0, 7.0, 8.0]).reshape(1, 1, 5)
     usable = np.array([True, True, True, False, True]).reshape(1, 1, 5)
     full = np.array([False, False, False, False, True]).reshape(1, 1, 5)
-    data = Data(
+    data = FitImages(
         electrons, usable, full, np.full_like(image, 6.0), np.full_like(image, 0.8)
     )
     asked = []
@@ -55,7 +55,7 @@ def test_unknown_modes_take_from_the_parameters_what_marginals_say():
 
 
 def test_modes_stand_after_the_parameters_with_no_bounds():
-    prior = Prior(
+    prior = GaussianPrior(
         np.array([1.5, -2.0]),
         np.array([0.4, np.inf]),
         np.array([-3.0, -np.inf]),
@@ -78,7 +78,7 @@ def test_values_go_to_their_places_and_the_rest_to_the_modes():
         def with_residual(self, modes, basis):
             return Model(modes=modes)
 
-    of = residual.problem(Model(modes=None), NAMES, base)
+    of = residual.residual_phase_problem(Model(modes=None), NAMES, base)
     want = base.copy()
     want[PLACE["height_nm"]], want[PLACE["bias_nm"]] = -7.0, 4.0
     x, modes, wanted = of(np.array([-7.0, 4.0]), True)
@@ -113,7 +113,7 @@ def test_a_phase_is_kept_where_unseen_frames_gain_four_sigma_and_a_fiftieth(
     pixels = np.ones((4, 30, 26), bool)
     usable, full = pixels.copy(), ~pixels
     usable[:, 0, :], full[:, 1, 0:4] = False, True
-    data = Data(1.0 * pixels, usable, full, 1.0 * pixels, 1.0 * pixels)
+    data = FitImages(1.0 * pixels, usable, full, 1.0 * pixels, 1.0 * pixels)
     assert (usable & ~full).sum() == 3000
     model = SimpleNamespace(
         setting=SimpleNamespace(depth_um=np.array([3.0, 1.0, 2.0, 4.0]))
@@ -129,12 +129,14 @@ def test_a_phase_is_kept_where_unseen_frames_gain_four_sigma_and_a_fiftieth(
         return made if settings.finish else SimpleNamespace(value=begin)
 
     told = iter([before / 3, after / 4, 2 * before / 3, 3 * after / 4])
-    monkeypatch.setattr(residual, "problem", lambda here, names, base: None)
+    monkeypatch.setattr(
+        residual, "residual_phase_problem", lambda here, names, base: None
+    )
     monkeypatch.setattr(residual, "_misfit", lambda images, rest, x: next(told))
-    monkeypatch.setattr(leastsquares, "fit", fit)
+    monkeypatch.setattr(leastsquares, "fit_levenberg_marquardt", fit)
     start = np.array([2.0, -1.0])
-    got = residual.attempt(
-        model, data, NAMES, start, base=start, prior=Prior.none(start)
+    got = residual.fit_residual_phase(
+        model, data, NAMES, start, base=start, prior=GaussianPrior.none(start)
     )
     assert asked == [(p, False), (p + MODES, False)] * 2 + [(p + MODES, True)] * kept
     assert split == [[0, 1], [2, 3], [2, 3], [0, 1]]
@@ -158,14 +160,17 @@ def test_a_phase_is_kept_where_unseen_frames_gain_four_sigma_and_a_fiftieth(
 
 def test_three_frames_are_too_few_to_leave_any_out():
     data = SimpleNamespace(electrons=np.zeros((3, 5, 6)))
-    assert residual.attempt(None, data, NAMES, None, base=None, prior=None) is None
+    assert (
+        residual.fit_residual_phase(None, data, NAMES, None, base=None, prior=None)
+        is None
+    )
 
 
 def _solution(value, information):
     """All fields by name; those that are cut to the parameters tell which of them they
     are of.
     """
-    told = {field.name: None for field in dataclasses.fields(leastsquares.Solution)}
+    told = {field.name: None for field in dataclasses.fields(leastsquares.FitSolution)}
     size = len(value)
     told |= {
         "value": value,
@@ -173,4 +178,4 @@ def _solution(value, information):
         "information": information,
     }
     told |= {"beyond": np.arange(size), "slopes": np.arange(size) + 0.5}
-    return leastsquares.Solution(**told)
+    return leastsquares.FitSolution(**told)

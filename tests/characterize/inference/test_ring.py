@@ -13,7 +13,7 @@ import bench_lens as b
 from pictured import Pictured
 
 from characterize.inference import explore, leastsquares, search
-from characterize.inference.leastsquares import Prior
+from characterize.inference.leastsquares import GaussianPrior
 from characterize.model import PLACE
 
 NAMED = ("bias_nm", "bias_y_nm", "background_e")
@@ -23,7 +23,7 @@ PICTURES = np.linalg.qr(RNG.standard_normal((60, 3)))[0].T.reshape(
     3, 5, 4, 3
 )  # of unit length, at right angles
 PRODUCT, SQUARES, NOISE = 0.043, 0.013, 0.4
-PRIOR = Prior(
+PRIOR = GaussianPrior(
     np.array([1.7, 0.0, 0.0]),
     np.array([15.0, np.inf, np.inf]),
     np.full(3, -40.0),
@@ -71,7 +71,7 @@ def fitted(seen, begin):
     """
     frames = BRIGHT + seen[0] * PICTURES[0] + seen[1] * PICTURES[1] + 1.3 * PICTURES[2]
     about = b.given(Ring(), frames, NOISE, NAMED, PRIOR)
-    return about, leastsquares.fit(
+    return about, leastsquares.fit_levenberg_marquardt(
         about.problem(), about.data, np.array(begin), prior=PRIOR
     )
 
@@ -85,7 +85,7 @@ def test_ends_on_a_ring_are_those_of_the_least_over_a_grid(seen):
     held, and alike.
     """
     about, mode = fitted(seen, (4.0, 5.0, 0.0))
-    found = explore.explore(about, [mode])
+    found = explore.explore_posterior(about, [mode])
 
     fine = np.linspace(-25, 25, 2501)
     whole = rise(*np.meshgrid(fine, fine, indexing="ij"), seen)
@@ -112,7 +112,7 @@ def test_intervals_on_a_ring_are_those_of_the_grid_wherever_the_fit_began(seen, 
     one or two: 5 % of the width, of
     which steps between points of the grid are 0.2 %."""
     about, mode = fitted(seen, begin)
-    found = explore.explore(about, search.mirrored(about, [mode]))
+    found = explore.explore_posterior(about, search.add_mirrored_starts(about, [mode]))
     fine = np.linspace(-30, 30, 3001)
     whole = rise(*np.meshgrid(fine, fine, indexing="ij"), seen)
     for name, low, high, axis in zip(

@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import explore, posterior, search
-from characterize.inference.arrange import Arrangement
-from characterize.model import ForwardModel, vector
+from characterize.inference.arrange import FrameArrangement
+from characterize.model import ForwardModel, parameter_vector
 
 JUDGED = (
     "bias_nm",
@@ -47,11 +47,11 @@ class Counted:
 
 def fitted():
     data, model = b.near_focus(b.DEPTHS, **HIDDEN)
-    found = Arrangement(0, 0, (0, 0), 1, np.arange(5), False, True, 0, False, ())
-    about = search.Task(model, data, vector({}), {}, found)
-    gain = search.starts(about, biases_nm=(0.0,))[0][search.PLACE["log_gain"]]
-    begin = vector(HIDDEN | {"log_gain": float(gain)})
-    return about, search.refine(
+    found = FrameArrangement(0, 0, (0, 0), 1, np.arange(5), False, True, 0, False, ())
+    about = search.SearchTask(model, data, parameter_vector({}), {}, found)
+    gain = search.starting_points(about, biases_nm=(0.0,))[0][search.PLACE["log_gain"]]
+    begin = parameter_vector(HIDDEN | {"log_gain": float(gain)})
+    return about, search.refine_fit(
         about, begin[[search.PLACE[name] for name in about.names]]
     )
 
@@ -102,7 +102,7 @@ def test_the_misfit_has_risen_by_384_where_intervals_end(monkeypatch):
     """
     about, mode = fitted()
     asked = Counted(monkeypatch)
-    found = explore.explore(about, [mode])
+    found = explore.explore_posterior(about, [mode])
     assert asked.images < 4 * 38
     assert asked.slopes < 38
     assert len(found.profiles) == 19

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from characterize.inference import search
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 
 COVARIANCE = np.array([[0.04, 0.03], [0.03, 0.25]])
 
@@ -31,7 +31,7 @@ def test_ends_are_kept_best_first_where_they_lie_a_sigma_apart_and_explain_as_mu
         end([2.0, 5.0], 11.0),
     )
     far = end([-2.0, 5.0], 10.0 + search.MODES_WITHIN + 0.1)
-    assert search.distinct([far, other, twin, best]) == [best, other]
+    assert search.distinct_modes([far, other, twin, best]) == [best, other]
 
 
 def test_a_wider_search_that_leaves_the_model_s_range_is_none(monkeypatch):
@@ -48,9 +48,9 @@ def test_a_wider_search_that_leaves_the_model_s_range_is_none(monkeypatch):
             raise ZeroDivisionError
         return ["an end"]
 
-    monkeypatch.setattr(search, "search", searched)
-    assert search.wider("more parameters", np.array([1.0, 2.0])) == ["an end"]
+    monkeypatch.setattr(search, "search_modes", searched)
+    assert search.widen_search("more parameters", np.array([1.0, 2.0])) == ["an end"]
     assert asked == [("more parameters", [[1.0, 2.0]])]
-    assert search.wider("refused", np.array([1.0, 2.0])) is None
+    assert search.widen_search("refused", np.array([1.0, 2.0])) is None
     with pytest.raises(ZeroDivisionError):
-        search.wider("broken", np.array([1.0, 2.0]))
+        search.widen_search("broken", np.array([1.0, 2.0]))

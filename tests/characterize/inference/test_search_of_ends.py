@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from characterize.inference import ends
-from characterize.inference.ends import End, Search
+from characterize.inference.ends import ConfidenceLimit, LimitSearch
 
 REACH = 1.959964
 SIGMA = np.array([0.7, 2.1])
@@ -42,10 +42,14 @@ def four(**more):
     of 3.08 of the second.
     """
     found = {
-        (0, -1): End(-0.5, [(-0.2, 1.0)], [(np.array([-0.4, 3.08]), 2.0)], steps=3),
-        (0, 1): End(2.9, [(2.0, 2.0)], [(np.array([2.5, -4.0]), 1.0)], steps=3),
-        (1, -1): End(-8.0, [(-7.0, 2.5)], [], steps=3),
-        (1, 1): End(3.0, [(2.0, 3.0)], [], steps=3),
+        (0, -1): ConfidenceLimit(
+            -0.5, [(-0.2, 1.0)], [(np.array([-0.4, 3.08]), 2.0)], steps=3
+        ),
+        (0, 1): ConfidenceLimit(
+            2.9, [(2.0, 2.0)], [(np.array([2.5, -4.0]), 1.0)], steps=3
+        ),
+        (1, -1): ConfidenceLimit(-8.0, [(-7.0, 2.5)], [], steps=3),
+        (1, 1): ConfidenceLimit(3.0, [(2.0, 3.0)], [], steps=3),
     }
     return found | more
 
@@ -58,13 +62,13 @@ def test_ends_are_asked_from_each_mode_at_the_level_of_the_misfit(monkeypatch):
     begins only where it may reach on.
     """
     told = Told(four())
-    monkeypatch.setattr(ends, "end", told)
+    monkeypatch.setattr(ends, "find_limit", told)
     second = valley((4.0, -3.5), above=2.0)
     hopeless, little = (
         valley((7.0, 9.0), above=GOAL**2 + 0.1),
         valley((1.0, -3.0), above=GOAL**2 - 0.5),
     )
-    search = Search(None, MODE, None, [valley(), second, hopeless, little])
+    search = LimitSearch(None, MODE, None, [valley(), second, hopeless, little])
     assert [k for k, *_ in search._begins(1, 1)] == [-1, -2, -4]
     assert search.ends(WANTED) == []
     for _, i, _, goal, _, most, _ in told.asked:
@@ -84,7 +88,7 @@ def test_ends_are_asked_from_each_mode_at_the_level_of_the_misfit(monkeypatch):
             reach[order[1], i, sign] > end + 0.1 * SIGMA[i]
         )
         assert mine == want
-    few = Search(
+    few = LimitSearch(
         None, SimpleNamespace(value=MODE.value, chi2_per_dof=0.5), None, [valley()]
     )
     assert few._level == pytest.approx(
@@ -93,10 +97,10 @@ def test_ends_are_asked_from_each_mode_at_the_level_of_the_misfit(monkeypatch):
 
 
 def test_slopes_met_by_one_end_are_known_to_those_asked_later_and_once(monkeypatch):
-    monkeypatch.setattr(ends, "end", Told(four()))
+    monkeypatch.setattr(ends, "find_limit", Told(four()))
     one = valley()
     one.met = ("before",)
-    search = Search(None, MODE, None, [one])
+    search = LimitSearch(None, MODE, None, [one])
     search.ends(WANTED[:2])
     assert search._valleys[-1].met == ("before", (0, -1), (0, 1))
     search.ends(WANTED[2:])
@@ -108,8 +112,8 @@ def test_a_place_beyond_an_end_is_asked_once_and_the_farther_end_stays(monkeypat
     near; 3.3 is asked. So is -0.56
     too near to -0.5 of an interval of 3.4."""
     told = Told(four())
-    monkeypatch.setattr(ends, "end", told)
-    search = Search(None, MODE, None, [valley()])
+    monkeypatch.setattr(ends, "find_limit", told)
+    search = LimitSearch(None, MODE, None, [valley()])
     search.ends(WANTED[2:])
     assert search.beyond() == []  # nothing met yet
     search.ends(WANTED[:2])
@@ -118,7 +122,9 @@ def test_a_place_beyond_an_end_is_asked_once_and_the_farther_end_stays(monkeypat
     search.ends(WANTED[:2])
     assert search.beyond() == []
     far = np.array([0.2, 3.3])
-    told.by[1, 1] = End(2.7, [], [(far, 3.0), (np.array([-0.66, 1.0]), 3.0)], steps=2)
+    told.by[1, 1] = ConfidenceLimit(
+        2.7, [], [(far, 3.0), (np.array([-0.66, 1.0]), 3.0)], steps=2
+    )
     assert search.ends([(1, 1, (-1, None, 9.0))]) == []
     assert search._found[1, 1].place == 3.0  # what was found before lies farther
     (low, high) = sorted(search.beyond())
@@ -132,8 +138,8 @@ def test_a_place_beyond_an_end_is_asked_once_and_the_farther_end_stays(monkeypat
     assert (high[2][0], high[2][1].tolist(), high[2][2]) == (-1, far.tolist(), 3.3)
     assert search.beyond() == []
     told.by[1, 1], told.by[0, -1] = (
-        End(3.6, [], [], steps=2),
-        End(-0.7, [], [], steps=2),
+        ConfidenceLimit(3.6, [], [], steps=2),
+        ConfidenceLimit(-0.7, [], [], steps=2),
     )
     search.ends([low, high])
     assert told.asked[-2][4].tolist() == [-0.66, 1.0]
@@ -149,24 +155,28 @@ def test_an_end_that_was_not_found_is_asked_again_from_a_place_as_far_and_told(
     is not a fiftieth farther again."""
     told = Told(
         four()
-        | {(1, 1): End(3.0, [], [(np.array([0.0, 2.8]), 3.0)], steps=3, done=False)}
+        | {
+            (1, 1): ConfidenceLimit(
+                3.0, [], [(np.array([0.0, 2.8]), 3.0)], steps=3, done=False
+            )
+        }
     )
     told.by[0, -1].met.clear()
-    monkeypatch.setattr(ends, "end", told)
-    search = Search(None, MODE, None, [valley()])
+    monkeypatch.setattr(ends, "find_limit", told)
+    search = LimitSearch(None, MODE, None, [valley()])
     search.ends(WANTED)
     (again,) = search.beyond()
     assert again[:2] == (1, 1)
     assert again[2][1].tolist() == [0.0, 2.8]
     assert search.beyond() == []
-    told.by[1, 1] = End(2.9, [], [(np.array([0.0, 2.95]), 3.0)], steps=3)
+    told.by[1, 1] = ConfidenceLimit(2.9, [], [(np.array([0.0, 2.95]), 3.0)], steps=3)
     search.ends([again])
     assert search.beyond() == []
     assert search.profile(1).found == (
         True,
         False,
     )  # what is known reaches to 3, and was not the end
-    told.by[1, 1] = End(3.1, [], [], steps=3)
+    told.by[1, 1] = ConfidenceLimit(3.1, [], [], steps=3)
     search.ends([again])
     assert search.profile(1).found == (True, True)
 
@@ -174,9 +184,11 @@ def test_an_end_that_was_not_found_is_asked_again_from_a_place_as_far_and_told(
 def test_places_below_the_mode_are_told(monkeypatch):
     lower = np.array([0.1, -2.0])
     monkeypatch.setattr(
-        ends, "end", Told(four() | {(1, 1): End(3.0, [], [], lower, 2)})
+        ends,
+        "find_limit",
+        Told(four() | {(1, 1): ConfidenceLimit(3.0, [], [], lower, 2)}),
     )
-    found = Search(None, MODE, None, [valley()]).ends(WANTED)
+    found = LimitSearch(None, MODE, None, [valley()]).ends(WANTED)
     assert len(found) == 1
     assert found[0] is lower
 
@@ -185,8 +197,8 @@ def test_a_profile_is_what_was_seen_on_the_way_to_both_ends(monkeypatch):
     """Of the second: -8 to 3 about -3 where the parabola has 1.96 · 1.2 · 2.1 = 4.9 to
     either side: 6 is too far.
     """
-    monkeypatch.setattr(ends, "end", Told(four()))
-    search = Search(
+    monkeypatch.setattr(ends, "find_limit", Told(four()))
+    search = LimitSearch(
         None, MODE, None, [valley(), valley((9.0, 9.0), sigma=(99.0, 99.0))]
     )
     search.ends(WANTED)
@@ -231,14 +243,14 @@ def test_a_profile_along_a_walk_is_the_walk_between_what_was_seen_and_its_own_st
     curve between -5 and 1.8.
     """
     asked = []
-    monkeypatch.setattr(ends, "end", Told(four()))
+    monkeypatch.setattr(ends, "find_limit", Told(four()))
     monkeypatch.setattr(
         ends,
         "valley_of",
         lambda task, at, rise: asked.append((at, rise)) or valley(at.value),
     )
     by = walk([[1.0, -3.0], [0.0, -5.0], [2.0, 1.8], [3.0, 8.0]], [0.0, 3.0, 5.0, 5.6])
-    search = Search(None, MODE, by, [valley()])
+    search = LimitSearch(None, MODE, by, [valley()])
     assert [(k, begin, x.tolist()) for k, begin, x in search._met] == [
         (0, None, [1.0, -3.0]), (1, None, [0.0, -5.0]), (2, None, [2.0, 1.8])
     ]  # fmt: skip
@@ -260,11 +272,11 @@ def test_a_walk_beyond_both_ends_gives_way_to_what_was_seen_there(monkeypatch):
     """Stops from -9.5 to 9: the curve between -6.8, the nearest that the lower end has
     seen, and 2.
     """
-    low = End(-8.0, [(-7.0, 2.5), (-6.8, 2.4)], [], steps=3)
-    high = End(3.0, [(1.9, 2.9), (2.0, 3.0)], [], steps=3)
-    monkeypatch.setattr(ends, "end", Told(four() | {(1, -1): low, (1, 1): high}))
+    low = ConfidenceLimit(-8.0, [(-7.0, 2.5), (-6.8, 2.4)], [], steps=3)
+    high = ConfidenceLimit(3.0, [(1.9, 2.9), (2.0, 3.0)], [], steps=3)
+    monkeypatch.setattr(ends, "find_limit", Told(four() | {(1, -1): low, (1, 1): high}))
     monkeypatch.setattr(ends, "valley_of", lambda task, at, rise: valley(at.value))
-    search = Search(
+    search = LimitSearch(
         None,
         MODE,
         walk([[1.0, -9.5], [0.0, 9.0], [2.0, 1.7]], [2.0, 3.0, 5.0]),
@@ -280,8 +292,10 @@ def test_a_begin_must_reach_beyond_the_farthest_end_so_far(monkeypatch):
     than 0.07.
     """
     places = iter([3.0, 5.0, 9.0])
-    monkeypatch.setattr(ends, "end", lambda *_, **__: End(next(places), [], []))
-    search = Search(None, MODE, None, [valley()])
+    monkeypatch.setattr(
+        ends, "find_limit", lambda *_, **__: ConfidenceLimit(next(places), [], [])
+    )
+    search = LimitSearch(None, MODE, None, [valley()])
     begins = [(-1, None, reach) for reach in (6.0, 5.5, 4.5, 5.06)]
     found = search._farthest(((0, 1, begins), search._valleys))
     assert [one.place for _, one in found] == [3.0, 5.0]

@@ -13,9 +13,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import leastsquares, posterior, search, walk
-from characterize.inference.arrange import Arrangement
-from characterize.inference.leastsquares import Settings
-from characterize.model import NAMES, PLACE, Known, vector
+from characterize.inference.arrange import FrameArrangement
+from characterize.inference.leastsquares import SolverSettings
+from characterize.model import NAMES, PLACE, KnownValue, parameter_vector
 from tests.referees.one_profile import profile
 
 DEPTHS = (560.0, 600.0, 640.0)
@@ -42,20 +42,20 @@ def about():
         "spherical_rad": 0.11,
     }
     data, model = b.near_focus(DEPTHS, **values)
-    held = {name: Known(name, 0.0) for name in NAMES if name not in FREE}
-    laid = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
-    task = search.Task(model, data, vector(), held, laid)
+    held = {name: KnownValue(name, 0.0) for name in NAMES if name not in FREE}
+    laid = FrameArrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
+    task = search.SearchTask(model, data, parameter_vector(), held, laid)
     begin = np.zeros(len(task.names))
-    light = model.images(vector())[0]
+    light = model.images(parameter_vector())[0]
     begin[task.names.index("log_gain")] = math.log(
         (light * data.electrons).sum() / (light**2).sum()
     )
-    return task, search.refine(task, begin)
+    return task, search.refine_fit(task, begin)
 
 
 def valley(about):
     task, mode = about
-    return posterior.Valley(
+    return posterior.LocalMode(
         task.problem(),
         task.data,
         mode.value,
@@ -125,7 +125,9 @@ def test_stops_between_two_of_a_walk_are_as_low_as_with_slopes_of_their_own(abou
     )
     for one in stops:
         held = walk._holding(task.prior, i, float(one.value[i]))
-        best = leastsquares.fit(*part, one.value, prior=held, settings=Settings())
+        best = leastsquares.fit_levenberg_marquardt(
+            *part, one.value, prior=held, settings=SolverSettings()
+        )
         least = walk._measured(task, task.data, best.value, best.image)
         assert one.merit == pytest.approx(least, abs=0.1)
 
@@ -138,7 +140,7 @@ def test_derivatives_that_are_put_together_are_central_differences(about, name):
     the 8e-3 of all derivatives.
     """
     model = about[0].model
-    x = vector(
+    x = parameter_vector(
         {
             "stage_zero_um": 4.0,
             "spherical_rad": 0.11,

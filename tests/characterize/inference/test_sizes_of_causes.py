@@ -15,7 +15,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import causes
-from characterize.model import MODES, PLACE, Known, Setting, prior_rad, unstated, vector
+from characterize.model import (
+    MODES,
+    PLACE,
+    FrameSetting,
+    KnownValue,
+    parameter_vector,
+    prior_rad,
+    type_b_sigma,
+)
 from metalens.fabrication import WavefrontError, named
 from metalens.lens import Lens
 
@@ -44,7 +52,7 @@ class Sensor:
     margin: int = 4
     fill: float = 1.0
     oversample: int = 2
-    edges = Setting.edges
+    edges = FrameSetting.edges
     glow: float = 1.0
 
 
@@ -99,13 +107,13 @@ class Asked:
 
 
 def found(names=("bias_nm",), known=None, unfitted=None):
-    x = vector({"bias_nm": 2.0, "background_e": 1.5, "index": 0.004})
+    x = parameter_vector({"bias_nm": 2.0, "background_e": 1.5, "index": 0.004})
     task = Asked(Model(), names, known or {}, unfitted or {})
     image = task.model.images(x)[0]
     slopes = {
         name: SLOPES[PLACE[name]] for name in ("stage_zero_um", *named(WavefrontError))
     }
-    return {one.cause: one for one in causes.changes(task, x, slopes)}, image
+    return {one.cause: one for one in causes.systematic_changes(task, x, slopes)}, image
 
 
 def test_a_stated_wall_is_reckoned_with_by_the_mean_square_of_its_angle():
@@ -113,8 +121,8 @@ def test_a_stated_wall_is_reckoned_with_by_the_mean_square_of_its_angle():
     is stated, whatever it is.
     """
     stated = {
-        "sidewall_deg": Known("sidewall_deg", 1.2, 0.5),
-        "index": Known("index", 0.03, 0.004),
+        "sidewall_deg": KnownValue("sidewall_deg", 1.2, 0.5),
+        "index": KnownValue("index", 0.03, 0.004),
     }
     every, _ = found(known=stated)
     assert every["a tilted side wall"].sigma == pytest.approx(1.3 / 0.5)
@@ -132,7 +140,7 @@ def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
     x, then y.
     """
     x, every = (
-        vector(),
+        parameter_vector(),
         {
             name: SLOPES[PLACE[name]]
             for name in ("decentre_x_um", "decentre_y_um", "stage_zero_um")
@@ -144,7 +152,9 @@ def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
     task = Asked(Model(groups=groups), ("bias_nm",), {}, unfitted)
     every |= {name: SLOPES[PLACE[name]] for name in named(WavefrontError)}
     (found,) = [
-        one for one in causes.changes(task, x, every) if one.cause == causes.WINDOWS
+        one
+        for one in causes.systematic_changes(task, x, every)
+        if one.cause == causes.WINDOWS
     ]
     want = np.zeros((4, *SHAPE))
     for k, (frame, name) in enumerate(
@@ -155,7 +165,7 @@ def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
     assert found.sigma == pytest.approx(sigma)
     one = replace(task, model=Model(groups=groups[:1]))
     assert causes.WINDOWS not in [
-        cause.cause for cause in causes.changes(one, x, every)
+        cause.cause for cause in causes.systematic_changes(one, x, every)
     ]
 
 
@@ -188,15 +198,15 @@ def test_what_is_fitted_or_stated_exactly_is_no_cause():
     assert "a tilt of the lens about y" not in every
     assert "a plate of glass in the beam" not in every
     assert "uneven illumination" not in every
-    none, _ = found(known={"glass_um": Known("glass_um", 0.0)})
+    none, _ = found(known={"glass_um": KnownValue("glass_um", 0.0)})
     assert not [cause for cause in none if "of glass about" in cause]
     assert (
         none["a plate of glass in the beam"].frees == ()
     )  # looked for by name, and kept as it is stated
     some, _ = found(
         known={
-            "glass_um": Known("glass_um", 90.0, 5.0),
-            "light_y": Known("light_y", 0.0),
+            "glass_um": KnownValue("glass_um", 90.0, 5.0),
+            "light_y": KnownValue("light_y", 0.0),
         }
     )
     assert some["a plate of glass in the beam"].frees == ("glass_um",)
@@ -225,7 +235,7 @@ def test_the_page_says_the_sizes_that_are_reckoned_with():
         return [float(n) for n in re.findall(r"[0-9.]*[0-9]", row.split("|")[2])]
 
     def sizes(*names):
-        return [unstated(name, LENS) for name in names]
+        return [type_b_sigma(name, LENS) for name in names]
 
     four = sizes("bandwidth_nm", "tilt_x_deg", "index", "bias_a_nm")
     assert numbers(
@@ -236,4 +246,4 @@ def test_the_page_says_the_sizes_that_are_reckoned_with():
     assert numbers("pixel pitch") == sizes("pixel_percent")
     assert numbers("turn of the camera against the lens") == sizes("camera_turn_deg")
     assert numbers("write fields of the mask out of place") == sizes("stitching_nm")
-    assert numbers("side wall")[0] == unstated("sidewall_deg", LENS)
+    assert numbers("side wall")[0] == type_b_sigma("sidewall_deg", LENS)

@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import causes
-from characterize.inference.missing import CHANCE, look
-from characterize.inference.search import Task, refine
-from characterize.model import PLACE, ForwardModel, Setting, vector
+from characterize.inference.missing import CHANCE, run_score_tests
+from characterize.inference.search import SearchTask, refine_fit
+from characterize.model import PLACE, ForwardModel, FrameSetting, parameter_vector
 
 _DEPTHS = 420.0, 600.0, 1050.0
 _WIDE_UM, _FINE = 1.5, 10  # a pixel, and how many fine ones it is wide
@@ -30,7 +30,7 @@ def at_rows(share: float) -> np.ndarray:
     """(5, 17, 17) light of pixels that lie ``share`` times as far apart each way, as
     wide as ever.
     """
-    setting = Setting(
+    setting = FrameSetting(
         np.array(b.DEPTHS),
         np.zeros((5, 2)),
         np.ones(5),
@@ -39,7 +39,7 @@ def at_rows(share: float) -> np.ndarray:
         17,
         fill=1 / share,
     )
-    x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
+    x = parameter_vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
     return np.asarray(ForwardModel(b.lens(), setting, b.RESPONSE).images(x)[0])
 
 
@@ -49,10 +49,10 @@ def test_they_lie_farther_apart_along_one_axis_alone():
 
     Models of their own for each pitch: fields to 5e-4, light to twice that.
     """
-    setting = Setting(
+    setting = FrameSetting(
         np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), _WIDE_UM, 17, 17
     )
-    x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
+    x = parameter_vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
     (tall,) = causes.seen_at(model, x, [np.diag([1.06, 1.0])])
     apart, plain = at_rows(1.06), at_rows(1.0)
@@ -67,10 +67,10 @@ def summed(rows: int) -> np.ndarray:
     middle one about the axis.
     """
     count = 17 * max(_FINE, rows)
-    setting = Setting(
+    setting = FrameSetting(
         np.array(_DEPTHS), np.zeros((3, 2)), np.ones(3), _WIDE_UM / _FINE, count, count
     )
-    x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25 * _FINE})
+    x = parameter_vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25 * _FINE})
     light = ForwardModel(b.lens(), setting, b.RESPONSE).images(x)[0]
     y, x0 = ((count - 16 * side) // 2 for side in (rows, _FINE))
     part = light[:, y : y + 16 * rows, x0 : x0 + 16 * _FINE]
@@ -85,9 +85,13 @@ def test_a_fit_that_knows_of_square_pixels_names_them_first():
     light = light * (6000 / light.max())
     electrons = light + np.random.default_rng(4).normal(0, np.sqrt(light + 9))
     data, model = b.near_focus(_DEPTHS)
-    x = vector(_PLACE | {"crosstalk_px": 0.25})
+    x = parameter_vector(_PLACE | {"crosstalk_px": 0.25})
     x[PLACE["log_gain"]] = np.log(6000 / model.images(x)[0].max())
-    task = Task(model, dataclasses.replace(data, electrons=electrons), x, {}, None)
-    first = look(task, refine(task, x[[PLACE[name] for name in task.names]])).leans[0]
+    task = SearchTask(
+        model, dataclasses.replace(data, electrons=electrons), x, {}, None
+    )
+    first = run_score_tests(
+        task, refine_fit(task, x[[PLACE[name] for name in task.names]])
+    ).leans[0]
     assert first.cause == "pixels that are not as high as wide"
     assert first.chance < CHANCE

@@ -14,12 +14,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import causes
-from characterize.inference.search import Task
-from characterize.model import vector
+from characterize.inference.search import SearchTask
+from characterize.model import parameter_vector
 
 WAYS = {"coma": (1, 0.23, -0.11), "trefoil": (3, -0.12, 0.17)}
 DATA, MODEL = b.near_focus((420.0, 760.0))
-TASK = Task(MODEL, DATA, vector(), {}, None)
+TASK = SearchTask(MODEL, DATA, parameter_vector(), {}, None)
 
 
 def bent(turn_deg):
@@ -31,7 +31,7 @@ def bent(turn_deg):
         turned = complex(x, y) * np.exp(1j * times * math.radians(turn_deg))
         out |= {f"{name}_x_rad": turned.real, f"{name}_y_rad": turned.imag}
     both = complex(0.19, -0.14) * np.exp(2j * math.radians(turn_deg))
-    return vector(
+    return parameter_vector(
         out
         | {
             "astigmatism_rad": both.real,
@@ -70,13 +70,13 @@ def test_it_is_reckoned_with_at_one_degree_or_as_stated(stated, wanted):
     slopes = {"stage_zero_um": np.zeros_like(DATA.electrons)}
     (turned,) = [
         one
-        for one in causes.changes(task, bent(0.0), slopes)
+        for one in causes.systematic_changes(task, bent(0.0), slopes)
         if one.cause == "a camera that is turned"
     ]
     assert turned.sigma == pytest.approx(wanted)  # of half a degree
     assert turned.amount == 0.5
     assert not [
         one
-        for one in causes.changes(task, vector(), slopes)
+        for one in causes.systematic_changes(task, parameter_vector(), slopes)
         if one.cause == "a camera that is turned"
     ]

@@ -7,8 +7,8 @@ import pytest
 from scipy import optimize
 
 from characterize.inference import posterior
-from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import Valley
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.inference.posterior import LocalMode
 
 RNG = np.random.default_rng(71)
 SHAPE, SIGMA = (2, 5, 7), 0.37
@@ -29,20 +29,20 @@ def data(noise=0.0):
     """Of the mode, with noise of one size; shot noise is none of it."""
     everywhere = np.ones(SHAPE, bool)
     seen = straight(MODE, False)[0] + SIGMA * noise
-    return Data(
+    return FitImages(
         seen, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15)
     )
 
 
 def valley(model=straight, *, of=None, known=None, **bounds):
-    free = Prior.none(MODE)
-    prior = Prior(
+    free = GaussianPrior.none(MODE)
+    prior = GaussianPrior(
         free.mean,
         free.sigma,
         bounds.get("low", free.low),
         bounds.get("high", free.high),
     )
-    return Valley(model, of or data(), MODE, prior, known=known)
+    return LocalMode(model, of or data(), MODE, prior, known=known)
 
 
 def test_an_outlier_is_held_at_the_root_of_six_times_its_sigma():
@@ -109,12 +109,16 @@ def test_slopes_that_are_wrong_by_a_factor_are_right_after_one_step(factor, left
         return bright + SIGMA * x[0] * slope[0], SIGMA * slope if jacobian else None
 
     everywhere = np.ones(SHAPE, bool)
-    of = Data(
+    of = FitImages(
         bright, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15)
     )
     mode = np.zeros(1)
-    one = Valley(
-        model, of, mode, Prior.none(mode), known=(bright, factor * SIGMA * slope)
+    one = LocalMode(
+        model,
+        of,
+        mode,
+        GaussianPrior.none(mode),
+        known=(bright, factor * SIGMA * slope),
     )
     got, _ = one.descend(np.array([4.0]), rounds=2, least=0.0)
     assert got[0] == pytest.approx(4.0 * left, abs=2e-5)
@@ -132,7 +136,7 @@ def test_slopes_explain_what_a_step_missed_by_the_least_change_and_stay_after_on
     step *= sigma / np.linalg.norm(COLUMNS @ step)
     metric = COLUMNS.T @ COLUMNS
     other -= (other @ metric @ step) / (step @ metric @ step) * step
-    got = posterior.secant(COLUMNS, step, missed) - COLUMNS
+    got = posterior.broyden_update(COLUMNS, step, missed) - COLUMNS
     assert got @ other == pytest.approx(0, abs=1e-12 / sigma)
     assert got @ step == pytest.approx(missed * (sigma > 0.01), abs=1e-12)
 

@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import explore, leastsquares, search, walk
-from characterize.inference.arrange import Arrangement
-from characterize.inference.leastsquares import Data, Prior
-from characterize.model import NAMES, PLACE, Known, vector
-from characterize.model.setting import Setting
+from characterize.inference.arrange import FrameArrangement
+from characterize.inference.leastsquares import FitImages, GaussianPrior
+from characterize.model import NAMES, PLACE, KnownValue, parameter_vector
+from characterize.model.setting import FrameSetting
 
 NAMED = ("bias_nm", "height_nm", "background_e")
 DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
@@ -36,7 +36,7 @@ class Double:
 
     def __init__(self, index=None):
         self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(
+        self.setting = FrameSetting(
             DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3
         )
         self.groups = [SimpleNamespace(index=np.arange(len(index)))]
@@ -65,7 +65,7 @@ class Double:
 
 def prior(mean, sigma):
     wide = np.array([26.0, 99.0, 99.0])
-    return Prior(
+    return GaussianPrior(
         np.array([mean, 0.0, 0.0]), np.array([sigma, np.inf, np.inf]), -wide, wide
     )
 
@@ -82,7 +82,7 @@ def task(known):
 
 def at(about, bias):
     """A fit to the end from the valley of a bias."""
-    return leastsquares.fit(
+    return leastsquares.fit_levenberg_marquardt(
         about.problem(), about.data, np.array([bias, HEIGHT, 0.0]), prior=about.prior
     )
 
@@ -107,7 +107,7 @@ def test_both_valleys_are_found_and_the_interval_is_their_hull():
     """
     known = prior(0.0, 15.0)
     about = task(known)
-    found = explore.explore(about, [at(about, ROOTS[1])])
+    found = explore.explore_posterior(about, [at(about, ROOTS[1])])
     fine = np.linspace(-25, 25, 200001)
     curve = rise(fine, known) - rise(fine, known).min()
     inside = fine[curve < 3.8415]
@@ -130,7 +130,7 @@ def test_both_valleys_are_found_and_the_interval_is_their_hull():
 def test_draws_lie_in_both_valleys_as_often_as_the_density_says():
     known = prior(4.0, 15.0)
     about = task(known)
-    found = explore.explore(about, [at(about, ROOTS[1])])
+    found = explore.explore_posterior(about, [at(about, ROOTS[1])])
     fine = np.linspace(-25, 25, 200001)
     density = np.exp(-rise(fine, known) / 2)
     share = density[fine < 2.5].sum() / density.sum()
@@ -151,7 +151,7 @@ def test_a_far_better_valley_replaces_the_fit():
     about = task(prior(ROOTS[0], 3.0))
     other = at(about, ROOTS[1])
     assert other.value[0] > 10
-    found = explore.explore(about, [other])
+    found = explore.explore_posterior(about, [other])
     assert len(found.modes) == 1
     assert found.best.value[0] == pytest.approx(ROOTS[0], abs=0.01)
     assert found.high[0] < ROOTS[0] + 3
@@ -165,7 +165,7 @@ def test_a_walk_between_two_stops_keeps_to_the_lower_of_each_place():
             information=np.diag([4.0, 9.0, 25.0]),
         )
 
-    seen = walk.Walk.of(
+    seen = walk.ProfileScan.of(
         task(prior(0.0, 15.0)),
         [stop(3.0, 8.0), stop(-1.0, 5.0), stop(3.0, 6.0), stop(1.0, 7.0)],
         0,
@@ -189,14 +189,14 @@ def test_misfit_of_a_pixel_is_the_integral_of_its_score(seen, light):
     """
     floor, scale = 7.3, 1.9
     one = np.array([[[seen]]])
-    data = Data(
+    data = FitImages(
         one,
         one == one,
         one != one,
         np.full(one.shape, floor),
         np.full(one.shape, scale),
     )
-    about = SimpleNamespace(prior=Prior.none(np.zeros(1)))
+    about = SimpleNamespace(prior=GaussianPrior.none(np.zeros(1)))
     got = walk._measured(about, data, np.zeros(1), np.array([[[light]]]))
     score, ends = (
         lambda t: (seen - t) / (floor + max(t, 0.0) / scale),
@@ -215,25 +215,25 @@ def test_the_ends_of_a_lens_s_bent_bias_are_where_another_solver_finds_the_rise(
     data, model = b.near_focus(depths, **values)
     electrons = data.electrons
     free = {"bias_nm", "stage_zero_um", "log_gain", "background_e", "crosstalk_px"}
-    start = vector({"crosstalk_px": 0.2})
+    start = parameter_vector({"crosstalk_px": 0.2})
     held = {
-        name: Known(name, float(start[PLACE[name]]))
+        name: KnownValue(name, float(start[PLACE[name]]))
         for name in NAMES
         if name not in free
     }
-    about = search.Task(
+    about = search.SearchTask(
         model,
         data,
         start,
         held,
-        Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ()),
+        FrameArrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ()),
     )
     place = [about.names.index(name) for name in ("bias_nm", "log_gain")]
     light = model.images(start)[0]
     begin = np.array([start[PLACE[name]] for name in about.names])
     begin[place[1]] = np.log((light * electrons).sum() / (light**2).sum())
-    mode = search.refine(about, begin)
-    low, high = walk.walk(about, [mode], "bias_nm").interval(3.8415)
+    mode = search.refine_fit(about, begin)
+    low, high = walk.scan_profile(about, [mode], "bias_nm").interval(3.8415)
     sigma, others = (
         np.sqrt(np.diag(mode.covariance)),
         np.delete(np.arange(len(begin)), place[0]),

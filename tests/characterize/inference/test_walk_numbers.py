@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from characterize.inference import walk
-from characterize.inference.leastsquares import Prior, Solution
-from characterize.inference.walk import Walk
+from characterize.inference.leastsquares import FitSolution, GaussianPrior
+from characterize.inference.walk import ProfileScan
 
 
 def prior(mean=3.0, sigma=4.0, low=-5.0, high=99.0):
     free = np.full(2, np.inf)
-    return Prior(
+    return GaussianPrior(
         np.array([0.0, mean, 0.0]),
         np.array([np.inf, sigma, np.inf]),
         np.r_[-free[0], low, -9.0],
@@ -36,7 +36,7 @@ def mode(value=1.0, sigma=0.7, merit=20.0, **more):
         "beyond": np.zeros(3)
     }
     ended = {"chi2_per_dof": 1.0, "converged": True, "reason": "made", "iterations": 1}
-    return Solution(**nothing | ended | known | more)
+    return FitSolution(**nothing | ended | known | more)
 
 
 def test_a_walk_goes_two_and_a_half_prior_sigma_to_either_side_within_the_bounds():
@@ -81,11 +81,13 @@ def test_valleys_are_walked_in_steps_of_their_sigma_up_to_fourteen_variances_abo
         data=None,
     )
     for passes in (False, True):
-        monkeypatch.setattr(Walk, "passes", lambda self, value, passes=passes: passes)
+        monkeypatch.setattr(
+            ProfileScan, "passes", lambda self, value, passes=passes: passes
+        )
         for sigma, step in ((0.7, 0.7), (2.0, 1.4)):
             sides.clear()
             modes = [mode(1.0, 0.3), mode(6.0, sigma)]
-            made = walk.walk(about, modes, "bias_nm", widened=1.5)
+            made = walk.scan_profile(about, modes, "bias_nm", widened=1.5)
             assert [s[0] for s in sides] == [1.0, 1.0, 6.0, 6.0]
             assert [s[1] for s in sides[:2]] == [-7.0, 13.0]
             beside = (
@@ -111,7 +113,7 @@ def straight():
     at = MIDDLE + SIGMA * np.linspace(-6, 6, 121)
     value = np.array([2.0, 0.0, 7.0]) + (at - MIDDLE)[:, None] * SLOPE
     value[:, 1] = at
-    return Walk(
+    return ProfileScan(
         1,
         value,
         ((at - MIDDLE) / SIGMA) ** 2,
@@ -130,7 +132,7 @@ def test_intervals_of_a_gaussian_are_those_of_its_covariance(straight):
     assert low == pytest.approx(middle - half, abs=near)
     assert high == pytest.approx(middle + half, abs=near)
     for above in (9.0, 30.0):  # of another lens; the second is no profile at all
-        nowhere = Walk(1, straight.value, straight.rise + above, straight.spread)
+        nowhere = ProfileScan(1, straight.value, straight.rise + above, straight.spread)
         assert nowhere.interval(3.8)[0] == pytest.approx(middle, abs=1e-6)
 
 
@@ -157,7 +159,9 @@ def test_draws_have_the_covariance_of_the_walk(straight, widened):
     """40000 draws: means to sigma / 200, covariances to 0.7 % of the product of both
     sigma, four of each.
     """
-    walked = Walk(1, straight.value, straight.rise, straight.spread, 14 * widened)
+    walked = ProfileScan(
+        1, straight.value, straight.rise, straight.spread, 14 * widened
+    )
     drawn = walked.draws(40_000, widened=widened, rng=np.random.default_rng(3))
     want = widened * covariance()
     sigma = np.sqrt(np.diag(want))
@@ -168,7 +172,7 @@ def test_draws_have_the_covariance_of_the_walk(straight, widened):
 
 def test_lowest_places_come_first():
     rise = np.array([3.0, 1.0, 4.0, 0.0, 0.0, 6.0, 2.0])
-    made = Walk(0, np.arange(7.0)[:, None], rise, np.zeros((7, 1, 1)))
+    made = ProfileScan(0, np.arange(7.0)[:, None], rise, np.zeros((7, 1, 1)))
     assert made.minima() == [3, 4, 1, 6]
 
 
@@ -204,14 +208,14 @@ def test_outliers_count_linearly_saturated_pixels_where_they_are_too_dark_and_th
     """Noise of 1 e without light: (d - t)² up to 4 of Huber's sigma, then twice that a
     sigma.
     """
-    huber = walk.Settings().huber
+    huber = walk.SolverSettings().huber
     seen = np.array([[[0.5, huber + 2.0, 9.0, 50.0, 50.0]]])
     image = np.array([[[0.0, 0.0, 0.0, 49.0, 51.0]]])
     floor = np.full(seen.shape, 1.0)
     usable, saturated = np.ones(seen.shape, bool), np.zeros(seen.shape, bool)
     usable[..., 2] = False
     saturated[..., 3:] = True
-    data = walk.Data(seen, usable, saturated, floor, np.full(seen.shape, 1e15))
+    data = walk.FitImages(seen, usable, saturated, floor, np.full(seen.shape, 1e15))
     about = SimpleNamespace(prior=prior())
     got = walk._measured(about, data, np.array([7.0, 9.0, 7.0]), image)
     bent = huber * (2 * (huber + 2) - huber)
@@ -233,7 +237,7 @@ def lopsided(left=1.7, right=2.9, cut=6.0):
     value = np.array([2.0, 0.0, 7.0]) + x[:, None] * SLOPE
     value[:, 1] = MIDDLE + x
     rise = np.where(x < 0, x / left, x / right) ** 2
-    return Walk(1, value, rise, np.broadcast_to(OTHERS, (201, 3, 3)).copy())
+    return ProfileScan(1, value, rise, np.broadcast_to(OTHERS, (201, 3, 3)).copy())
 
 
 @pytest.mark.parametrize("i", [0, 2])
@@ -290,12 +294,12 @@ def test_two_valleys_go_farthest_each_by_itself_and_a_stop_that_nothing_holds_as
     rise = np.array([9.0, 6.0, 0.0, 5.0, 4.0, 8.5, 2.0, 3.0, 8.5, 8.1, 9.0])
     spread = np.zeros((11, 2, 2))
     spread[:, 1, 1] = 0.25
-    made = Walk(0, value, rise, spread)
+    made = ProfileScan(0, value, rise, spread)
     want = [5 + math.sqrt(5) * 0.5, 3 + math.sqrt(8) * 0.5]  # 9 lies above the level
     assert [k for k, _ in made.outermost(1, 1, 8.0)] == [7, 2]
     assert [place[1] for _, place in made.outermost(1, 1, 8.0)] == pytest.approx(want)
     spread[4, 1, 1] = 90.0**2
-    free = Walk(0, value, rise, spread).outermost(1, -1, 8.0)
+    free = ProfileScan(0, value, rise, spread).outermost(1, -1, 8.0)
     assert [k for k, _ in free] == [4, 6]
     assert [place[1] for _, place in free] == pytest.approx(
         [0.5 - math.sqrt(4) * 2 * 0.5, 0.1 - math.sqrt(6) * 0.5]
@@ -310,7 +314,7 @@ def test_a_walk_into_more_room_is_drawn_where_the_room_is(widened):
     growth, x = 0.12, SIGMA * np.linspace(-6, 6, 241)
     value = np.column_stack([2 + 0 * x, MIDDLE + x, 7 + 0 * x])
     spread = OTHERS * np.exp(2 * growth * x)[:, None, None]
-    made = Walk(1, value, (x / SIGMA) ** 2, spread, 22.0 * widened)
+    made = ProfileScan(1, value, (x / SIGMA) ** 2, spread, 22.0 * widened)
     drawn = made.draws(20_000, widened=widened, rng=np.random.default_rng(5))
     variance = widened * SIGMA**2
     assert drawn[:, 1].mean() == pytest.approx(
@@ -334,7 +338,7 @@ def test_every_share_of_the_mass_has_one_draw_evenly_between_its_places(monkeypa
     value = np.array([[0.0, 3.0], [4.0, -1.0], [10.0, 2.0]])
     spread = np.zeros((3, 2, 2))
     spread[:, 1, 1] = 1e-18
-    made = Walk(0, value, -2 * np.log([1.0, 0.5, 0.125]), spread)
+    made = ProfileScan(0, value, -2 * np.log([1.0, 0.5, 0.125]), spread)
     drawn = made.draws(1000, widened=1.0, rng=np.random.default_rng(7))
     drawn = drawn[np.argsort(drawn[:, 0])]
     mass = (
@@ -509,15 +513,15 @@ def test_valleys_are_sought_on_few_frames_from_the_lowest_places_and_again_from_
     monkeypatch.setattr(walk, "few_frames", lambda setting: np.array([1, 3]))
     monkeypatch.setattr(walk, "_side", side)
     monkeypatch.setattr(walk, "_misfit", lambda task, part, x: 2.0)
-    monkeypatch.setattr(walk, "followed", follow)
+    monkeypatch.setattr(walk, "follow_starts", follow)
     monkeypatch.setattr(
-        walk, "distinct", lambda ends: sorted(ends, key=lambda e: e.merit)
+        walk, "distinct_modes", lambda ends: sorted(ends, key=lambda e: e.merit)
     )
     about = SimpleNamespace(
         prior=prior(low=-99.0), names=("a", "bias_nm", "c"), model=SimpleNamespace(setting=None),
         problem=lambda few: few.tolist(), data=SimpleNamespace(planes=lambda few: few.tolist()),
     )  # fmt: skip
-    kept = walk.valleys(about, [mode(1.0, merit=20.0, **free)], "bias_nm")
+    kept = walk.find_modes(about, [mode(1.0, merit=20.0, **free)], "bias_nm")
     assert [one.merit for one in kept] == [
         9.5,
         10.0,

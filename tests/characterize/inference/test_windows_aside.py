@@ -14,8 +14,8 @@ import bench_lens as b
 
 from characterize.bench import bench
 from characterize.inference import estimate
-from characterize.inference.estimate import Options
-from metalens.ground.errors import FitRefused
+from characterize.inference.estimate import FitOptions
+from metalens.core.errors import FitRefused
 
 DEGREES, DEPTHS = (0.0, 6.0), (420.0, 600.0, 900.0)
 
@@ -34,9 +34,10 @@ def captured(aside_um):
         hidden = dataclasses.replace(
             b.truth(**off), depths_um=DEPTHS, angles_deg=(angle,)
         )
-        light.append(bench.irradiance(b.lens(8.0), hidden, b.RESPONSE))
+        light.append(bench.bench_irradiance(b.lens(8.0), hidden, b.RESPONSE))
     bright = [
-        one * (6000.0 / np.max(light)) + bench.background(b.truth()) for one in light
+        one * (6000.0 / np.max(light)) + bench.background_plane(b.truth())
+        for one in light
     ]
     shots = b.capture(b.electrons(strength_rad=8.0))
     n = len(DEPTHS)
@@ -64,7 +65,7 @@ def test_a_window_half_a_pixel_off_at_one_angle_is_refused_by_name():
         estimate.fit(
             captured((0.8, -0.5)),
             b.lens(8.0),
-            Options(scan_um=60.0),
+            FitOptions(scan_um=60.0),
             response=b.RESPONSE,
         )
 
@@ -72,7 +73,7 @@ def test_a_window_half_a_pixel_off_at_one_angle_is_refused_by_name():
 @pytest.mark.slow
 def test_windows_about_their_chief_rays_are_fitted():
     found = estimate.fit(
-        captured((0.0, 0.0)), b.lens(8.0), Options(scan_um=60.0), response=b.RESPONSE
+        captured((0.0, 0.0)), b.lens(8.0), FitOptions(scan_um=60.0), response=b.RESPONSE
     )
     assert found.trusted
     assert any(

@@ -44,7 +44,7 @@ def test_widths_are_those_of_the_light_on_pixels_and_wider_by_what_a_pixel_is_ta
     FWHM, 0.3 and 1.95 % at 4.6.
     """
     shot, seen, radius, step = on_pixels(pixel_um, 0.31, -0.44)
-    found = metrics.spot(shot, step_um=pixel_um)
+    found = metrics.measure_spot(shot, step_um=pixel_um)
     middle = seen[len(seen) // 2]
     half = 2 * np.interp(
         -middle.max() / 2,

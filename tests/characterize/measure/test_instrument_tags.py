@@ -5,7 +5,7 @@ import pytest
 import tifffile
 
 from characterize.measure import sem
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 
 IMAGE = np.arange(30 * 40, dtype=np.uint8).reshape(30, 40)
 ZEISS = "\r\n0\r\n0\r\n0\r\nAP_MAG\r\nMag = 50.00 K X\r\nAP_PIXEL_SIZE\r\nPixel Size = 2.233 nm\r\n"

@@ -9,7 +9,7 @@ from scipy import ndimage
 from characterize.measure import lattice as lattices
 from characterize.measure import overlay, sem
 from metalens.cell import Lattice
-from metalens.ground.errors import CaptureError
+from metalens.core.errors import CaptureError
 from metalens.lens import DiameterMap
 
 PIXEL, PITCH = 3.7, 310.0  # nm
@@ -84,7 +84,9 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
     shape = (330, 370)
     place = lattice(turn, angle, ratio, shape)
     truth = np.random.default_rng(5).uniform(140, 230, len(place))
-    found = sem.measure(picture(place, truth, shape, top=top), sem.Micrograph(PIXEL))
+    found = sem.measure_diameters(
+        picture(place, truth, shape, top=top), sem.Micrograph(PIXEL)
+    )
     assert found.lattice.kind == kind
     assert not (found.missing | found.collapsed).any()
     seen = np.stack([found.row, found.column], 1)
@@ -100,7 +102,7 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
 def test_a_picture_of_one_line_of_waves_is_refused():
     waves = np.sin(np.arange(200) / 5)[None] + 0 * np.arange(160)[:, None]
     with pytest.raises(CaptureError, match="no lattice"):
-        sem.measure(waves, sem.Micrograph(PIXEL))
+        sem.measure_diameters(waves, sem.Micrograph(PIXEL))
 
 
 def drawn(rows=40, columns=44):
@@ -118,13 +120,13 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
     p = PITCH / PIXEL
     place = (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) * p
     side = int(n * p)
-    found = sem.measure(
+    found = sem.measure_diameters(
         picture(place, made.ravel(), (side, side), top=0.9),
         sem.Micrograph(PIXEL, PITCH),
     )
-    laid = overlay.overlay(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
+    laid = overlay.overlay_design(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
     assert laid.clearly
-    where = overlay.numbered(found, laid).site
+    where = overlay.register_to_mask(found, laid).site
     assert where.min(0).tolist() == [row, column]
     assert np.flatnonzero(laid.outlier).tolist() == [2 * n + 4]
     assert np.allclose(laid.designed_nm, part.ravel())
@@ -165,17 +167,21 @@ def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(
         [20, 22]
     )
     wide = mask[tuple(index.T)] - 3.1
-    found = sem.measure(picture(place, wide, shape), sem.Micrograph(PIXEL, PITCH))
-    laid = overlay.overlay(found, made)
+    found = sem.measure_diameters(
+        picture(place, wide, shape), sem.Micrograph(PIXEL, PITCH)
+    )
+    laid = overlay.overlay_design(found, made)
     assert laid.clearly
     apart = np.hypot(
         found.row[:, None] - place[:, 0], found.column[:, None] - place[:, 1]
     )
-    assert np.array_equal(overlay.numbered(found, laid).site, index[apart.argmin(1)])
+    assert np.array_equal(
+        overlay.register_to_mask(found, laid).site, index[apart.argmin(1)]
+    )
     assert np.nanmean(laid.error_nm) == pytest.approx(
         -3.1, abs=0.6 * PIXEL
     )  # edges of a blurred rim: as below
-    assert overlay.scale(found, PIXEL, made) == pytest.approx(1.0, abs=1e-3)
+    assert overlay.lattice_scale(found, PIXEL, made) == pytest.approx(1.0, abs=1e-3)
     assert np.count_nonzero(laid.outlier) < 2
 
 
@@ -183,7 +189,7 @@ def test_a_picture_across_the_mask_is_refused():
     """Rows of a hexagonal lattice along y, where those of a mask run along x."""
     shape = (330, 370)
     place = lattice(30.0, 60.0, 1.0, shape)
-    found = sem.measure(
+    found = sem.measure_diameters(
         picture(place, np.full(len(place), 180.0), shape), sem.Micrograph(PIXEL, PITCH)
     )
     made = DiameterMap(
@@ -195,12 +201,14 @@ def test_a_picture_across_the_mask_is_refused():
         CaptureError,
         match="rows of this hexagonal lattice do not lie in the picture as on the mask",
     ):
-        overlay.overlay(found, made)
+        overlay.overlay_design(found, made)
     with pytest.raises(
         CaptureError,
         match="the picture shows a hexagonal lattice, the design is square",
     ):
-        overlay.overlay(found, DiameterMap(np.full((44, 60), 0.18), PITCH * 1e-3))
+        overlay.overlay_design(
+            found, DiameterMap(np.full((44, 60), 0.18), PITCH * 1e-3)
+        )
 
 
 @pytest.mark.parametrize("level", [4000.0, 1e-9])
@@ -228,7 +236,7 @@ def test_a_picture_whose_sides_differ_by_a_twentieth_from_the_design_is_not_laid
     stretch, fits
 ):
     """Of a rectangle of 0.31 x 0.434 um; the scale of the picture is free."""
-    seen = lattices.Lattice(
+    seen = lattices.ImageLattice(
         np.zeros(2),
         np.array([0.0, 71.0 * stretch]),
         np.array([1.4 * 71.0 / stretch, 0.0]),
@@ -253,7 +261,7 @@ def test_a_longer_side_is_sought_up_to_two_and_a_half_pitches_and_no_wave_beyond
             2 * np.pi * rows / (20.0 * ratio)
         )
         wave = wave + (0.0 if ratio == 2.4 else 3.0) * np.cos(2 * np.pi * rows / 60.0)
-        made = lattices.find(wave, 20.0)
+        made = lattices.find_lattice(wave, 20.0)
         assert np.abs(made.a) == pytest.approx([0.0, 20.0], abs=0.05)
         assert np.abs(made.b) == pytest.approx([20.0 * ratio, 0.0], abs=0.1)
 
@@ -269,9 +277,9 @@ def test_the_longer_side_of_a_cell_is_two_and_a_half_pitches_at_most(longer, fou
     )
     if not found:
         with pytest.raises(CaptureError, match=r"no lattice of pitch 12\.00 pixels"):
-            lattices.find(seen, 12.0)
+            lattices.find_lattice(seen, 12.0)
         return
-    made = lattices.find(seen, 12.0)
+    made = lattices.find_lattice(seen, 12.0)
     assert (
         np.abs(made.a - [0.0, 12.0]).max() < 0.05
     )  # peaks of waves of 25 and of 13 turns, a hundredth of one

@@ -16,8 +16,8 @@ import bench_lens as b
 
 from characterize.captures.capture import Capture
 from characterize.measure import frames, metrics, overlay, sem
-from characterize.measure.lattice import Lattice
-from metalens.ground.errors import CaptureError
+from characterize.measure.lattice import ImageLattice
+from metalens.core.errors import CaptureError
 from metalens.lens.record import DiameterMap
 
 RNG = np.random.default_rng(8)
@@ -25,8 +25,8 @@ RNG = np.random.default_rng(8)
 
 def found(diameter, site):
     zero, no = np.zeros(len(site)), np.zeros(len(site), bool)
-    lattice = Lattice(np.zeros(2), np.r_[0, 9.0], np.r_[9.0, 0])
-    return sem.Diameters(zero, zero, diameter, zero, no, no, site, lattice, no)
+    lattice = ImageLattice(np.zeros(2), np.r_[0, 9.0], np.r_[9.0, 0])
+    return sem.MeasuredDiameters(zero, zero, diameter, zero, no, no, site, lattice, no)
 
 
 def test_a_micrograph_lies_where_its_pillars_follow_the_design():
@@ -47,13 +47,13 @@ def test_a_micrograph_lies_where_its_pillars_follow_the_design():
     )  # unmeasured, fallen, without a design
     assert there[17] == 0
     site, made, there = (np.delete(a, 17, 0) for a in (site, made, there))
-    laid = overlay.overlay(found(made, site), DiameterMap(drawn, 0.4))
+    laid = overlay.overlay_design(found(made, site), DiameterMap(drawn, 0.4))
     assert (laid.row, laid.column, laid.clearly) == (7, -2, True)
     assert laid.designed_nm == pytest.approx(there)
     assert laid.error_nm == pytest.approx(made - there, nan_ok=True)
     assert np.flatnonzero(laid.outlier).tolist() == [19]
     assert np.array_equal(
-        overlay.numbered(found(made, site), laid).site, site + np.array([7, -2])
+        overlay.register_to_mask(found(made, site), laid).site, site + np.array([7, -2])
     )
 
 
@@ -70,7 +70,7 @@ def test_an_outlier_is_four_robust_sigma_from_the_median_error(off, outlying, si
     error[11] = 20 + sign[11] * off * max(
         1.4826 * size, 0.5
     )  # on its own side: the median stays 20
-    laid = overlay.overlay(
+    laid = overlay.overlay_design(
         found(drawn.ravel() * 1e3 + error, site), DiameterMap(drawn, 0.4)
     )
     assert np.flatnonzero(laid.outlier).tolist() == ([11] if outlying else [])
@@ -140,7 +140,7 @@ def capture(n=1, **more):
 
 def test_angles_of_one_place_of_the_source_are_alike_to_a_millionth_of_a_degree():
     at = SimpleNamespace(angle_deg=3.1234564, angle_y_deg=-0.2000006)
-    assert frames.Frame.field.fget(at) == (3.123456, -0.200001)
+    assert frames.FrameMetrics.field.fget(at) == (3.123456, -0.200001)
 
 
 def test_light_is_counted_above_the_median_of_the_rim():
@@ -185,7 +185,7 @@ def test_a_hot_pixel_in_its_core_leaves_a_spot_its_width(beside):
     counts = np.rint(np.stack([0.7 * spot, spot, 0.4 * spot]) + 300)
     dark = np.full((3, 41, 47), 300.0)
     plain, broken = (
-        frames.measure(
+        frames.measure_frames(
             Capture(
                 counts + hot, np.array([1.0, 2.0, 3.0]), np.zeros((3, 2)), np.full(3, np.nan), ("a", "b", "c"), 16,
                 pixel_um=1.3, dark=dark + hot, about={"gain_e": 1.4},
@@ -219,8 +219,10 @@ def test_a_spot_stands_five_robust_sigma_above_the_rim(top, seen):
 
 
 def row(depth, angle, ee80, x=0.0, *, angle_y=0.0, y=0.3):
-    spot = metrics.Spot(1.0, ee80, (1.0, 1.0), (x, y))
-    return frames.Frame("f", depth, angle, angle_y, spot, 1.0, 1.0, 1.0, 3.0, 1.0, 9.0)
+    spot = metrics.SpotMetrics(1.0, ee80, (1.0, 1.0), (x, y))
+    return frames.FrameMetrics(
+        "f", depth, angle, angle_y, spot, 1.0, 1.0, 1.0, 3.0, 1.0, 9.0
+    )
 
 
 def test_the_sharpest_depth_is_the_top_of_a_parabola_in_its_inverse():
@@ -270,7 +272,7 @@ def test_two_places_that_fit_alike_are_not_clear():
     for change, clear in ((0.0012, False), (0.03, True)):
         drawn = np.concatenate([block, block + change * RNG.normal(size=block.shape)])
         made = drawn[site[:, 0], site[:, 1]] * 1e3 + RNG.normal(0, 4.0, len(site))
-        laid = overlay.overlay(found(made, site), DiameterMap(drawn, 0.4))
+        laid = overlay.overlay_design(found(made, site), DiameterMap(drawn, 0.4))
         assert laid.clearly == clear
         assert laid.column == 0
         assert not clear or laid.row == 0
@@ -279,7 +281,7 @@ def test_two_places_that_fit_alike_are_not_clear():
 def test_knots_hold_six_pillars_at_least():
     drawn, none = RNG.uniform(100, 300, 17), np.zeros(17, bool)
     table = overlay.bias_table(
-        overlay.Overlay(
+        overlay.MaskOverlay(
             drawn, drawn * 0.01, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=none
         )
     )
@@ -289,7 +291,7 @@ def test_knots_hold_six_pillars_at_least():
     ]  # 17 // 6 = 2, though seven are asked for
     many = np.sort(RNG.uniform(100, 300, 84))
     table = overlay.bias_table(
-        overlay.Overlay(
+        overlay.MaskOverlay(
             many,
             many,
             0,
@@ -345,17 +347,17 @@ def test_the_airy_pattern_falls_to_nothing_at_its_first_ring():
     design = b.row(400.0, wavelength_um=0.9, sensor_distance_um=1570.0, layers=b.GLASS)
     sine = 400 / math.hypot(400, 1500)
     ring = 3.8317059702 / (2 * math.pi * sine / 0.9)
-    pattern = frames.airy(design, capture(pixel_um=ring / 20), (41, 61))
+    pattern = frames.airy_pattern(design, capture(pixel_um=ring / 20), (41, 61))
     assert pattern[20, 30] == pytest.approx(1, abs=2e-3)
     assert pattern[20, 50] < 2e-3
     assert pattern[40, 30] < 2e-3
     u = 3.8317059702 / 2
     assert pattern[30, 30] == pytest.approx((2 * special.j1(u) / u) ** 2, abs=2e-3)
-    other = frames.airy(
+    other = frames.airy_pattern(
         design, capture(pixel_um=ring / 20, wavelength_um=0.45), (41, 61)
     )
     assert other[30, 30] < 2e-3  # half the wavelength, half the ring
-    wide = frames.airy(design, capture(pixel_um=ring / 4), (7, 9))
+    wide = frames.airy_pattern(design, capture(pixel_um=ring / 4), (7, 9))
     assert wide[3, 4] == pytest.approx(pattern[18:23, 28:33].mean(), abs=2e-3)
 
 
@@ -372,7 +374,7 @@ def test_frames_are_measured_along_their_own_axes():
         np.full(2, np.nan), ("near", "far"), 16, pixel_um=pixel, about={"gain_e": 2.0},
     )  # fmt: skip
     total = [2 * math.pi * sx * sy * p for p in peaks]
-    made = frames.measure(shots, reference_e=1.6 * total[0])
+    made = frames.measure_frames(shots, reference_e=1.6 * total[0])
     assert made.step_um == pixel
     for row, name, depth, angle, peak, light in zip(
         made.frames,
@@ -408,7 +410,7 @@ def test_frames_are_measured_along_their_own_axes():
     assert made.best_depth_um == {}
     assert made.light[1].max() == pytest.approx(peaks[1], rel=1e-6)
     with pytest.raises(CaptureError, match="pixel_um"):
-        frames.measure(capture())
+        frames.measure_frames(capture())
 
 
 def test_pixels_per_side_of_the_rim_take_part_alike():

@@ -20,7 +20,7 @@ def test_widths_are_those_of_the_spot_without_a_speck_far_off():
     y, x = np.mgrid[:80, :90]
     light = np.exp(-((x - 41.3) ** 2 / (2 * 2.1**2) + (y - 38.6) ** 2 / (2 * 1.7**2)))
     light[66:70, 60:64] += light.sum() * 0.01 / 16
-    spot = metrics.spot(light, step_um=0.6)
+    spot = metrics.measure_spot(light, step_um=0.6)
     assert spot.d4sigma_um == pytest.approx((4 * 2.1 * 0.6, 4 * 1.7 * 0.6), rel=2e-3)
     assert spot.centroid_um == pytest.approx(
         ((41.3 - 44.5) * 0.6, (38.6 - 39.5) * 0.6), abs=1e-3

@@ -30,12 +30,12 @@ def test_mtf_of_an_oblong_spot_along_each_axis():
 
 
 def test_mtf50_is_where_it_falls_through_one_half():
-    falling = metrics.Mtf(
+    falling = metrics.EdgeMtf(
         np.array([0.0, 0.2, 0.5, 0.9]), np.array([1.0, 0.8, 0.3, 0.6])
     )
     assert falling.mtf50_per_um == pytest.approx(0.2 + 0.3 * 0.3 / 0.5)
     assert math.isnan(
-        metrics.Mtf(np.array([0.0, 0.2]), np.array([1.0, 0.8])).mtf50_per_um
+        metrics.EdgeMtf(np.array([0.0, 0.2]), np.array([1.0, 0.8])).mtf50_per_um
     )
 
 
@@ -68,7 +68,7 @@ def test_edge_of_either_lean_on_pixels_of_their_own_size(degrees):
 
 
 def test_spot_of_an_oblong_beam_off_the_middle():
-    found = metrics.spot(gauss(2.1, 1.3, x0=2.7, y0=-1.9), step_um=STEP)
+    found = metrics.measure_spot(gauss(2.1, 1.3, x0=2.7, y0=-1.9), step_um=STEP)
     assert found.centroid_um == pytest.approx((2.7, -1.9), abs=1e-3)
     assert found.d4sigma_um == pytest.approx((8.4, 5.2), rel=1e-3)
     u = np.linspace(
@@ -110,6 +110,6 @@ def test_peak_between_samples():
     y, x = np.arange(9) - 4 - 0.3, np.arange(11) - 5 + 0.2
     light = 5.0 - 0.11 * y[:, None] ** 2 - 0.07 * x**2
     ideal = light.copy()
-    assert metrics.strehl(light * 3, ideal) == pytest.approx(1)
+    assert metrics.strehl_ratio(light * 3, ideal) == pytest.approx(1)
     height, (dy, dx) = metrics._parabola(light, 4, 5)
     assert (height, dy, dx) == pytest.approx((5.0, 0.3, -0.2))

@@ -79,7 +79,7 @@ def test_strehl_of_spots_of_unlike_width_is_that_of_their_areas():
     def spot(sx, sy):
         return np.exp(-((x - 0.2) ** 2) / (2 * sx**2) - (y + 0.3) ** 2 / (2 * sy**2))
 
-    found = metrics.strehl(7.0 * spot(6.0, 7.5), spot(3.0, 5.0))
+    found = metrics.strehl_ratio(7.0 * spot(6.0, 7.5), spot(3.0, 5.0))
     assert found == pytest.approx(
         3.0 * 5.0 / (6.0 * 7.5), rel=2e-3
     )  # parabola: (1/3)^4 / 24 at 0.3 samples

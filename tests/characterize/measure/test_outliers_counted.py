@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from characterize.measure import overlay
-from characterize.measure.lattice import Lattice
+from characterize.measure.lattice import ImageLattice
 from metalens.lens import DiameterMap
 
 RNG = np.random.default_rng(19)
@@ -26,9 +26,9 @@ def laid(scatter_nm, fallen=(), by=0.0, side=36):
         + RNG.normal(0, scatter_nm, len(site))
     )
     made[list(fallen)] += by
-    lattice = Lattice(np.zeros(2), np.r_[0.3, 9.0], np.r_[9.0, -0.3])
+    lattice = ImageLattice(np.zeros(2), np.r_[0.3, 9.0], np.r_[9.0, -0.3])
     found = SimpleNamespace(diameter_nm=made, site=site, lattice=lattice)
-    return overlay.overlay(found, DiameterMap(drawn * 1e-3, 0.35))
+    return overlay.overlay_design(found, DiameterMap(drawn * 1e-3, 0.35))
 
 
 def test_hardly_any_sound_pillar_is_an_outlier():

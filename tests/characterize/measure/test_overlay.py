@@ -35,7 +35,7 @@ def test_knots_of_a_bias_table_carry_mean_and_standard_error():
     error = RNG.normal(0, 3.0, 20) + designed * 0.02
     outlier = np.zeros(20, bool)
     outlier[3] = True
-    laid = overlay.Overlay(
+    laid = overlay.MaskOverlay(
         designed, error, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=outlier
     )
     table = overlay.bias_table(laid, knots=3)
@@ -55,7 +55,7 @@ def test_knots_of_a_bias_table_carry_mean_and_standard_error():
     ):  # each of the three within 2.2 of its sigma: 5 or 6 degrees of freedom, 93 %
         drawn = RNG.normal(0, 3.0, 20)
         rows = overlay.bias_table(
-            overlay.Overlay(
+            overlay.MaskOverlay(
                 designed,
                 drawn,
                 0,

@@ -7,8 +7,8 @@ import pytest
 from scipy import ndimage
 
 from characterize.measure import sem
-from characterize.measure.lattice import Lattice
-from metalens.ground.errors import CaptureError
+from characterize.measure.lattice import ImageLattice
+from metalens.core.errors import CaptureError
 
 PIXEL, PITCH = 4.0, 400.0
 ABOUT = sem.Micrograph(PIXEL, PITCH)
@@ -54,7 +54,7 @@ def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5)
 
 def test_bias_below_0_3_px_and_repeatability_below_0_1_px():
     truth = np.random.default_rng(1).uniform(140, 300, (4, 4))
-    found = [sem.measure(render(truth, seed), ABOUT) for seed in range(4)]
+    found = [sem.measure_diameters(render(truth, seed), ABOUT) for seed in range(4)]
     runs = np.array([each.diameter_nm for each in found])
     error_px = (runs - truth.ravel()) / PIXEL
     assert not np.isnan(runs).any()
@@ -70,7 +70,9 @@ def test_bias_below_0_3_px_and_repeatability_below_0_1_px():
 
 def test_missing_and_collapsed_pillars_are_named():
     truth = np.full((4, 4), 200.0)
-    found = sem.measure(render(truth, missing={(1, 2), (3, 3)}, moved={(2, 0)}), ABOUT)
+    found = sem.measure_diameters(
+        render(truth, missing={(1, 2), (3, 3)}, moved={(2, 0)}), ABOUT
+    )
     assert np.flatnonzero(found.missing).tolist() == [6, 15]
     assert np.flatnonzero(found.collapsed).tolist() == [8]
     assert np.isnan(found.diameter_nm[[6, 15, 8]]).all()
@@ -80,7 +82,7 @@ def test_missing_and_collapsed_pillars_are_named():
 
 def test_bias_becomes_prior_knowledge_of_the_fit():
     truth = np.full((4, 4), 206.0)
-    known = sem.measure(render(truth), ABOUT).bias(200.0)
+    known = sem.measure_diameters(render(truth), ABOUT).bias(200.0)
     assert known.name == "bias_nm"
     assert abs(known.value - 6) < 0.3 * PIXEL
     assert 0 < known.sigma < 1
@@ -88,7 +90,9 @@ def test_bias_becomes_prior_knowledge_of_the_fit():
 
 def test_wrong_pitch_is_refused():
     with pytest.raises(CaptureError, match="no lattice"):
-        sem.measure(render(np.full((4, 4), 200.0)), sem.Micrograph(PIXEL, 533.0))
+        sem.measure_diameters(
+            render(np.full((4, 4), 200.0)), sem.Micrograph(PIXEL, 533.0)
+        )
     with pytest.raises(CaptureError, match="6 or more pixels"):
         sem.Micrograph(100.0, 400.0)
 
@@ -103,8 +107,8 @@ def test_scale_bar_gives_the_pixel():
 
 def test_calibrated_edge_bias_comes_off_both_sides():
     image = render(np.random.default_rng(4).uniform(160, 260, (4, 4)))
-    plain = sem.measure(image, ABOUT).diameter_nm
-    calibrated = sem.measure(
+    plain = sem.measure_diameters(image, ABOUT).diameter_nm
+    calibrated = sem.measure_diameters(
         image, sem.Micrograph(PIXEL, PITCH, edge_bias_nm=3.7)
     ).diameter_nm
     assert plain - calibrated == pytest.approx(np.full(16, 7.4), abs=1e-9)
@@ -114,15 +118,18 @@ def test_summaries_of_the_diameters():
     four = np.array([201.0, 202.0, np.nan, 204.0, 209.0])
     zero, no = np.zeros(5), np.zeros(5, bool)
     site = np.stack([np.arange(5), np.arange(5)[::-1]], axis=1)
-    where = (site, Lattice(np.zeros(2), np.array([0.0, 7.0]), np.array([6.0, 0.0])))
-    found = sem.Diameters(zero, zero, four, zero, no, no, *where, no)
+    where = (
+        site,
+        ImageLattice(np.zeros(2), np.array([0.0, 7.0]), np.array([6.0, 0.0])),
+    )
+    found = sem.MeasuredDiameters(zero, zero, four, zero, no, no, *where, no)
     assert found.mean_nm == pytest.approx(204.0)
     assert found.three_sigma_nm == pytest.approx(3 * np.sqrt((9 + 4 + 0 + 25) / 4))
     known = found.bias(np.array([200.0, 200.0, 200.0, 200.0, 200.0]))
     assert known.value == pytest.approx(4.0)
     assert known.sigma == pytest.approx(np.sqrt((9 + 4 + 0 + 25) / 3) / 2)
     assert (
-        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where, no)
+        sem.MeasuredDiameters(zero, zero, four * 0 + 5, zero, no, no, *where, no)
         .bias(3.0)
         .sigma
         == 0.05

@@ -9,9 +9,11 @@ import pytest
 from scipy import ndimage
 
 from characterize.measure import radial, sem
-from characterize.measure.lattice import Lattice
+from characterize.measure.lattice import ImageLattice
 
-LATTICE = Lattice(np.array([3.0, 4.0]), np.array([0.0, 50.0]), np.array([50.0, 0.0]))
+LATTICE = ImageLattice(
+    np.array([3.0, 4.0]), np.array([0.0, 50.0]), np.array([50.0, 0.0])
+)
 
 
 def test_diameters_are_twice_the_radii_less_twice_the_bias_of_an_edge(monkeypatch):
@@ -31,12 +33,12 @@ def test_diameters_are_twice_the_radii_less_twice_the_bias_of_an_edge(monkeypatc
 
     pitches = []
     monkeypatch.setattr(
-        sem, "find", lambda flat, pitch: pitches.append(pitch) or LATTICE
+        sem, "find_lattice", lambda flat, pitch: pitches.append(pitch) or LATTICE
     )
-    monkeypatch.setattr(Lattice, "sites", lambda self, shape: (place, site))
+    monkeypatch.setattr(ImageLattice, "sites", lambda self, shape: (place, site))
     monkeypatch.setattr(sem, "_step", lambda flat, row, column, pitch: steps[column])
     monkeypatch.setattr(sem, "_pillar", pillar)
-    got = sem.measure(
+    got = sem.measure_diameters(
         np.random.default_rng(1).normal(size=(160, 180)),
         sem.Micrograph(3.5, 175.0, 1.2),
     )
@@ -257,7 +259,7 @@ def test_plateaus_are_the_brightest_rim_and_the_darkest_third_beyond_it():
     )
     mean[60] = 0.02
     rays = mean[:, None] + np.array([0.03, -0.03, 0.0])
-    inner, outer, rim = radial.plateaus(REACH[: len(rays)], rays)
+    inner, outer, rim = radial.rim_and_gap_levels(REACH[: len(rays)], rays)
     assert rim == 30
     assert inner == pytest.approx(0.9)
     assert outer == pytest.approx(
@@ -266,10 +268,10 @@ def test_plateaus_are_the_brightest_rim_and_the_darkest_third_beyond_it():
     far = np.concatenate(
         [[0.65], np.full(29, 0.5), [0.7], np.full(30, 0.5), [0.6], np.full(40, 0.1)]
     )  # bright beyond 16 samples of the fall
-    assert radial.plateaus(REACH[: len(far)], far[:, None])[2] == 61
+    assert radial.rim_and_gap_levels(REACH[: len(far)], far[:, None])[2] == 61
     wide = np.concatenate([np.full(70, 0.5), [0.9], np.full(17, 0.6), np.full(40, 0.1)])
     assert (
-        radial.plateaus(REACH[: len(wide)], wide[:, None])[2] == 70
+        radial.rim_and_gap_levels(REACH[: len(wide)], wide[:, None])[2] == 70
     )  # a fifth of 87: 17 samples
 
 
@@ -318,7 +320,7 @@ def test_levels_are_less_row_medians_and_a_shade_over_their_percentiles():
 
 
 def test_uniformity_is_three_standard_deviations_of_the_good_pillars():
-    found = object.__new__(sem.Diameters)
+    found = object.__new__(sem.MeasuredDiameters)
     object.__setattr__(
         found, "diameter_nm", np.array([151.0, math.nan, 163.0, 148.0, 155.5])
     )

@@ -53,7 +53,7 @@ def measured(diameter, blur, *, noise, rng, pitch=None):
     picture = 37.0 + 290.0 * (
         blurred(flat, blur) + noise * rng.standard_normal(flat.shape)
     )
-    found = sem.measure(picture, sem.Micrograph(1.0, pitch))
+    found = sem.measure_diameters(picture, sem.Micrograph(1.0, pitch))
     whole = np.isfinite(found.diameter_nm)
     assert whole.sum() >= 19  # of 25, less those that the picture's edge cuts
     return found.diameter_nm[whole] - diameter, found.sigma_nm[whole]
@@ -128,19 +128,19 @@ def test_a_disc_that_is_read_is_found_from_its_reading(radius, variance):
         -0.5 * ((reach[:, None] - 14 - 0.125 * np.arange(64)) / smooth) ** 2
     ).sum(1)
     rays = np.repeat((weights @ seen / weights.sum(1))[:, None], radial.RAYS, 1)
-    blur = radial.blur(reach, rays, smooth)
+    blur = radial.blur_variance(reach, rays, smooth)
     assert blur == pytest.approx(
         variance, rel=0.02
     )  # eight turns, each leaving a third
-    inner, outer, rim = radial.plateaus(reach, rays)
-    half = radial.falls(reach, rays, (inner + outer) / 2, rim)[0]
-    assert radial.unblurred(reach, half, variance, smooth)[0] == pytest.approx(
+    inner, outer, rim = radial.rim_and_gap_levels(reach, rays)
+    half = radial.edge_crossings(reach, rays, (inner + outer) / 2, rim)[0]
+    assert radial.deblur_radius(reach, half, variance, smooth)[0] == pytest.approx(
         radius, abs=0.01
     )  # steps of the sum
     rim_only = rays - 0.7 * np.exp(-((reach / (0.4 * radius)) ** 2))[:, None]
-    assert np.isnan(radial.blur(reach, rim_only, smooth))  # a dark top
+    assert np.isnan(radial.blur_variance(reach, rim_only, smooth))  # a dark top
 
 
 def test_a_wide_disc_is_left_to_the_plain_rule():
-    assert radial.wide(16.0, 2.0**2, 1.0)
-    assert not radial.wide(11.0, 2.0**2, 1.0)
+    assert radial.is_wide_disc(16.0, 2.0**2, 1.0)
+    assert not radial.is_wide_disc(11.0, 2.0**2, 1.0)

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.model import kernel, pillar_slopes
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 from metalens.lens import DiameterMap
 
 
@@ -21,7 +21,7 @@ from metalens.lens import DiameterMap
     ("tolerance", "more"), [(5e-4 / math.e**2, 2.0), (5e-7, math.log(1e3)), (5e-3, 0.0)]
 )
 def test_digits_are_counted_from_five_ten_thousandths_of_the_field(tolerance, more):
-    assert kernel.digits(tolerance) == pytest.approx(more, abs=1e-12)
+    assert kernel.extra_digits(tolerance) == pytest.approx(more, abs=1e-12)
 
 
 def test_tables_hold_five_times_the_rounding_of_their_columns():
@@ -35,11 +35,11 @@ def test_tables_hold_five_times_the_rounding_of_their_columns():
     )
     least = 2.0**-23 * math.sqrt(300) * 5
     assert kernel.least_tolerance(table) == pytest.approx(least, rel=1e-9)
-    left, right, _ = kernel.factors(table, 1.02 * least)
+    left, right, _ = kernel.low_rank_factors(table, 1.02 * least)
     assert left.shape[1] == 7
     assert np.linalg.norm(left @ right - table) < least * np.linalg.norm(table)
     with pytest.raises(FitError, match="of their norm"):
-        kernel.factors(table, 0.98 * least)
+        kernel.low_rank_factors(table, 0.98 * least)
 
 
 def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):

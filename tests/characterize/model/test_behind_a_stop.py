@@ -15,16 +15,21 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.inference import causes
-from characterize.inference.causes import behind
-from characterize.inference.search import Task
+from characterize.inference.causes import model_behind_stop
+from characterize.inference.search import SearchTask
 from characterize.model import forward
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import NAMES, Known, unfitted, vector
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import (
+    NAMES,
+    KnownValue,
+    parameter_vector,
+    unfitted_sizes,
+)
 from metalens import design, profiles
 from metalens.cell import Cell, Film, Index
-from metalens.ground.errors import ConfigError, PropagationError
+from metalens.core.errors import ConfigError, PropagationError
 from metalens.lens import Layers, Stop
 
 DEPTHS = (470.0, 640.0, 910.0)
@@ -54,7 +59,7 @@ def setting(angles=((0.0, 0.0),), depths=DEPTHS, **about):
     n = len(depths)
     every = np.repeat(np.array(angles), n, 0)
     tight = {"tolerance": 2e-5} | about
-    return Setting(
+    return FrameSetting(
         np.tile(depths, len(angles)),
         every,
         np.ones(n * len(angles)),
@@ -67,17 +72,20 @@ def setting(angles=((0.0, 0.0),), depths=DEPTHS, **about):
 
 def shown(made, angle_deg):
     """Frames of the bench at two depths, in units of its own."""
-    known = tuple(Known(name, value) for name, value in VALUES.items())
-    truth = Truth(
-        DEPTHS[:2], (angle_deg,), parameter=known, camera=Camera(pixel_um=1.5, pixels=8)
+    known = tuple(KnownValue(name, value) for name, value in VALUES.items())
+    truth = HiddenLens(
+        DEPTHS[:2],
+        (angle_deg,),
+        parameter=known,
+        camera=BenchCamera(pixel_um=1.5, pixels=8),
     )
-    return bench.irradiance(made, truth, b.RESPONSE)
+    return bench.bench_irradiance(made, truth, b.RESPONSE)
 
 
 def expected(made, angle_deg):
     """The same by the model."""
     angle = np.radians(angle_deg), 0.0
-    at = Setting(
+    at = FrameSetting(
         np.array(DEPTHS[:2]),
         np.array([angle] * 2),
         np.ones(2),
@@ -86,7 +94,7 @@ def expected(made, angle_deg):
         8,
         tolerance=2e-5,
     )
-    return ForwardModel(made, at, b.RESPONSE).images(vector(VALUES))[0]
+    return ForwardModel(made, at, b.RESPONSE).images(parameter_vector(VALUES))[0]
 
 
 VALUES = {
@@ -132,7 +140,7 @@ def test_derivatives_behind_a_stop_are_differences_of_images(monkeypatch):
     model = ForwardModel(
         lens(), setting(((0.09, -0.05),), DEPTHS[:2], tolerance=1e-7), b.RESPONSE
     )
-    base = vector(VALUES | {"pinhole_um": 4.0, "log_gain": 5.0})
+    base = parameter_vector(VALUES | {"pinhole_um": 4.0, "log_gain": 5.0})
     steps = {
         "distance_um": 0.02, "stage_zero_um": 0.2, "decentre_y_um": 0.02, "tilt_x_deg": 0.01, "bias_nm": 0.05,
         "bias_x_nm": 0.05, "coma_x_rad": 1e-3, "pinhole_um": 0.1,
@@ -151,7 +159,7 @@ def test_quick_models_of_all_depths_share_their_operators():
     model = ForwardModel(
         lens(), setting(((0.0, 0.0), (0.07, 0.0)), tolerance=5e-4), b.RESPONSE
     )
-    x = vector(VALUES)
+    x = parameter_vector(VALUES)
     whole, quick = model.images(x)[0], model.quick()
     assert np.linalg.norm(quick.images(x)[0] - whole) < 0.02 * np.linalg.norm(whole)
     assert [[one.index.tolist() for one in group.lit] for group in quick.groups] == [
@@ -175,12 +183,12 @@ def test_the_model_behind_another_stop_is_that_of_the_other_lens():
     at, other, x = (
         setting(depths=DEPTHS[:1], tolerance=5e-4),
         Stop(10.0, 63.0, (-1.0, 0.5)),
-        vector(VALUES),
+        parameter_vector(VALUES),
     )
     model = ForwardModel(lens(), at, b.RESPONSE)
     want = ForwardModel(lens(other), at, b.RESPONSE).images(x)[0]
-    assert behind(model, other).images(x)[0] == pytest.approx(want, rel=1e-6)
-    held = behind(model.about((2.0, -1.0)).rough(0.01), other)
+    assert model_behind_stop(model, other).images(x)[0] == pytest.approx(want, rel=1e-6)
+    held = model_behind_stop(model.about((2.0, -1.0)).rough(0.01), other)
     assert (held.grid.middle_um, held.cut) == ((2.0, -1.0), 0.01)
 
 
@@ -190,11 +198,11 @@ def test_a_stop_off_its_place_is_a_cause_of_its_own():
     """
     model, x = (
         ForwardModel(lens(), setting(depths=DEPTHS[:2], tolerance=5e-4), b.RESPONSE),
-        vector(VALUES),
+        parameter_vector(VALUES),
     )
     image = model.images(x)[0]
     for stated, sigma in (({}, 1.0), ({"stop_um": 0.75}, 0.25)):
-        task = Task(model, None, x, {}, None, (), stated)
+        task = SearchTask(model, None, x, {}, None, (), stated)
         found = list(causes._of_stop(task, x, image))
         assert [one.cause for one in found] == [
             "an aperture stop off along x",
@@ -207,7 +215,9 @@ def test_a_stop_off_its_place_is_a_cause_of_its_own():
         ).images(x)[0]
         assert one.images[0] == pytest.approx(moved - image, abs=1e-6 * image.max())
         assert np.abs(one.images).max() > 0.02 * image.max()
-    plain = Task(ForwardModel(lens(None), model.setting, b.RESPONSE), None, x, {}, None)
+    plain = SearchTask(
+        ForwardModel(lens(None), model.setting, b.RESPONSE), None, x, {}, None
+    )
     assert not list(causes._of_stop(plain, x, image))
 
 
@@ -217,11 +227,14 @@ def test_a_source_behind_the_stop_is_refused():
 
 
 def test_the_place_of_a_stop_is_stated_of_lenses_that_have_one():
-    known = {"stop_um": Known("stop_um", 0.0, 0.7), "bias_nm": Known("bias_nm", 1.0)}
-    assert unfitted(known, lens()) == {"stop_um": 0.7}
+    known = {
+        "stop_um": KnownValue("stop_um", 0.0, 0.7),
+        "bias_nm": KnownValue("bias_nm", 1.0),
+    }
+    assert unfitted_sizes(known, lens()) == {"stop_um": 0.7}
     assert list(known) == ["bias_nm"]
     with pytest.raises(ConfigError, match="no aperture stop"):
-        unfitted({"stop_um": Known("stop_um", 0.0, 0.7)}, lens(None))
+        unfitted_sizes({"stop_um": KnownValue("stop_um", 0.0, 0.7)}, lens(None))
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from scipy import integrate
 
 from characterize.model import detector
-from characterize.model.detector import Grid
+from characterize.model.detector import DetectorGrid
 
 FX, FY = np.array([[0.13, 0.31, 0.02]]), np.array([[0.07], [-0.22]])
 F = np.hypot(FX, FY)
@@ -34,9 +34,12 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
     def slab(t):  # area of a ball's slice
         return size**2 / 4 - t * t
 
-    box = detector.pixel(FY, FX, pixel)
-    spread = detector.gauss(FY, FX, 0.9)[0]
-    lit, glow = detector.disc(FY, FX, size)[0], detector.ball(FY, FX, size)
+    box = detector.pixel_transfer(FY, FX, pixel)
+    spread = detector.gaussian_transfer(FY, FX, 0.9)[0]
+    lit, glow = (
+        detector.disc_transfer(FY, FX, size)[0],
+        detector.ball_transfer(FY, FX, size),
+    )
     for (i, j), f in np.ndenumerate(F):
         one = over(lambda t: 1.0, pixel / 2, FX[0, j]) * over(
             lambda t: 1.0, pixel / 2, FY[i, 0]
@@ -48,22 +51,28 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
         assert lit[i, j] == pytest.approx(over(chord, size / 2, f), rel=1e-6)
         assert glow[i, j] == pytest.approx(over(slab, size / 2, f), rel=1e-7)
     zero = np.zeros((1, 1))
-    assert (detector.disc(zero, zero, size)[0], detector.disc(zero, zero, size)[1]) == (
+    assert (
+        detector.disc_transfer(zero, zero, size)[0],
+        detector.disc_transfer(zero, zero, size)[1],
+    ) == (
         1,
         0,
     )
-    assert detector.ball(zero, zero, size) == pytest.approx(1, abs=1e-6)
+    assert detector.ball_transfer(zero, zero, size) == pytest.approx(1, abs=1e-6)
 
 
 def test_derivatives_by_width_are_those_of_differences():
-    for transfer, at in ((detector.gauss, 0.9), (detector.disc, 3.1)):
+    for transfer, at in (
+        (detector.gaussian_transfer, 0.9),
+        (detector.disc_transfer, 3.1),
+    ):
         rise = (transfer(FY, FX, at + 1e-5)[0] - transfer(FY, FX, at - 1e-5)[0]) / 2e-5
         assert transfer(FY, FX, at)[1] == pytest.approx(rise, rel=1e-6)
 
 
 @pytest.mark.parametrize("over", [1, 2, 3, 4])
 def test_fine_samples_share_each_pixel_evenly(over):
-    grid = Grid(5, 8, 2.4, over, margin=3)
+    grid = DetectorGrid(5, 8, 2.4, over, margin=3)
     for axis, pixels in zip(grid.axes_um(), (5, 8), strict=True):
         assert len(axis) == (pixels + 6) * over
         centre = axis.reshape(-1, over).mean(1)
@@ -79,7 +88,7 @@ def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over
     """Waves that close on the grid: the pixel at (r, c) sees cos(2π f·place), turned
     and weakened by the transfer.
     """
-    grid = Grid(6, 9, 1.7, over, margin=2)
+    grid = DetectorGrid(6, 9, 1.7, over, margin=2)
     y, x = grid.axes_um()
     fy, fx = 2 / (10 * 1.7), 3 / (13 * 1.7)
     light = 5 + np.cos(2 * math.pi * (fx * x + fy * y[:, None]) + 0.4)
@@ -109,15 +118,15 @@ def test_sums_along_the_axes_are_the_transfer_and_its_derivative(over):
     """Of light below the highest frequency of the samples, which is half in the
     sampling: rounding is left.
     """
-    grid, sigma = Grid(5, 8, 2.4, over, margin=3), 1.3
+    grid, sigma = DetectorGrid(5, 8, 2.4, over, margin=3), 1.3
     light = np.fft.fft2(np.random.default_rng(over).random((2, 11 * over, 14 * over)))
     light[:, 11 * over // 2 if over % 2 == 0 else slice(0, 0)] = 0
     light[:, :, 7 * over] = 0
     light = np.fft.ifft2(light).real
     fy, fx = grid.frequencies()
     square, (smooth, by_sigma) = (
-        detector.pixel(fy, fx, 2.4),
-        detector.gauss(fy, fx, sigma),
+        detector.pixel_transfer(fy, fx, 2.4),
+        detector.gaussian_transfer(fy, fx, sigma),
     )
     plain, slope = grid.sums(sigma)
     assert grid.sample(light, plain) == pytest.approx(
@@ -132,16 +141,20 @@ def test_sums_along_the_axes_are_the_transfer_and_its_derivative(over):
 
 
 def test_a_point_source_has_sums_and_a_small_disc_nearly_the_same():
-    grid, shrink = Grid(6, 5, 2.4, 2), np.array([0.7, 1.2])
+    grid, shrink = DetectorGrid(6, 5, 2.4, 2), np.array([0.7, 1.2])
     light = np.random.default_rng(0).random((2, 20, 18))
     light = np.fft.irfft2(
         np.fft.rfft2(light)
         * (np.hypot(*np.broadcast_arrays(*grid.frequencies())) < 0.3),
         (20, 18),
     )
-    point, slopes = detector.transfers(grid, 0.4, 0 * shrink, shrink, sized=False)
-    small, others = detector.transfers(grid, 0.4, 1e-4 * shrink, shrink, sized=True)
-    assert isinstance(point, detector.Sums)
+    point, slopes = detector.detector_transfers(
+        grid, 0.4, 0 * shrink, shrink, sized=False
+    )
+    small, others = detector.detector_transfers(
+        grid, 0.4, 1e-4 * shrink, shrink, sized=True
+    )
+    assert isinstance(point, detector.SeparableBlur)
     assert set(slopes) == {"crosstalk_px"}
     assert grid.sample(light, point) == pytest.approx(
         grid.sample(light, small), abs=1e-9

@@ -13,16 +13,16 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference.leastsquares import Data
+from characterize.inference.leastsquares import FitImages
 from characterize.inference.prepare import quick_enough
-from characterize.model import ForwardModel, Setting, made, thinplate
+from characterize.model import ForwardModel, FrameSetting, made, thinplate
 from characterize.model.glass import extra_path
 from characterize.model.moments import WHOLE
-from characterize.model.parameters import PLACE, vector
-from characterize.model.setting import Spectrum, true_depth
+from characterize.model.parameters import PLACE, parameter_vector
+from characterize.model.setting import SpectralLine, true_depth
 from metalens import design, profiles
 from metalens.cell.record import Cell
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 
 
 @pytest.mark.parametrize("path_um", [1.0, 13.7, 69.0, 310.0])
@@ -33,7 +33,7 @@ def test_colours_stand_for_a_gaussian_line_to_every_path_of_the_lens(
     """Mean of exp(i s) over a line of 4.25 nm, for phases s of paths up to the longest:
     exp(-s²/2).
     """
-    line = Spectrum(path_um, 0.85, tolerance)
+    line = SpectralLine(path_um, 0.85, tolerance)
     offset, weight = np.array(line.colours(4.25)).T
     assert weight.sum() == pytest.approx(1, rel=1e-12)
     assert (weight * offset).sum() == pytest.approx(0, abs=1e-9)
@@ -48,10 +48,10 @@ def test_colours_stand_for_a_gaussian_line_to_every_path_of_the_lens(
 
 
 def test_narrow_light_on_a_small_lens_is_two_colours_and_wide_light_on_a_large_one_is_refused():
-    assert len(Spectrum(5.0, 0.85, 5e-4).colours(1.0)) == 2
-    assert len(Spectrum(69.0, 0.85, 5e-4).colours(4.25)) == 9
+    assert len(SpectralLine(5.0, 0.85, 5e-4).colours(1.0)) == 2
+    assert len(SpectralLine(69.0, 0.85, 5e-4).colours(4.25)) == 9
     with pytest.raises(FitError, match="narrower filter"):
-        Spectrum(900.0, 0.85, 5e-4).colours(8.0)
+        SpectralLine(900.0, 0.85, 5e-4).colours(8.0)
 
 
 def test_the_longest_path_of_a_lens_is_from_its_axis_to_its_rim():
@@ -60,9 +60,11 @@ def test_the_longest_path_of_a_lens_is_from_its_axis_to_its_rim():
     """
     lens, radius = b.lens(), b.lens().diameters.radius_um
     exact = math.hypot(radius, 380) - 380 + math.hypot(radius, 110) - 110
-    line = Spectrum.of(lens, np.array([600.0, 380.0]), np.zeros((2, 2)), tolerance=1e-3)
+    line = SpectralLine.of(
+        lens, np.array([600.0, 380.0]), np.zeros((2, 2)), tolerance=1e-3
+    )
     assert line.path_um == pytest.approx(exact + 0.85, rel=1e-9)
-    aside = Spectrum.of(
+    aside = SpectralLine.of(
         lens,
         np.array([380.0, 600.0]),
         np.array([[0.2, -0.1], [0.2, -0.1]]),
@@ -98,23 +100,30 @@ def test_frames_of_a_wide_spectrum_are_those_of_its_colours():
         cell=Cell(pitch_um=0.4),
         proxy=b.proxy(),
     )[0]
-    setting = Setting(np.array([640.0]), np.zeros((1, 2)), np.ones(1), 1.5, 16, 16)
-    model, x = ForwardModel(lens, setting, b.RESPONSE), vector({"bandwidth_nm": 8.0})
+    setting = FrameSetting(np.array([640.0]), np.zeros((1, 2)), np.ones(1), 1.5, 16, 16)
+    model, x = (
+        ForwardModel(lens, setting, b.RESPONSE),
+        parameter_vector({"bandwidth_nm": 8.0}),
+    )
     place = np.linspace(-4, 4, 25)
     weight = np.exp(-(place**2) / 2)
     want = 0.0
     for offset, share in zip(8.0 * place, weight / weight.sum(), strict=True):
-        want = want + share * model.images(vector({"wavelength_nm": float(offset)}))[0]
+        want = (
+            want
+            + share
+            * model.images(parameter_vector({"wavelength_nm": float(offset)}))[0]
+        )
     assert np.abs(model.images(x)[0] - want).max() < 2 * setting.tolerance * want.max()
 
 
 def test_a_stage_is_off_by_its_zero_and_by_its_scale_about_its_middle():
     setting = SimpleNamespace(depth_um=np.array([21e3, 26e3, 34e3]))
-    x = vector({"stage_zero_um": 310.0, "stage_scale": 0.013})
+    x = parameter_vector({"stage_zero_um": 310.0, "stage_scale": 0.013})
     assert true_depth(x, setting, 27e3) == pytest.approx(
         [21e3 + 310 - 78, 26e3 + 310 - 13, 34e3 + 310 + 91]
     )
-    behind = true_depth(vector({"stage_zero_um": -20e3}), setting, 27e3)
+    behind = true_depth(parameter_vector({"stage_zero_um": -20e3}), setting, 27e3)
     assert behind == pytest.approx(
         [4.2e3, 6e3, 14e3]
     )  # never nearer than a fifth of what was stated
@@ -126,9 +135,11 @@ def test_fewer_terms_change_no_derivative():
 
     A twentieth of the largest change; 1 % of the fields is left out.
     """
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
+    )
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
-    x = vector(b.VALUES | {"background_e": 0.0})
+    x = parameter_vector(b.VALUES | {"background_e": 0.0})
     names = ["distance_um", "wavelength_nm", "stage_zero_um", "bias_nm", "coma_x_rad"]
     full, some = (each.images(x, names)[1] for each in (model, model.rough(1e-2)))
     for one, other in zip(full, some, strict=True):
@@ -139,15 +150,17 @@ def test_the_fewest_terms_that_count_depend_on_the_light():
     """Of frames of few electrons more may be left out; chi-square rises by no more than
     0.02 against all terms.
     """
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
+    )
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
-    light = model.images(vector(b.VALUES | {"background_e": 0.0}))[0]
+    light = model.images(parameter_vector(b.VALUES | {"background_e": 0.0}))[0]
     cuts = []
     for peak in (50.0, 5e5, 5e7):
-        x = vector(b.VALUES | {"log_gain": math.log(peak / light.max())})
+        x = parameter_vector(b.VALUES | {"log_gain": math.log(peak / light.max())})
         exact = model.images(x)[0]
         ones = np.ones_like(exact)
-        data = Data(exact, ones > 0, ones < 0, 4 * ones, ones)
+        data = FitImages(exact, ones > 0, ones < 0, 4 * ones, ones)
         quick = quick_enough(model, data, x)
         rise = float(((quick.images(x)[0] - exact) ** 2 / data.variance(exact)).sum())
         assert rise < 0.02
@@ -159,11 +172,13 @@ def test_of_some_nodes_phase_and_its_slopes_are_those_of_all():
     """Also through glass, with modes beyond the parameters and uneven light; to
     rounding.
     """
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
-    model = ForwardModel(b.lens(), setting, b.RESPONSE).with_residual(
-        np.array([0.07, -0.11]), thinplate.basis
+    setting = FrameSetting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16
     )
-    x = vector(
+    model = ForwardModel(b.lens(), setting, b.RESPONSE).with_residual(
+        np.array([0.07, -0.11]), thinplate.thin_plate_basis
+    )
+    x = parameter_vector(
         b.VALUES
         | {
             "glass_um": 170.0,
@@ -198,7 +213,7 @@ def test_a_window_off_the_chief_ray_sees_the_same_light_shifted_by_whole_pixels(
     them: fields to 5e-4, twice. Held at
     the chief ray, the phase of a decentre turns each place as the middle: k 4.5 um 10
     um 1.5 sin² / d missed."""
-    setting = Setting(
+    setting = FrameSetting(
         np.array([480.0, 800.0]), np.zeros((2, 2)), np.ones(2), 1.5, 16, 18
     )
     model, names = (
@@ -211,9 +226,9 @@ def test_a_window_off_the_chief_ray_sees_the_same_light_shifted_by_whole_pixels(
         "background_x_e": 0.0,
         "log_gain": 10.0,
     }
-    here, slopes = model.images(vector(values), names)
+    here, slopes = model.images(parameter_vector(values), names)
     x, y = (1.5 * n for n in pixels)
-    moved = vector(values | {"decentre_x_um": x, "decentre_y_um": y})
+    moved = parameter_vector(values | {"decentre_x_um": x, "decentre_y_um": y})
     there, shifted = model.about((x, y)).images(moved, names)
     rows, columns = (
         slice(max(n, 0), size + min(n, 0))
@@ -234,7 +249,7 @@ def test_a_window_off_the_chief_ray_sees_the_same_light_shifted_by_whole_pixels(
     assert np.abs(plain - here[:, rows, columns]).max() > 8e-3 * here.max()
 
 
-SMALL = Setting(
+SMALL = FrameSetting(
     np.array([480.0, 800.0]), np.zeros((2, 2)), np.array([1.0, 1.7]), 1.5, 12, 16
 )
 
@@ -249,12 +264,12 @@ def test_frames_hold_the_light_of_the_lens(small):
     and the exposure; of that the
     pillars pass three quarters and the window, of three Airy radii to each side, nine
     tenths."""
-    light = small.images(vector({"log_gain": 1.3}))[0].sum((1, 2))
+    light = small.images(parameter_vector({"log_gain": 1.3}))[0].sum((1, 2))
     mean = 2 / (1 / 480.0 + 1 / 800.0)
     want = math.exp(1.3) * np.array(
         [1.0 * (mean / 480.0) ** 2, 1.7 * (mean / 800.0) ** 2]
     )
-    t = made.pillars(b.lens(), b.RESPONSE, vector({}))
+    t = made.as_built_transmission(b.lens(), b.RESPONSE, parameter_vector({}))
     passed = (np.abs(t) ** 2).sum() / (t != 0).sum()
     assert passed == pytest.approx(0.75, abs=0.03)
     assert light / want / passed == pytest.approx([0.92, 0.92], abs=0.06)
@@ -265,10 +280,10 @@ def test_some_frames_of_several_angles_are_those_of_all():
     angles = np.array([[0.05, -0.02], [0.0, 0.03]])[[0, 1, 0, 1, 0]]
     model = ForwardModel(
         b.lens(),
-        Setting(np.array(b.DEPTHS), angles, np.linspace(1, 2, 5), 1.5, 10, 10),
+        FrameSetting(np.array(b.DEPTHS), angles, np.linspace(1, 2, 5), 1.5, 10, 10),
         b.RESPONSE,
     )
-    x = vector(b.VALUES)
+    x = parameter_vector(b.VALUES)
     every = model.images(x)[0]
     for some in ([1, 2, 4], [3], [0, 4]):
         assert model.only(np.array(some)).images(x)[0] == pytest.approx(
@@ -288,9 +303,9 @@ def test_a_background_rises_from_minus_one_to_one_across_the_frame(small):
     its slopes along x and y by
     (column - 7.5) / 8 and (row - 5.5) / 6."""
     dark = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}
-    light = small.images(vector(dark))[0]
+    light = small.images(parameter_vector(dark))[0]
     seen = small.images(
-        vector(
+        parameter_vector(
             dark | {"background_e": 7.0, "background_x_e": 3.0, "background_y_e": -5.0}
         )
     )[0]
@@ -304,11 +319,11 @@ def test_a_source_of_some_width_is_the_sum_of_its_points(small):
     its width there times d / z.
     """
     values = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0, "log_gain": 10.0}
-    wide = small.images(vector(values | {"pinhole_um": 14.0}))[0]
-    point = small.images(vector(values))[0]
+    wide = small.images(parameter_vector(values | {"pinhole_um": 14.0}))[0]
+    point = small.images(parameter_vector(values))[0]
     radius = 7.0 * np.sqrt((np.arange(5) + 0.5) / 5)  # rings of one area
     want = np.mean([
-        small.images(vector(values | {"source_x_um": r * math.cos(a), "source_y_um": r * math.sin(a)}))[0]
+        small.images(parameter_vector(values | {"source_x_um": r * math.cos(a), "source_y_um": r * math.sin(a)}))[0]
         for i, r in enumerate(radius)
         for a in 2 * np.pi * (np.arange(7) + i / 3) / 7
     ], axis=0)  # fmt: skip
@@ -322,7 +337,7 @@ def test_derivatives_by_the_bench_are_differences_with_a_wide_source(small):
     """Central ones; the source's image grows with distance and depth. Slopes of fields
     are of fewer terms, which leaves
     0.8 % of that by the wavelength."""
-    x = vector(b.VALUES | {"pinhole_um": 14.0, "log_gain": 10.0})
+    x = parameter_vector(b.VALUES | {"pinhole_um": 14.0, "log_gain": 10.0})
     steps = {
         "distance_um": 0.03,
         "stage_zero_um": 0.3,
@@ -352,7 +367,7 @@ def test_smooth_phases_are_those_of_the_paths_from_a_point_of_the_bench_to_a_win
     """Straight lines through the place of a node, at the wavelength that it is, but for
     a phase of all the lens.
     """
-    setting = Setting(
+    setting = FrameSetting(
         np.array([480.0, 800.0]),
         np.tile([0.06, -0.04], (2, 1)),
         np.ones(2),
@@ -367,7 +382,7 @@ def test_smooth_phases_are_those_of_the_paths_from_a_point_of_the_bench_to_a_win
         "decentre_x_um": 0.8,
         "decentre_y_um": -0.4,
     }
-    x = vector(
+    x = parameter_vector(
         bench
         | {
             "tilt_x_deg": 0.3,
@@ -390,7 +405,11 @@ def test_smooth_phases_are_those_of_the_paths_from_a_point_of_the_bench_to_a_win
         )
         off = got - 2 * math.pi / 0.8513 * (enter + leave)
         assert np.ptp(off) < 1e-9 * np.abs(got).max()
-    plate = x + vector({"glass_um": 70.0, "glass_tilt_x_deg": 1.1}) - vector({})
+    plate = (
+        x
+        + parameter_vector({"glass_um": 70.0, "glass_tilt_x_deg": 1.1})
+        - parameter_vector({})
+    )
     for got, z in zip(
         model._phase(plate, group) - model._phase(x, group), (489.0, 809.0), strict=True
     ):

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from characterize.model.gather import folded, lit, mirrored
-from characterize.model.glass import Bench
-from characterize.model.pillars import Pillars
-from characterize.model.reduced import Reduced
+from characterize.model.gather import fold_weights, gather_light, is_mirror_symmetric
+from characterize.model.glass import BenchGeometry
+from characterize.model.pillars import PillarResponse
+from characterize.model.reduced import CompressedLens
 from metalens import design
 from metalens.cell import Cell
 from metalens.design import profiles
@@ -33,7 +33,7 @@ def test_a_pillar_s_functions_are_looked_up_and_turned(kind, close):
     table = (rng.normal(size=(5, 3)) + 1j * rng.normal(size=(5, 3))).astype(kind)
     place = rng.integers(0, 5, (4, 6))
     turns = np.exp(2j * np.pi * rng.random((6, 4))).astype(kind).T
-    got = lit(table, place, turns)
+    got = gather_light(table, place, turns)
     want = (table[place] * turns[..., None]).transpose(1, 0, 2)
     assert got.shape == (6, 4, 6)
     assert got.dtype == table.real.dtype
@@ -52,9 +52,9 @@ def test_half_of_what_is_alike_to_both_sides_sums_to_all_of_it(count):
     values = np.concatenate([half[::-1], half[count % 2 :]])
     first = count // 2
     assert (
-        folded(weights, first)[first:].T @ values[first:] == weights.T @ values
+        fold_weights(weights, first)[first:].T @ values[first:] == weights.T @ values
     ).all()
-    assert folded(weights, 0) is weights
+    assert fold_weights(weights, 0) is weights
 
 
 @pytest.fixture(scope="module", params=[9.2, 9.6])
@@ -73,12 +73,12 @@ def lens(request):
 
 def gathered(lens, tangents=(0.0, 0.0)):
     bench, depths = (
-        Bench(lens.sensor_distance_um, 0.85, 138.0, tangents),
+        BenchGeometry(lens.sensor_distance_um, 0.85, 138.0, tangents),
         np.array([100.0, 170.0]),
     )
-    return Reduced(
+    return CompressedLens(
         lens,
-        Pillars(lens, b.RESPONSE),
+        PillarResponse(lens, b.RESPONSE),
         bench,
         window_um=24.0,
         depths_um=depths,
@@ -110,15 +110,21 @@ def test_a_quarter_of_the_pillars_gathers_what_all_do(lens):
 
 def test_pillars_are_alike_to_both_sides_only_where_all_of_them_and_the_light_are(lens):
     d = lens.diameters
-    assert mirrored(d, (0.0, 0.0))
-    assert not mirrored(d, (0.0, 0.01))
-    assert not mirrored(with_one_wider(lens, 1e-12).diameters, (0.0, 0.0))
+    assert is_mirror_symmetric(d, (0.0, 0.0))
+    assert not is_mirror_symmetric(d, (0.0, 0.01))
+    assert not is_mirror_symmetric(with_one_wider(lens, 1e-12).diameters, (0.0, 0.0))
     one_way = d.diameter_um * (1 + 1e-3 * np.linspace(-1, 1, len(d.diameter_um)))
-    assert not mirrored(dataclasses.replace(d, diameter_um=one_way), (0.0, 0.0))
-    assert not mirrored(dataclasses.replace(d, diameter_um=one_way.T), (0.0, 0.0))
-    assert not mirrored(dataclasses.replace(d, length_um=d.diameter_um), (0.0, 0.0))
-    assert not mirrored(
+    assert not is_mirror_symmetric(
+        dataclasses.replace(d, diameter_um=one_way), (0.0, 0.0)
+    )
+    assert not is_mirror_symmetric(
+        dataclasses.replace(d, diameter_um=one_way.T), (0.0, 0.0)
+    )
+    assert not is_mirror_symmetric(
+        dataclasses.replace(d, length_um=d.diameter_um), (0.0, 0.0)
+    )
+    assert not is_mirror_symmetric(
         dataclasses.replace(d, angle_rad=np.zeros_like(d.diameter_um)), (0.0, 0.0)
     )
-    assert mirrored(d, (0.0, 0.0), Stop(7.0, 30.0))
-    assert not mirrored(d, (0.0, 0.0), Stop(7.0, 30.0, (0.0, 0.3)))
+    assert is_mirror_symmetric(d, (0.0, 0.0), Stop(7.0, 30.0))
+    assert not is_mirror_symmetric(d, (0.0, 0.0), Stop(7.0, 30.0, (0.0, 0.3)))

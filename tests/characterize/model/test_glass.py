@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.model.glass import INDEX, extra_path
-from characterize.model.parameters import vector
-from metalens.ground.errors import FitError
+from characterize.model.parameters import parameter_vector
+from metalens.core.errors import FitError
 
 DEPTH, TANGENTS = 411.0, (0.031, -0.017)
 
@@ -60,7 +60,7 @@ def test_the_path_through_glass_is_the_least(values):
         np.array(y),
         tangents=TANGENTS,
         depth_um=DEPTH,
-        values=vector(values),
+        values=parameter_vector(values),
     )
     want = least_path(x, y, values) - least_path(0.0, 0.0, values)
     assert abs(want) > 0.1
@@ -70,15 +70,17 @@ def test_the_path_through_glass_is_the_least(values):
 
 
 def test_frames_through_glass_are_those_of_every_pillar():
-    from characterize.model.forward import ForwardModel, Setting
+    from characterize.model.forward import ForwardModel, FrameSetting
 
     model = ForwardModel(
         b.lens(),
-        Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16),
+        FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16),
         b.RESPONSE,
     )
     glass = {"glass_um": 60.0, "glass_tilt_x_deg": 6.0}
-    x = vector(b.VALUES | glass | {"background_e": 0.0, "background_x_e": 0.0})
+    x = parameter_vector(
+        b.VALUES | glass | {"background_e": 0.0, "background_x_e": 0.0}
+    )
     found, want = model.images(x)[0], b.light(**glass)
     scale = (found * want).sum() / (found**2).sum()
     assert np.abs(scale * found - want).max() < 1e-3 * want.max()  # as without glass
@@ -91,7 +93,7 @@ def test_a_plate_that_has_no_room_is_refused(tilt_deg):
     """Along the normal of a tilted plate the source is nearer: 40 cos 30 degrees less
     than 35 um.
     """
-    values = vector({"glass_um": 35.0, "glass_tilt_x_deg": tilt_deg})
+    values = parameter_vector({"glass_um": 35.0, "glass_tilt_x_deg": tilt_deg})
     at = np.array([2.0]), np.array([-3.0])
     if tilt_deg:
         with pytest.raises(

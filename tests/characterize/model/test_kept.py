@@ -31,7 +31,7 @@ def asked(about="a cell", packages=("characterize.model",), title="pillars"):
         calls.append(1)
         return MADE
 
-    return kept.kept(title, about, packages, make), len(calls)
+    return kept.cached_arrays(title, about, packages, make), len(calls)
 
 
 def test_a_second_run_finds_the_same_bits(home):
@@ -81,11 +81,11 @@ def test_a_home_that_cannot_be_written_costs_time_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for home in ("~", str(tmp_path / "nobody")):
         monkeypatch.setattr(os.path, "expanduser", lambda path, home=home: home)
-        assert kept.folder() is None
+        assert kept.cache_folder() is None
         assert asked()[1] == 1
         assert not Path(home).exists()
     monkeypatch.setattr(os.path, "expanduser", lambda path: str(tmp_path))
-    assert kept.folder() == tmp_path / ".cache" / "metalens"
+    assert kept.cache_folder() == tmp_path / ".cache" / "metalens"
 
 
 def test_the_oldest_files_go(home, monkeypatch):

@@ -14,26 +14,26 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.inference.search import prior_of
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.glass import Bench
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.glass import BenchGeometry
 from characterize.model.kernel import (
     SINGLE,
-    Kernel,
-    factors,
+    CompressedKernel,
+    complex_precision,
     least_tolerance,
-    precision,
-    turns,
+    low_rank_factors,
+    phasors,
 )
-from characterize.model.parameters import Known
-from characterize.model.pillars import Change, Pillars
-from characterize.model.reduced import Reduced
+from characterize.model.parameters import KnownValue
+from characterize.model.pillars import PillarChange, PillarResponse
+from characterize.model.reduced import CompressedLens
 from metalens import design, profiles
 from metalens.cell.record import Cell
-from metalens.ground import legendre
-from metalens.ground.errors import FitError
-from metalens.ground.paths import source_path
+from metalens.core import legendre
+from metalens.core.errors import FitError
+from metalens.core.paths import source_path
 
 K = 2 * math.pi / 0.85
 # nominal distance, actual over nominal, lens radius or half sides (x, y), half window,
@@ -70,7 +70,7 @@ def case(name):
         y / np.sqrt(x**2 + y**2 + distance**2),
     )
     spans = (float(p.min()), float(p.max())), (float(q.min()), float(q.max()))
-    return Kernel(K, *spans, distance, distance * share, (tx, ty)), half
+    return CompressedKernel(K, *spans, distance, distance * share, (tx, ty)), half
 
 
 def places(kernel, half, count=120):
@@ -114,12 +114,15 @@ def interpolated(kernel, half, counts, at):
     (w, m), (p, q, X, Y) = counts, at
 
     def basis(count, values, low, high):
-        return legendre.interpolation(
+        return legendre.interpolation_matrix(
             count, (2 * values.ravel() - low - high) / (high - low)
         )
 
-    node = legendre.mapped(w, -half, half)
-    P, Q = legendre.mapped(m, *kernel.p), legendre.mapped(m, *kernel.q)[:, None]
+    node = legendre.mapped_nodes(w, -half, half)
+    P, Q = (
+        legendre.mapped_nodes(m, *kernel.p),
+        legendre.mapped_nodes(m, *kernel.q)[:, None],
+    )
     table = np.stack(
         [kernel.rest(P, Q, node[:, None, None], height) for height in node]
     )
@@ -162,7 +165,7 @@ def test_factors_are_those_of_the_singular_values(tolerance):
     )
     size = np.exp(-0.12 * np.arange(90))
     table = ((u * size) @ v.conj().T).astype(np.complex64)
-    columns, rows, remainder = factors(table, tolerance)
+    columns, rows, remainder = low_rank_factors(table, tolerance)
     left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
     assert np.linalg.norm(columns @ rows - table) < 1.05 * tolerance * np.linalg.norm(
         table
@@ -173,7 +176,7 @@ def test_factors_are_those_of_the_singular_values(tolerance):
 
 def test_factors_of_a_table_without_structure_are_all_of_it():
     table = np.random.default_rng(0).normal(size=(30, 40)).astype(np.complex64)
-    columns, rows, _ = factors(table, 1e-5)
+    columns, rows, _ = low_rank_factors(table, 1e-5)
     assert columns.shape == (30, 30)
     assert np.abs(columns @ rows - table).max() < 1e-5
 
@@ -202,7 +205,7 @@ def test_what_the_precision_of_a_table_holds_is_met_in_any_order_of_sums_and_the
     for tolerance in np.geomspace(1e-2, 1.01 * least, 6):
         for _ in range(3):
             mixed = table[rng.permutation(160)][:, rng.permutation(140)]
-            columns, rows, _ = factors(mixed, tolerance)
+            columns, rows, _ = low_rank_factors(mixed, tolerance)
             left = np.linalg.norm(
                 columns.astype(complex) @ rows - mixed
             ) / np.linalg.norm(mixed)
@@ -217,24 +220,24 @@ def test_what_the_precision_of_a_table_holds_is_met_in_any_order_of_sums_and_the
                 np.abs(overlap).max() < 20 * np.finfo(kind).eps
             )  # products of 160 terms
     with pytest.raises(FitError, match=np.dtype(kind).name):
-        factors(table, 0.9 * least)
+        low_rank_factors(table, 0.9 * least)
 
 
 def test_no_kind_of_number_is_chosen_that_does_not_hold_the_tolerance():
-    assert precision(SINGLE) is np.complex64
-    assert precision(0.99 * SINGLE) is np.complex128
+    assert complex_precision(SINGLE) is np.complex64
+    assert complex_precision(0.99 * SINGLE) is np.complex128
     largest = np.empty(
         (1, 20_000), np.complex64
     )  # more than the columns of any window here: 66² and 61² nodes
     assert least_tolerance(largest) < SINGLE
     for impossible in (1e-10, 0.0, math.nan, 1.0):
         with pytest.raises(FitError, match="tolerance"):
-            precision(impossible)
+            complex_precision(impossible)
 
 
 def test_phases_are_wrapped_before_they_lose_digits():
     phase = np.linspace(-1e7, 1e7, 1001)
-    assert np.abs(turns(phase) - np.exp(1j * phase)).max() < 1e-6
+    assert np.abs(phasors(phase) - np.exp(1j * phase)).max() < 1e-6
 
 
 def near_lens(width_um=20.0):
@@ -254,8 +257,8 @@ def test_a_tighter_tolerance_is_met_and_never_gives_a_worse_field(tangents):
     a tenth of the tolerance.
     """
     lens, axis, z = near_lens(9.2), np.linspace(-6.3, 6.3, 29), 120.0
-    pillars, d = Pillars(lens, b.RESPONSE), lens.sensor_distance_um
-    nominal = pillars.coefficients(Change())[0]
+    pillars, d = PillarResponse(lens, b.RESPONSE), lens.sensor_distance_um
+    nominal = pillars.coefficients(PillarChange())[0]
     rows, columns = np.nonzero(lens.diameters.diameter_um)
     x, y = lens.diameters.x_um[columns], lens.diameters.y_um[rows]
     t = (
@@ -279,13 +282,13 @@ def test_a_tighter_tolerance_is_met_and_never_gives_a_worse_field(tangents):
         -1
     ) * 0.4**2
     bench_, depths, errors = (
-        Bench(d, 0.85, 138.0, tangents),
+        BenchGeometry(d, 0.85, 138.0, tangents),
         np.array([100.0, 170.0]),
         [],
     )
     tolerances = (1e-2, 1e-3, SINGLE, 0.3 * SINGLE, 5e-6, 1e-7)
     for tolerance in tolerances:
-        reduced = Reduced(
+        reduced = CompressedLens(
             lens, pillars, bench_, window_um=24.0, depths_um=depths, tolerance=tolerance
         )
         operators = reduced.operators(
@@ -321,15 +324,15 @@ def test_window_as_wide_as_the_distance_agrees_with_the_sum_over_every_pillar(
         "coma_x_rad": 0.2,
         "crosstalk_px": 0.25,
     }
-    known = tuple(Known(name, value) for name, value in values.items())
-    truth = Truth(
+    known = tuple(KnownValue(name, value) for name, value in values.items())
+    truth = HiddenLens(
         depths,
         parameter=known,
-        camera=Camera(pixel_um=1.0, pixels=20),
+        camera=BenchCamera(pixel_um=1.0, pixels=20),
         angles_deg=(angle_deg,),
     )
-    want = bench.irradiance(lens, truth, b.RESPONSE)
-    setting = Setting(*truth.stated, np.ones(2), 1.0, 20, 20)
+    want = bench.bench_irradiance(lens, truth, b.RESPONSE)
+    setting = FrameSetting(*truth.stated, np.ones(2), 1.0, 20, 20)
     model = ForwardModel(lens, setting, b.RESPONSE)
     found = model.images(truth.vector())[0]
     found *= (found * want).sum() / (found**2).sum()

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from characterize.model import kernel
-from characterize.model.glass import Films
-from characterize.model.kernel import Kernel
-from metalens.ground.errors import FitError
+from characterize.model.glass import FilmStack
+from characterize.model.kernel import CompressedKernel
+from metalens.core.errors import FitError
 
 K, NOMINAL, AWAY, TANGENTS = 2 * math.pi / 0.83, 31.0, 33.7, (0.21, -0.13)
-KERNEL = Kernel(K, (-0.31, 0.12), (-0.05, 0.27), NOMINAL, AWAY, TANGENTS)
+KERNEL = CompressedKernel(K, (-0.31, 0.12), (-0.05, 0.27), NOMINAL, AWAY, TANGENTS)
 P, Q = np.array([-0.3, 0.02, 0.11]), np.array([0.26, -0.04, 0.1])
 X, Y = np.array([[2.3], [-1.7]]), np.array([[-0.9], [3.1]])
 
@@ -34,7 +34,7 @@ def distance(p, q, x, y, this=KERNEL, far=AWAY):
 def test_paths_are_differences_of_distances_to_the_window_and_its_middle():
     for this in (
         KERNEL,
-        Kernel(K, KERNEL.p, KERNEL.q, NOMINAL, AWAY, TANGENTS, nodes_um=28.0),
+        CompressedKernel(K, KERNEL.p, KERNEL.q, NOMINAL, AWAY, TANGENTS, nodes_um=28.0),
     ):
         path, ray = this.path(P, Q, X, Y)
         assert ray == pytest.approx(distance(P, Q, X, Y, this), rel=1e-13)
@@ -60,8 +60,8 @@ def snell(far):
 
 def test_paths_through_films_are_those_of_snells_rays():
     """At the nominal 31 um; the chord's table of rays is good to 1e-9 of them."""
-    films = Films((), ((1.52, 9.0), (1.33, 7.0)), 1.1)
-    this = Kernel(K, KERNEL.p, KERNEL.q, NOMINAL, NOMINAL, TANGENTS, films)
+    films = FilmStack((), ((1.52, 9.0), (1.33, 7.0)), 1.1)
+    this = CompressedKernel(K, KERNEL.p, KERNEL.q, NOMINAL, NOMINAL, TANGENTS, films)
     path, ray = this.path(P, Q, X, Y)
     r_0 = NOMINAL / np.sqrt(1 - P**2 - Q**2)
     near = np.hypot(r_0 * P, r_0 * Q)
@@ -149,12 +149,12 @@ def test_a_longer_distance_or_wave_is_longer_by_its_share():
 def test_turns_are_wrapped_before_they_lose_digits(kind):
     """1e5 turns and a bit: single precision of the phase itself would leave 0.03 rad."""
     phase = 2 * math.pi * (1e5 + np.array([0.13, -0.41, 0.5])) + 0.0
-    found = kernel.turns(phase, kind)
+    found = kernel.phasors(phase, kind)
     assert found.dtype == kind
     assert found == pytest.approx(
         np.exp(1j * 2 * math.pi * np.array([0.13, -0.41, 0.5])), abs=1e-6
     )
-    faded = kernel.turns(np.array([0.3 + 0.7j]), kind)
+    faded = kernel.phasors(np.array([0.3 + 0.7j]), kind)
     assert faded == pytest.approx(
         [math.exp(-0.7) * (math.cos(0.3) + 1j * math.sin(0.3))], rel=1e-6
     )
@@ -162,17 +162,17 @@ def test_turns_are_wrapped_before_they_lose_digits(kind):
 
 
 def test_precision_follows_the_tolerance():
-    assert [kernel.precision(t) for t in (0.5, 1e-4)] == [np.complex64] * 2
-    assert [kernel.precision(t) for t in (0.99e-4, 1e-9)] == [np.complex128] * 2
+    assert [kernel.complex_precision(t) for t in (0.5, 1e-4)] == [np.complex64] * 2
+    assert [kernel.complex_precision(t) for t in (0.99e-4, 1e-9)] == [np.complex128] * 2
     for wrong in (0.99e-9, 1.0, math.nan):
         with pytest.raises(FitError, match="need 1e-9 to 1"):
-            kernel.precision(wrong)
+            kernel.complex_precision(wrong)
     assert (kernel.real_of(np.complex64), kernel.real_of(np.complex128)) == (
         np.float32,
         np.float64,
     )
-    assert kernel.digits(5e-4) == kernel.digits(0.1) == 0.0
-    assert kernel.digits(5e-6) == pytest.approx(math.log(100))
+    assert kernel.extra_digits(5e-4) == kernel.extra_digits(0.1) == 0.0
+    assert kernel.extra_digits(5e-6) == pytest.approx(math.log(100))
     eps = np.finfo(np.float32).eps
     for shape in ((3, 400), (400, 3)):
         assert kernel.least_tolerance(np.zeros(shape, np.complex64)) == pytest.approx(
@@ -200,7 +200,7 @@ def test_factors_have_as_many_terms_as_their_remainder_needs(tolerance, scale):
     """
     sizes = scale * 0.5 ** np.arange(46)
     table = known(sizes)
-    columns, rows, remainder = kernel.factors(table, tolerance)
+    columns, rows, remainder = kernel.low_rank_factors(table, tolerance)
     rank = next(
         n
         for n in range(46)
@@ -214,14 +214,18 @@ def test_factors_have_as_many_terms_as_their_remainder_needs(tolerance, scale):
 
 
 def test_factors_of_one_term_and_of_more_than_is_held():
-    columns, rows, remainder = kernel.factors(known(np.array([3.0])), 1e-6)
+    columns, rows, remainder = kernel.low_rank_factors(known(np.array([3.0])), 1e-6)
     assert (len(rows), remainder) == (1, pytest.approx([1.0]))
     assert columns @ rows == pytest.approx(known(np.array([3.0])), abs=1e-9)
-    assert len(kernel.factors(known(np.array([3.0, 1e-3])), 0.9)[1]) == 1
+    assert len(kernel.low_rank_factors(known(np.array([3.0, 1e-3])), 0.9)[1]) == 1
     with pytest.raises(FitError, match="complex64 tables of"):
-        kernel.factors(known(np.array([3.0, 1.0])).astype(np.complex64), 4e-6)
+        kernel.low_rank_factors(known(np.array([3.0, 1.0])).astype(np.complex64), 4e-6)
     assert (
-        len(kernel.factors(known(np.array([3.0, 1.0])).astype(np.complex64), 1e-5)[1])
+        len(
+            kernel.low_rank_factors(
+                known(np.array([3.0, 1.0])).astype(np.complex64), 1e-5
+            )[1]
+        )
         == 2
     )
 
@@ -269,12 +273,14 @@ def test_terms_of_a_wave_leave_a_fiftieth_of_the_tolerance(slope):
 def test_counts_of_nodes_hold_branches_and_digits(
     half, span, tolerance, window, aperture
 ):
-    this = Kernel(
+    this = CompressedKernel(
         1e-6, span, (0.0, 0.005), 31.0, 31.0
     )  # waves so long that no phase turns
     assert this.counts(half, half / 3, tolerance) == (
         window,
-        aperture if aperture > 10 else int(10.16 * (1 + kernel.digits(tolerance) / 8)),
+        aperture
+        if aperture > 10
+        else int(10.16 * (1 + kernel.extra_digits(tolerance) / 8)),
     )
 
 

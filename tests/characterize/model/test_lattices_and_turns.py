@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.model import ForwardModel, Setting, vector
+from characterize.model import ForwardModel, FrameSetting, parameter_vector
 from characterize.model import made as as_built
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Rectangle
@@ -117,11 +117,11 @@ def test_frames_are_the_sum_over_every_pillar(hexagonal, hand, sign):
     the area of a site.
     """
     lens, sites = made(hexagonal, hand)
-    setting = Setting(
+    setting = FrameSetting(
         np.array(DEPTHS), np.zeros((3, 2)), np.ones(3), PIXEL, PIXELS, PIXELS
     )
     model = ForwardModel(lens, setting, b.RESPONSE)
-    got = model.images(vector(VALUES | {"crosstalk_px": 0.0}))[0]
+    got = model.images(parameter_vector(VALUES | {"crosstalk_px": 0.0}))[0]
     want = summed(lens, sites, sign)
     site = PITCH**2 * (math.sqrt(3) / 2 if hexagonal else 1.0)
     bright = site**2 * PIXEL**2 * model.reference_um**2 / (len(sites[0]) * site)
@@ -136,17 +136,22 @@ def test_the_bench_shows_the_sum_over_every_pillar(hexagonal, hand, sign):
     known = tuple(
         b.Known(name, value) for name, value in (VALUES | {"crosstalk_px": 0.0}).items()
     )
-    truth = bench.Truth(
-        DEPTHS, parameter=known, camera=bench.Camera(pixel_um=PIXEL, pixels=PIXELS)
+    truth = bench.HiddenLens(
+        DEPTHS, parameter=known, camera=bench.BenchCamera(pixel_um=PIXEL, pixels=PIXELS)
     )
-    got, want = bench.irradiance(lens, truth, b.RESPONSE), summed(lens, sites, sign)
+    got, want = (
+        bench.bench_irradiance(lens, truth, b.RESPONSE),
+        summed(lens, sites, sign),
+    )
     got *= (got * want).sum() / (got**2).sum()
     assert np.abs(got - want).max() < 2e-3 * want.max()
 
 
 def test_the_lens_as_built_lies_on_the_lattice_of_its_design_and_keeps_its_turns():
     lens, _ = made(True, "left")
-    grown = as_built.built_lens(lens, vector({"bias_nm": 3.0, "distance_um": 1.5}))
+    grown = as_built.built_lens(
+        lens, parameter_vector({"bias_nm": 3.0, "distance_um": 1.5})
+    )
     assert (grown.diameters.lattice, grown.hand, grown.sensor_distance_um) == (
         HEX,
         "left",

@@ -12,7 +12,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.model import made, state, thinplate, vector
+from characterize.model import made, parameter_vector, process_state_of, thinplate
 from metalens import psf
 from metalens.fabrication import transmission
 
@@ -40,7 +40,7 @@ def test_psfs_are_those_of_the_wavelength_in_nm_and_the_distance_in_um_beside_th
         "psf_stack",
         lambda phase, level, **about: asked.append((phase, level, about)) or stack,
     )
-    x = vector({"wavelength_nm": 1.7, "distance_um": -3.1, "bias_nm": 4.0})
+    x = parameter_vector({"wavelength_nm": 1.7, "distance_um": -3.1, "bias_nm": 4.0})
     view = psf.View(
         (600.0,), ((0.02, -0.01), (0.0, 0.03)), 24.0, 4, offset_um=(0.7, -0.4)
     )
@@ -49,7 +49,7 @@ def test_psfs_are_those_of_the_wavelength_in_nm_and_the_distance_in_um_beside_th
     )
     assert found.intensity.shape == (2, 1, 4, 4)
     for (phase, level, about), angle in zip(asked, view.angles_rad, strict=True):
-        t = made.pillars(
+        t = made.as_built_transmission(
             lens, b.RESPONSE, x, angle_rad=made.incidence_rad(lens.proxy, angle)
         )
         assert level * np.exp(1j * phase) == pytest.approx(
@@ -71,10 +71,10 @@ def test_every_pillar_passes_the_light_of_its_own_diameter_with_the_phase_of_its
     phase turns by 50 rad a um.
     """
     lens, rng = b.lens(), np.random.default_rng(3)
-    d, x = lens.diameters, vector(b.VALUES)
+    d, x = lens.diameters, parameter_vector(b.VALUES)
     noise = rng.normal(0, 2e-3, d.diameter_um.shape)
-    got = made.pillars(lens, b.RESPONSE, x, noise_um=noise)
-    known = state(x)
+    got = made.as_built_transmission(lens, b.RESPONSE, x, noise_um=noise)
+    known = process_state_of(x)
     u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
     stands = d.diameter_um > 0
     grown = (d.diameter_um + known.bias_um(u, v) + noise)[stands]
@@ -92,12 +92,18 @@ def test_a_residual_phase_lies_on_the_lens_over_its_radius():
     """Modes that nothing mirrors: each pillar with and without them, by the basis at
     its own place.
     """
-    lens, x, modes = b.lens(), vector(b.VALUES), np.array([0.4, -0.3, 0.25, 0.5, -0.2])
+    lens, x, modes = (
+        b.lens(),
+        parameter_vector(b.VALUES),
+        np.array([0.4, -0.3, 0.25, 0.5, -0.2]),
+    )
     d = lens.diameters
     u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
-    plain, bent = (made.pillars(lens, b.RESPONSE, x, modes=m) for m in (None, modes))
+    plain, bent = (
+        made.as_built_transmission(lens, b.RESPONSE, x, modes=m) for m in (None, modes)
+    )
     stands = d.diameter_um > 0
-    want = np.tensordot(modes, thinplate.basis(u, v, 5), 1)[stands]
+    want = np.tensordot(modes, thinplate.thin_plate_basis(u, v, 5), 1)[stands]
     assert (
         np.abs(bent[stands] - plain[stands] * np.exp(1j * want)).max() < 1e-4
     )  # 1e-5 of some radians
@@ -109,7 +115,7 @@ def test_a_lens_as_built_has_its_diameters_wavelength_and_distance():
     lens = b.lens()
     d, x = (
         lens.diameters,
-        vector(
+        parameter_vector(
             {
                 "wavelength_nm": 1.7,
                 "distance_um": -3.1,
@@ -134,7 +140,7 @@ def test_a_lens_as_built_has_its_diameters_wavelength_and_distance():
     assert (want == 0.09).any()
     assert (want == 0.26).any()
     wide = made.built_lens(dataclasses.replace(lens, proxy=dataclasses.replace(b.proxy(), domain_um=(0.09, 0.5))),
-                           vector({"bias_nm": 200.0}))  # fmt: skip
+                           parameter_vector({"bias_nm": 200.0}))  # fmt: skip
     assert wide.diameters.diameter_um.max() == pytest.approx(
         0.999 * 0.4, rel=1e-6
     )  # what stands does not touch

@@ -13,17 +13,17 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import leastsquares, residual
-from characterize.inference.leastsquares import Data, Settings
+from characterize.inference.leastsquares import FitImages, SolverSettings
 from characterize.model import forward, moments
-from characterize.model.detector import Grid
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.parameters import PLACE, vector
-from characterize.model.window import turned
+from characterize.model.detector import DetectorGrid
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.parameters import PLACE, parameter_vector
+from characterize.model.window import derivative_operators
 from metalens import design, profiles
 from metalens.cell.record import Cell
 
 BAND = 1.7
-SECANT = Settings(secant=True)
+SECANT = SolverSettings(secant=True)
 VALUES = {
     "bias_nm": 4.0, "bias_x_nm": 2.0, "height_nm": -8.0, "wavelength_nm": 0.4, "distance_um": 3.0,
     "decentre_x_um": 0.8, "stage_zero_um": 9.0, "coma_x_rad": 0.2, "spherical_rad": 0.15, "log_gain": 9.0,
@@ -41,7 +41,7 @@ def test_powers_of_the_direction_are_derivatives_of_the_field():
     """
     step = math.pi / BAND / 1.3
     coarse, fine = (np.arange(44) - 21.5) * step, np.linspace(-9.3, 8.1, 37)
-    ways = turned(fine, coarse, BAND, 4)
+    ways = derivative_operators(fine, coarse, BAND, 4)
     for t in (-0.93, 0.21, 0.77):
         for a, way in enumerate(ways):
             found = 1j ** (a % 2) * (way @ np.exp(1j * BAND * t * coarse))
@@ -63,18 +63,18 @@ def test_derivatives_from_those_of_the_field_are_differences_of_images(monkeypat
     """
     monkeypatch.setattr(moments, "_COARSE_PIXEL", 0.02)
     angle = np.array([[0.0, 0.0], [0.0, 0.0], [0.02, -0.03]])
-    setting = Setting(
+    setting = FrameSetting(
         np.array([2500.0, 3000.0, 3700.0]), angle, np.ones(3), 1.0, 40, 36
     )
     model = ForwardModel(lens(), setting, b.RESPONSE)
-    x, names = vector(VALUES), list(STEPS)
-    made, rates = [], moments.rates
+    x, names = parameter_vector(VALUES), list(STEPS)
+    made, rates = [], moments.light_derivatives
 
     def counted(*given):
         made.append(rates(*given))
         return made[-1]
 
-    monkeypatch.setattr(moments, "rates", counted)
+    monkeypatch.setattr(moments, "light_derivatives", counted)
     found = model.images(x, names)[1]
     assert len(made) == 2  # one for each angle
     assert {
@@ -108,7 +108,10 @@ def test_pixels_are_small_while_coefficients_change_less_across_one_than_slopes_
         )
 
     pixels = np.linspace(0.5, 12.0, 400)
-    small = [moments.fine_enough(Grid(32, 32, pixel, 4, 4), radius) for pixel in pixels]
+    small = [
+        moments.fine_enough(DetectorGrid(32, 32, pixel, 4, 4), radius)
+        for pixel in pixels
+    ]
     most = max(changed(pixel) for pixel, one in zip(pixels, small, strict=True) if one)
     assert 0.7 * forward._SLOPE_TOLERANCE < most < forward._SLOPE_TOLERANCE
 
@@ -119,7 +122,7 @@ def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
     """
     model = ForwardModel(
         lens(),
-        Setting(
+        FrameSetting(
             np.array([2500.0, 3000.0, 3700.0]),
             np.zeros((3, 2)),
             np.ones(3),
@@ -133,12 +136,12 @@ def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
         "bias_nm", "bias_x_nm", "bias_r_nm", "distance_um", "decentre_x_um", "stage_zero_um", "astigmatism_rad",
         "coma_x_rad", "spherical_rad", "log_gain", "background_e",
     )  # fmt: skip
-    truth = vector(VALUES)
+    truth = parameter_vector(VALUES)
     truth[PLACE["log_gain"]] += math.log(6000 / model.images(truth)[0].max())
     seen = model.images(truth)[0]
     seen = seen + np.random.default_rng(3).normal(0, np.sqrt(seen + 9))
     everywhere = np.ones(seen.shape, bool)
-    data = Data(
+    data = FitImages(
         seen, everywhere, ~everywhere, np.full(seen.shape, 9.0), np.ones(seen.shape)
     )
     begin = truth[[PLACE[name] for name in names]] * np.where(
@@ -148,8 +151,11 @@ def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
     for pixel in (0.02, 0.0):
         monkeypatch.setattr(moments, "_COARSE_PIXEL", pixel)
         found.append(
-            leastsquares.fit(
-                residual.problem(model, names, truth), data, begin, settings=SECANT
+            leastsquares.fit_levenberg_marquardt(
+                residual.residual_phase_problem(model, names, truth),
+                data,
+                begin,
+                settings=SECANT,
             )
         )
     quick, alone = found
@@ -162,7 +168,7 @@ def test_a_fit_ends_where_one_with_slopes_of_their_own_does(monkeypatch):
 def test_a_factor_that_is_no_polynomial_is_left_to_itself():
     t, s = np.random.default_rng(2).uniform(-1, 1, (2, 90))
     shapes = np.linalg.qr(
-        np.stack([t**a * s**b for a, b in moments.powers(5)], -1)[None]
+        np.stack([t**a * s**b for a, b in moments.monomial_powers(5)], -1)[None]
     )
     sharp, smooth = (t > 0.13).astype(complex)[None], (0.3 + 0.7j * s)[None]
     amounts = moments._amounts(shapes[0], [sharp, smooth])

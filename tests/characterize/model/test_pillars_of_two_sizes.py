@@ -11,10 +11,17 @@ import pytest
 from scipy import special
 
 from characterize.inference import asbuilt, prepare
-from characterize.model import ForwardModel, Setting, made, pillar_slopes, vector
-from characterize.model.pillars import Change, change, of_lens
+from characterize.model import (
+    ForwardModel,
+    FrameSetting,
+    made,
+    parameter_vector,
+    pillar_slopes,
+)
+from characterize.model.pillars import PillarChange, of_lens, pillar_change_of
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
+from metalens.core.errors import LensError
 from metalens.fabrication import (
     Kinds,
     PairSensitivities,
@@ -22,8 +29,7 @@ from metalens.fabrication import (
     Sensitivity,
     named,
 )
-from metalens.ground.errors import LensError
-from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
 
 X_UM, Y_UM = (
     np.linspace(0.06, 0.34, 71),
@@ -86,7 +92,7 @@ def two_sizes(n=46):
     table = np.stack(
         [formula(*np.meshgrid(X_UM, Y_UM, indexing="ij"), light) for light in "xy"], -1
     )[None]
-    pairs = Pairs(np.array([WAVE_UM]), X_UM, Y_UM, table, (75.0, 260.0))
+    pairs = TwoSizeTable(np.array([WAVE_UM]), X_UM, Y_UM, table, (75.0, 260.0))
     diameters = DiameterMap(width, 0.4, length_um=length)
     cell = Cell(0.4, 0.6, Index(2.7), shape=Rectangle())
     return Lens(
@@ -137,7 +143,7 @@ def test_a_bias_moves_both_sizes_of_every_pillar(light):
     1e-3 of a radian.
     """
     lens = two_sizes().seen(light)
-    found = made.pillars(lens, response(lens), vector(MADE))
+    found = made.as_built_transmission(lens, response(lens), parameter_vector(MADE))
     assert np.abs(found - truth(lens, light)).max() < 2e-3
     assert np.abs(found - truth(lens, "yx"["xy".index(light)])).max() > 0.5
 
@@ -163,12 +169,14 @@ def test_the_basis_holds_every_kind_of_pillar_under_change():
     lens = two_sizes()
     pillars, kinds = of_lens(lens, response(lens)), Kinds.of(lens.diameters)
     assert pillars.error < 1e-3
-    x = vector({"height_nm": 9.0})
+    x = parameter_vector({"height_nm": 9.0})
     for bias_um in (-0.017, 0.0, 0.0123):
         want = formula(kinds.width_um + bias_um, kinds.length_um + bias_um, "x")
         want = want * np.exp(by_height(kinds.width_um, kinds.length_um) * 9e-3)
-        assert np.abs(pillars.exact(bias_um, change(x)) - want).max() < 1e-4
-        series = pillars.weights(np.array(bias_um)) @ pillars.coefficients(change(x))
+        assert np.abs(pillars.exact(bias_um, pillar_change_of(x)) - want).max() < 1e-4
+        series = pillars.weights(np.array(bias_um)) @ pillars.coefficients(
+            pillar_change_of(x)
+        )
         entries = pillars.entries(lens.diameters, slice(3, 20), slice(5, 9))
         found, place = series @ pillars.table()[:, entries.ravel()], entries.ravel()
         assert np.abs(found - np.append(want, 0)[place]).max() < 1e-3
@@ -210,9 +218,9 @@ def test_frames_are_those_of_the_sum_over_every_pillar():
     compared up to its strength.
     """
     lens = two_sizes()
-    setting = Setting(DEPTH_UM, np.zeros((2, 2)), np.ones(2), 1.0, 8, 8)
+    setting = FrameSetting(DEPTH_UM, np.zeros((2, 2)), np.ones(2), 1.0, 8, 8)
     found = ForwardModel(lens, setting, response(lens)).images(
-        vector(MADE | BENCH | {"background_e": 0.0})
+        parameter_vector(MADE | BENCH | {"background_e": 0.0})
     )[0]
     want = summed(lens, setting)
     found *= (found * want).sum() / (found**2).sum()
@@ -232,7 +240,7 @@ def test_answers_of_both_sizes_are_kept_as_they_are_and_refused_over_one():
 
 def test_the_made_map_has_both_sizes_moved():
     lens = two_sizes()
-    found = made.built_lens(lens, vector({"bias_nm": 4.0})).diameters
+    found = made.built_lens(lens, parameter_vector({"bias_nm": 4.0})).diameters
     there = lens.diameters.diameter_um > 0
     assert found.diameter_um[there] == pytest.approx(
         lens.diameters.diameter_um[there] + 4e-3
@@ -247,20 +255,25 @@ def test_changes_of_the_wavelength_leave_t_as_the_table_has_it():
     lens = two_sizes()
     pillars = of_lens(lens, response(lens))
     for off in (0.0, 2e-3):
-        found = pillars._at_nodes(Change(wavelength_um=off))
-        assert np.array_equal(found, pillars._at_nodes(Change()))
+        found = pillars._at_nodes(PillarChange(wavelength_um=off))
+        assert np.array_equal(found, pillars._at_nodes(PillarChange()))
 
 
 def test_slopes_of_the_frames_are_their_differences():
     """Slopes are formed to 8e-3; steps of 0.1 nm leave 1e-4 of the second order."""
     lens = two_sizes(30)
-    setting = Setting(DEPTH_UM, np.zeros((2, 2)), np.ones(2), 1.0, 8, 8, tolerance=1e-7)
-    model, x = ForwardModel(lens, setting, response(lens)), vector(MADE | BENCH)
+    setting = FrameSetting(
+        DEPTH_UM, np.zeros((2, 2)), np.ones(2), 1.0, 8, 8, tolerance=1e-7
+    )
+    model, x = (
+        ForwardModel(lens, setting, response(lens)),
+        parameter_vector(MADE | BENCH),
+    )
     names = ("bias_nm", "bias_x_nm", "height_nm")
     slopes = model.images(x, names)[1]
     for name, slope in zip(names, slopes, strict=True):
         ends = [
-            model.images(vector(MADE | BENCH | {name: MADE[name] + step}))[0]
+            model.images(parameter_vector(MADE | BENCH | {name: MADE[name] + step}))[0]
             for step in (0.1, -0.1)
         ]
         want = (ends[0] - ends[1]) / 0.2
@@ -280,7 +293,11 @@ def test_a_fit_is_kept_with_the_answers_of_both_sizes(tmp_path):
     again = asbuilt.load(tmp_path / "asbuilt.h5")
     assert np.array_equal(again.pillars(), fit.pillars())
     assert (
-        np.abs(again.pillars() - made.pillars(lens, fit.response, vector())).max() > 0.1
+        np.abs(
+            again.pillars()
+            - made.as_built_transmission(lens, fit.response, parameter_vector())
+        ).max()
+        > 0.1
     )
 
 

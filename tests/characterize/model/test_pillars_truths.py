@@ -19,15 +19,15 @@ import hidden_lens
 
 from characterize.model import parameters, window
 from characterize.model import pillars as model
-from characterize.model.pillars import Change, Pillars
-from characterize.model.window import Operators, Terms, Ways
+from characterize.model.pillars import PillarChange, PillarResponse
+from characterize.model.window import AxisOperators, CouplingTerms, WindowOperators
 
 RNG = np.random.default_rng(61)
 
 
 @pytest.fixture(scope="module")
 def pillars():
-    return Pillars(b.lens(), b.RESPONSE)
+    return PillarResponse(b.lens(), b.RESPONSE)
 
 
 def test_weights_are_chebyshev_polynomials_of_the_bias_and_their_slopes_per_micrometre(
@@ -47,8 +47,8 @@ def test_weights_are_chebyshev_polynomials_of_the_bias_and_their_slopes_per_micr
 
 
 def some_change(share=0.6):
-    span = model.Range()
-    return Change(
+    span = model.ChangeRange()
+    return PillarChange(
         tuple(share * RNG.uniform(-1, 1, len(span.answers)) * span.answers), 0.0
     )
 
@@ -81,14 +81,14 @@ def test_nodes_are_laid_twice_and_thrice_as_densely_where_two_thousandths_of_t_a
 ):
     """The last is told in any case."""
     left, counts = list(missed), []
-    lay = Pillars._lay
+    lay = PillarResponse._lay
     monkeypatch.setattr(
-        Pillars,
+        PillarResponse,
         "_lay",
         lambda self, count, tolerance: counts.append(count) or lay(self, 7, 1e-2),
     )
-    monkeypatch.setattr(Pillars, "_measure", lambda self: left.pop(0))
-    found = Pillars(b.lens(), b.RESPONSE)
+    monkeypatch.setattr(PillarResponse, "_measure", lambda self: left.pop(0))
+    found = PillarResponse(b.lens(), b.RESPONSE)
     assert counts == [counts[0] * times - (times - 1) for times in range(1, laid + 1)]
     assert found.error == missed[-1]
 
@@ -97,12 +97,12 @@ def test_slopes_by_the_answering_causes_are_differences_of_the_coefficients(pill
     change = some_change()
     slopes = pillars.slopes(change)
     for i in range(len(slopes)):
-        h = 1e-4 * model.Range().answers[i]
+        h = 1e-4 * model.ChangeRange().answers[i]
         ends = []
         for sign in (1, -1):
             moved = list(change.answers)
             moved[i] += sign * h
-            ends.append(pillars.coefficients(Change(tuple(moved), 0.0)))
+            ends.append(pillars.coefficients(PillarChange(tuple(moved), 0.0)))
         want = (ends[0] - ends[1]) / (2 * h)
         assert slopes[i] == pytest.approx(want, abs=1e-5 * np.abs(want).max())
 
@@ -147,8 +147,8 @@ def test_light_meets_pillars_at_the_angle_of_its_slopes_where_the_proxy_knows_an
 
 
 def test_changes_are_in_micrometres_and_in_base_units():
-    x = parameters.vector({"wavelength_nm": 1.7, "height_nm": 12.0})
-    change = model.change(x)
+    x = parameters.parameter_vector({"wavelength_nm": 1.7, "height_nm": 12.0})
+    change = model.pillar_change_of(x)
     assert change.wavelength_um == pytest.approx(1.7e-3)
     assert sum(abs(a) > 0 for a in change.answers) == 1
     assert max(change.answers) == pytest.approx(12e-3)
@@ -176,7 +176,7 @@ def terms(size=1.0):
     across, amounts = RNG.normal(size=(3, 6)), RNG.normal(size=(5, 4, 3))
     inside = RNG.normal(size=(7, 4, 8))
     remainder, mixed = np.array([1.0, 0.3, 0.04, 0.006]), np.array([1.0, 0.009, 0.0007])
-    return Terms(across, amounts, inside, remainder, mixed, size)
+    return CouplingTerms(across, amounts, inside, remainder, mixed, size)
 
 
 def way(fine, coarse, nodes):
@@ -184,7 +184,7 @@ def way(fine, coarse, nodes):
         RNG.normal(size=shape)
         for shape in ((coarse, nodes), (fine, coarse), (coarse, nodes), (coarse, nodes))
     ]
-    return Ways(
+    return AxisOperators(
         parts[0] + 0j,
         parts[1],
         np.exp(1j * RNG.normal(size=fine)),
@@ -221,7 +221,7 @@ def test_fields_and_their_rates_are_sums_over_both_axes_and_the_terms():
     left out by its share of the
     tolerance: of the hypotenuse of all sizes over √3, over its own, at most a fifth."""
     y, x, rest, moved = way(9, 7, 5), way(11, 8, 6), terms(), terms(2.6)
-    made = Operators(y, x, rest, lambda name: moved)
+    made = WindowOperators(y, x, rest, lambda name: moved)
     light = RNG.normal(size=(2, 5, 6))
     got = made.field(light, 0.03)
     for i in (0, 1):
@@ -246,14 +246,14 @@ def test_between_wavelengths_pillars_are_those_of_the_proxy():
     where |t| is held at 1: a kink of
     1e-3 in a hundredth of all pillars. Beyond the span the proxy is asked itself."""
     lens = hidden_lens.lens()
-    found = Pillars(lens, b.RESPONSE)
+    found = PillarResponse(lens, b.RESPONSE)
     for off, close in ((-0.0041, 1e-8), (0.00587, 1e-8), (0.0073, 1e-15)):
         want = model.designed(
             lens.proxy,
             found.diameter_um + found.nodes_um[:, None],
             lens.wavelength_um + off,
         )
-        error = np.abs(found._at_nodes(Change(wavelength_um=off)) - want)
+        error = np.abs(found._at_nodes(PillarChange(wavelength_um=off)) - want)
         assert (error > close).mean() < 0.02
         assert error.max() < 1e-3
 

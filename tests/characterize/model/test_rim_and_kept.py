@@ -14,13 +14,13 @@ import bench_lens as b
 
 from characterize.inference import explore
 from characterize.model import gather
-from characterize.model.glass import Bench
-from characterize.model.kernel import digits
-from characterize.model.pillars import Change, Pillars
-from characterize.model.reduced import Reduced
+from characterize.model.glass import BenchGeometry
+from characterize.model.kernel import extra_digits
+from characterize.model.pillars import PillarChange, PillarResponse
+from characterize.model.reduced import CompressedLens
 from metalens import design, profiles
 from metalens.cell.record import Cell
-from metalens.ground import legendre
+from metalens.core import legendre
 
 AXIS = np.linspace(-12, 12, 49)
 INSIDE = np.ix_(np.abs(AXIS) <= 7, np.abs(AXIS) <= 7)
@@ -41,14 +41,14 @@ def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_
     """Root mean squares over the field's, against a field of 1e-5; the rest of the
     window keeps to the tolerance.
     """
-    pillars, tolerance, made = Pillars(lens, b.RESPONSE), 1e-3, {}
+    pillars, tolerance, made = PillarResponse(lens, b.RESPONSE), 1e-3, {}
     for name, (edge, asked) in {
         "best": (0.0, 1e-5),
         "plain": (0.0, tolerance),
         "rim": (5.0, tolerance),
     }.items():
-        bench = Bench(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
-        reduced = Reduced(
+        bench = BenchGeometry(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
+        reduced = CompressedLens(
             lens,
             pillars,
             bench,
@@ -62,7 +62,9 @@ def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_
             axes_um=(AXIS, AXIS),
             edge_um=edge,
         )
-        light = np.tensordot(pillars.coefficients(Change())[0], reduced.gathered, 1)
+        light = np.tensordot(
+            pillars.coefficients(PillarChange())[0], reduced.gathered, 1
+        )
         made[name] = found.field(light), found.rest.window.shape[1]
     best, whole = made["best"][0], np.sqrt((np.abs(made["best"][0]) ** 2).mean())
     rim = np.ones(best.shape, bool)
@@ -79,12 +81,12 @@ def test_a_rim_seen_by_its_blur_errs_by_twice_the_tolerance_at_most_and_saves_a_
 
 
 def reduced_of(lens, tolerance):
-    bench = Bench(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
-    pillars, depths = Pillars(lens, b.RESPONSE), np.array([100.0, 170.0])
-    made = Reduced(
+    bench = BenchGeometry(lens.sensor_distance_um, 0.85, 138.0, (0.21, -0.1))
+    pillars, depths = PillarResponse(lens, b.RESPONSE), np.array([100.0, 170.0])
+    made = CompressedLens(
         lens, pillars, bench, window_um=24.0, depths_um=depths, tolerance=tolerance
     )
-    return made, np.tensordot(pillars.coefficients(Change())[0], made.gathered, 1)
+    return made, np.tensordot(pillars.coefficients(PillarChange())[0], made.gathered, 1)
 
 
 def test_a_window_off_the_chief_ray_sees_the_same_field_where_it_is(lens):
@@ -131,19 +133,25 @@ def test_nodes_that_are_nearly_even_hold_steeper_waves_than_gauss_legendre_nodes
     """exp(i slope t) of the slope that they are made for: to the tolerance where
     Gauss-Legendre nodes fail.
     """
-    held = count * gather.density(count, tolerance) - 8 - 1.5 * digits(tolerance)
+    held = (
+        count * gather.node_density(count, tolerance)
+        - 8
+        - 1.5 * extra_digits(tolerance)
+    )
     slope = next(
         s for s in np.arange(held, 0, -0.1) if s + 2 * (s + 1) ** (1 / 3) <= held
     )
     t, pull, wave = (
         np.linspace(-1, 1, 1901),
-        gather.pull(count, tolerance),
+        gather.node_stretch(count, tolerance),
         lambda t: np.exp(1j * slope * t),
     )
-    even = gather.at(count, pull, (-1.0, 1.0), t) @ wave(
-        gather.even(count, pull, -1.0, 1.0)
+    even = gather.even_interpolation(count, pull, (-1.0, 1.0), t) @ wave(
+        gather.even_nodes(count, pull, -1.0, 1.0)
     ) - wave(t)
-    plain = legendre.interpolation(count, t) @ wave(legendre.nodes(count)[0]) - wave(t)
+    plain = legendre.interpolation_matrix(count, t) @ wave(
+        legendre.gauss_legendre_nodes(count)[0]
+    ) - wave(t)
     assert np.sqrt((np.abs(even) ** 2).mean()) < tolerance
     assert np.sqrt((np.abs(plain) ** 2).mean()) > 10 * np.sqrt(
         (np.abs(even) ** 2).mean()
@@ -154,7 +162,7 @@ def test_profiles_side_by_side_find_their_operators_again_and_older_places_let_g
     """An image and then its derivatives at each place: made once; of a few megabytes
     each at most sixteen are held.
     """
-    reduced, made = object.__new__(Reduced), []
+    reduced, made = object.__new__(CompressedLens), []
     reduced._operators, reduced._changing = {}, threading.Lock()
     reduced._operators_of = lambda _wave, distance_um, *_: (
         made.append(distance_um) or distance_um

@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.model import pillar_slopes
-from characterize.model.pillar_slopes import slopes
+from characterize.model.pillar_slopes import log_response_slopes
 from metalens import rcwa
 from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import sensitivity
@@ -45,7 +45,7 @@ def slope_by(changed, diameter_um, step=1e-3):
 
 
 def test_slopes_are_those_of_an_independent_solver():
-    found = slopes(thin_lens(CELL))
+    found = log_response_slopes(thin_lens(CELL))
     assert found.error < 0.1
     for d in (0.07, 0.15):
         height, index, wall = found.at(np.array(d))[:3]
@@ -58,7 +58,7 @@ def test_slopes_are_those_of_an_independent_solver():
 
 def test_a_film_on_the_pillars_is_part_of_their_slopes():
     film = dataclasses.replace(CELL, over=(Film(Index(1.5), 0.05),))
-    found = slopes(thin_lens(film))
+    found = log_response_slopes(thin_lens(film))
     want = slope_by(lambda x: dataclasses.replace(film, height_um=0.7 + x), 0.13)
     assert abs(found.at(np.array(0.13))[0] - want) < (0.05 + found.error) * abs(want)
 
@@ -66,7 +66,7 @@ def test_a_film_on_the_pillars_is_part_of_their_slopes():
 def test_cells_that_no_solver_takes_fall_back_to_the_effective_index():
     absorbing = dataclasses.replace(CELL, substrate=Index(1.5, 0.1))
     assert np.array_equal(
-        slopes(lens_of(absorbing)).coefficients,
+        log_response_slopes(lens_of(absorbing)).coefficients,
         sensitivity(lens_of(absorbing)).coefficients,
     )
 

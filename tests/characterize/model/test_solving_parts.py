@@ -92,7 +92,7 @@ def test_modes_leave_out_what_parameters_already_do():
     t = np.linspace(-1, 1, thinplate._GRID)
     u, v = np.meshgrid(t, t)
     inside = np.hypot(u, v) <= 1
-    modes = thinplate.basis(u, v)[:, inside]
+    modes = thinplate.thin_plate_basis(u, v)[:, inside]
     u, v = u[inside], v[inside]
     for shape in (np.ones_like(u), u, v, u**2 + v**2, *maps(WavefrontError, u, v)):
         assert np.abs(modes @ shape).max() < 1e-6 * len(u)

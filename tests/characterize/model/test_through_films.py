@@ -17,11 +17,11 @@ import bench_lens as b
 import films as referee
 
 from characterize.bench import bench
-from characterize.bench.bench import Camera, Truth
+from characterize.bench.bench import BenchCamera, HiddenLens
 from characterize.model import forward, made
-from characterize.model.forward import ForwardModel, Setting
-from characterize.model.glass import AIR, Films
-from characterize.model.parameters import NAMES, Known, vector
+from characterize.model.forward import ForwardModel, FrameSetting
+from characterize.model.glass import AIR, FilmStack
+from characterize.model.parameters import NAMES, KnownValue, parameter_vector
 from metalens import design, profiles
 from metalens.cell import Cell, Film, Index
 from metalens.lens import Layers
@@ -60,7 +60,7 @@ def ray(reach, media):
 
 
 def test_paths_are_those_of_snell_s_rays():
-    films, media = Films(FRONT, BEHIND, 1.31), ((1.31, DISTANCE - 49.0), *BEHIND)
+    films, media = FilmStack(FRONT, BEHIND, 1.31), ((1.31, DISTANCE - 49.0), *BEHIND)
     x, y, centre = np.array([11.0, -17.0]), np.array([3.0, 8.5]), (9.0, -4.0)
     want = [
         ray(math.hypot(centre[0] - u, centre[1] - v), media)[1]
@@ -92,10 +92,10 @@ def test_paths_are_those_of_snell_s_rays():
 
 
 def test_a_lens_in_air_has_none():
-    assert Films.of(Layers(), WAVELENGTH) is AIR
-    found = Films.of(lens(1.31).layers, WAVELENGTH)
+    assert FilmStack.of(Layers(), WAVELENGTH) is AIR
+    found = FilmStack.of(lens(1.31).layers, WAVELENGTH)
     assert (found.front, found.behind, found.filling) == (FRONT, BEHIND, 1.31)
-    assert not Films.of(
+    assert not FilmStack.of(
         Layers(cover=Index(1.31)), WAVELENGTH
     ).none_behind  # what fills the gap bends light too
 
@@ -133,7 +133,7 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
     it.
     """
     made_of, tangents = lens(filling), tuple(math.tan(a) for a in angle_rad)
-    setting = Setting(
+    setting = FrameSetting(
         DEPTHS,
         np.array([angle_rad] * 2),
         np.ones(2),
@@ -143,7 +143,7 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
         tolerance=2e-5,
         fill=0.01,
     )
-    x = vector(
+    x = parameter_vector(
         {
             "log_gain": 0.0,
             "background_e": 0.0,
@@ -158,7 +158,7 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
     far = snell(steep / math.sqrt(1 + steep**2), media)[0] / steep if steep else 0.0
     stack = referee.Stack(list(media), wavelength=WAVELENGTH, step=0.4, count=701)
     places = np.meshgrid(made_of.diameters.x_um, made_of.diameters.y_um)
-    pillars, want = made.pillars(made_of, b.RESPONSE, x), []
+    pillars, want = made.as_built_transmission(made_of, b.RESPONSE, x), []
     for depth in DEPTHS.tolist():
         waves = stack.fields(
             pillars * incident(places, tangents, depth),
@@ -176,7 +176,7 @@ def test_derivatives_are_differences_of_images(monkeypatch):
     pillars change with it, 1e-3.
     """
     monkeypatch.setattr(forward, "_SLOPE_TOLERANCE", 1e-4)
-    setting = Setting(
+    setting = FrameSetting(
         DEPTHS,
         np.array([[0.09, -0.05], [0.0, 0.0]]),
         np.ones(2),
@@ -186,7 +186,7 @@ def test_derivatives_are_differences_of_images(monkeypatch):
         tolerance=1e-7,
     )
     model = ForwardModel(lens(1.31), setting, b.RESPONSE)
-    base = vector(
+    base = parameter_vector(
         b.VALUES
         | {"pinhole_um": 4.0, "glass_um": 20.0, "distance_um": 3.0, "log_gain": 5.0}
     )
@@ -215,15 +215,18 @@ def test_the_bench_shows_what_the_model_expects_through_films(source_um, within)
         "crosstalk_px": 0.25,
     }
     known = tuple(
-        Known(name, value)
+        KnownValue(name, value)
         for name, value in (values | {"pinhole_um": source_um}).items()
     )
-    hidden = Truth(
-        (470.0, 640.0), (5.0,), parameter=known, camera=Camera(pixel_um=1.5, pixels=12)
+    hidden = HiddenLens(
+        (470.0, 640.0),
+        (5.0,),
+        parameter=known,
+        camera=BenchCamera(pixel_um=1.5, pixels=12),
     )
-    seen = bench.irradiance(lens(1.31), hidden, b.RESPONSE)
-    setting = Setting(*hidden.stated, np.ones(2), 1.5, 12, 12, tolerance=2e-5)
-    x = vector(values | {"pinhole_um": source_um, "background_e": 0.0})
+    seen = bench.bench_irradiance(lens(1.31), hidden, b.RESPONSE)
+    setting = FrameSetting(*hidden.stated, np.ones(2), 1.5, 12, 12, tolerance=2e-5)
+    x = parameter_vector(values | {"pinhole_um": source_um, "background_e": 0.0})
     want = ForwardModel(lens(1.31), setting, b.RESPONSE).images(x)[0]
     seen = seen * (np.vdot(seen, want) / np.vdot(seen, seen))
     assert np.linalg.norm(seen - want) < within * np.linalg.norm(want)

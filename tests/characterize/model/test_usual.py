@@ -13,8 +13,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference.search import prior_of
-from characterize.model import NAMES, PARAMETERS, Known, solving, unstated, usual
-from characterize.model.pillars import Change, Pillars, Range
+from characterize.model import (
+    NAMES,
+    PARAMETERS,
+    KnownValue,
+    solving,
+    type_b_sigma,
+    usual_parameters,
+)
+from characterize.model.pillars import ChangeRange, PillarChange, PillarResponse
 from metalens.fabrication import Sensitivity, coarser
 from metalens.lens import DiameterMap
 
@@ -61,7 +68,10 @@ def test_what_is_in_nm_and_decentre_grow_with_long_waves_and_nothing_else_does()
         coarser(short.wavelength_um) == 1.0
     )  # 532 nm: from the same writer, with its nanometres
     for row, much, same in zip(
-        PARAMETERS, usual(NAMES, long), usual(NAMES, short), strict=True
+        PARAMETERS,
+        usual_parameters(NAMES, long),
+        usual_parameters(NAMES, short),
+        strict=True,
     ):
         factor = (
             LARGER
@@ -81,15 +91,15 @@ def test_what_is_in_nm_and_decentre_grow_with_long_waves_and_nothing_else_does()
                 (factor * row.low, factor * row.high)
             )
             assert (same.low, same.high) == (row.low, row.high)
-    assert unstated("stitching_nm", long) == pytest.approx(60.0 * LARGER)
-    assert [unstated(name, long) for name in ("glass_um", "pixel_percent")] == [
+    assert type_b_sigma("stitching_nm", long) == pytest.approx(60.0 * LARGER)
+    assert [type_b_sigma(name, long) for name in ("glass_um", "pixel_percent")] == [
         100.0,
         1.0,
     ]
 
 
 def test_metrology_stays_as_it_is_stated():
-    known = {"bias_nm": Known("bias_nm", -41.0, 3.0)}
+    known = {"bias_nm": KnownValue("bias_nm", -41.0, 3.0)}
     prior = prior_of(("bias_nm", "height_nm"), known, larger(b.lens(), LARGER))
     assert (prior.mean[0], prior.sigma.tolist()) == (
         -41.0,
@@ -102,14 +112,16 @@ def test_a_larger_lens_has_the_same_pillars_at_larger_errors():
     """Two rooms of t, each over its own bounds: equal at errors as much larger, up to
     what either leaves out.
     """
-    small, long = (Pillars(lens, response) for lens, response in _pair())
+    small, long = (PillarResponse(lens, response) for lens, response in _pair())
     assert long.nodes_um == pytest.approx(LARGER * small.nodes_um)
     for bias, tall, dense, wave in (
         (0.024, -0.02, 0.03, 2e-3),
         (-0.017, 0.026, -0.04, -3e-3),
     ):
-        plain = Change((tall, dense, *[0.0] * (len(small.span.answers) - 2)), wave)
-        grown = Change((LARGER * tall, *plain.answers[1:]), LARGER * wave)
+        plain = PillarChange(
+            (tall, dense, *[0.0] * (len(small.span.answers) - 2)), wave
+        )
+        grown = PillarChange((LARGER * tall, *plain.answers[1:]), LARGER * wave)
         want = small.exact(bias, plain)
         assert long.exact(LARGER * bias, grown) == pytest.approx(
             want, abs=1e-6
@@ -133,4 +145,6 @@ def test_solved_heights_span_the_bounds_of_the_lens():
     assert dense == pytest.approx(
         np.array([-1, -0.67, -0.33, 0, 0.33, 0.67, 1]) * 0.08025
     )
-    assert Range.of(LARGER * 0.85).answers[:2] == pytest.approx((tall[-1], dense[-1]))
+    assert ChangeRange.of(LARGER * 0.85).answers[:2] == pytest.approx(
+        (tall[-1], dense[-1])
+    )

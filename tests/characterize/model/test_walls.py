@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.model.pillars import Change, Pillars
+from characterize.model.pillars import PillarChange, PillarResponse
 
 LEAN_UM = 0.019
 
@@ -21,15 +21,18 @@ def test_two_heights_stand_for_the_whole_wall(bias_um):
     """41 slices of ln t: the effect is 0.013 of t; a tenth of it is the basis, which
     was not made for walls.
     """
-    pillars = Pillars(b.lens(), b.RESPONSE)
+    pillars = PillarResponse(b.lens(), b.RESPONSE)
     upright, leaning = (
         pillars.basis.conj().T
-        @ (pillars.weights(np.array(bias_um)) @ pillars.coefficients(Change(), lean))
+        @ (
+            pillars.weights(np.array(bias_um))
+            @ pillars.coefficients(PillarChange(), lean)
+        )
         for lean in (0.0, LEAN_UM)
     )
     heights = (np.arange(41) + 0.5) / 41 - 0.5
     slices = np.array(
-        [pillars.exact(bias_um + 2 * LEAN_UM * h, Change()) for h in heights]
+        [pillars.exact(bias_um + 2 * LEAN_UM * h, PillarChange()) for h in heights]
     )
     turned = np.unwrap(np.angle(slices), axis=0).mean(0)
     want = np.exp(np.log(np.abs(slices)).mean(0) + 1j * turned)

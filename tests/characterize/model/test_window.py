@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from characterize.model import window
-from characterize.model.kernel import Kernel
-from characterize.model.window import Operators, Terms, ways
+from characterize.model.kernel import CompressedKernel
+from characterize.model.window import CouplingTerms, WindowOperators, axis_operators
 
 K = 2 * math.pi / 0.85
-KERNEL = Kernel(K, (-0.21, 0.27), (-0.17, 0.23), 1900.0, 1911.0, (0.03, -0.02))
+KERNEL = CompressedKernel(
+    K, (-0.21, 0.27), (-0.17, 0.23), 1900.0, 1911.0, (0.03, -0.02)
+)
 AT = (
     np.arange(90) - 41.5
 ) * 0.75  # not symmetric, as the samples of a window with an even number of pixels
@@ -22,7 +24,7 @@ AT = (
 def along(kernel, tolerance=1e-3, at=AT):
     """Coarse samples and ways along x."""
     nodes = np.linspace(*kernel.p, 23)
-    return nodes, ways(
+    return nodes, axis_operators(
         kernel.by_x,
         nodes,
         at,
@@ -41,7 +43,7 @@ def test_light_times_powers_of_its_direction_is_that_of_a_plane_wave(direction):
     band = 0.9
     coarse = (np.arange(60) - 27.0) * math.pi / band / window.ROOM
     wave, want = (np.exp(1j * band * direction * place) for place in (coarse, AT))
-    for power, weights in enumerate(window.turned(AT, coarse, band, 2)):
+    for power, weights in enumerate(window.derivative_operators(AT, coarse, band, 2)):
         found = weights @ wave * (1j if power % 2 else 1)
         assert found == pytest.approx(
             direction**power * want, abs=2e-3
@@ -97,15 +99,15 @@ def test_rates_are_the_differences_of_both_factors():
     light = rng.standard_normal((1, 19, 23)) + 1j * rng.standard_normal((1, 19, 23))
     bands = KERNEL.bands(40.0, 40.0)
     y, x = (
-        ways(by, nodes, AT, band, k=K, tolerance=1e-6, step_um=1.0)
+        axis_operators(by, nodes, AT, band, k=K, tolerance=1e-6, step_um=1.0)
         for by, nodes, band in ((KERNEL.by_y, q, bands[0]), (KERNEL.by_x, p, bands[1]))
     )
     one = np.ones((len(y[0]), 1, len(x[0])), complex)
-    rest = Terms(
+    rest = CouplingTerms(
         np.ones((1, 23)), np.ones((19, 1, 1)), one, np.ones(1), np.ones(1), 1.0
     )
     still = dataclasses.replace(rest, window=0 * one)
-    operators = Operators(y[1], x[1], rest, lambda name: still)
+    operators = WindowOperators(y[1], x[1], rest, lambda name: still)
 
     def field(k, off_um):
         down, across = (
@@ -131,7 +133,7 @@ def test_real_weights_of_complex_values_are_their_product(kind, of):
     weights = rng.normal(size=(5, 7)).astype(kind)
     values = (rng.normal(size=(7, 8)) + 1j * rng.normal(size=(7, 8))).astype(of)
     for some in (values, values[:, ::2]):  # also where they do not lie side by side
-        got = window.weighted(weights, some)
+        got = window.real_complex_product(weights, some)
         assert got.dtype == of
         assert got == pytest.approx(
             weights.astype(float) @ some, abs=1e-5 if kind is np.float32 else 1e-13

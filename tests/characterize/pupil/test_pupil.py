@@ -15,7 +15,7 @@ from scipy import special
 from characterize.captures import capture
 from characterize.pupil import fit as pupilfit
 from characterize.pupil.record import PupilModel, PupilSpec
-from metalens.ground.errors import CaptureError, FitError
+from metalens.core.errors import CaptureError, FitError
 
 SPEC = PupilSpec(
     0.3,
@@ -227,7 +227,7 @@ def test_real_beads_predict_the_planes_left_out():
 
 def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
     from metalens.cli import main
-    from metalens.ground import store
+    from metalens.core import store
 
     model = make()
     tifffile.imwrite(tmp_path / "stack.tif", noisy(model, truth(model)).frames)

@@ -7,16 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from characterize.inference.leastsquares import Data
+from characterize.inference.leastsquares import FitImages
 from characterize.pupil import check
-from characterize.pupil.judge import agree
+from characterize.pupil.judge import measure_agreement
 
 RNG = np.random.default_rng(9)
 
 
 def data(images, usable=None, saturated=None):
     everywhere = np.ones(images.shape, bool)
-    return Data(
+    return FitImages(
         images,
         everywhere if usable is None else usable,
         ~everywhere if saturated is None else saturated,
@@ -31,7 +31,7 @@ def test_agreement_counts_light_above_the_background_in_pixels_that_count():
         RNG.uniform(size=seen.shape) > 0.2,
         RNG.uniform(size=seen.shape) > 0.9,
     )
-    got = agree(told, data(seen, usable, saturated), 17.0)
+    got = measure_agreement(told, data(seen, usable, saturated), 17.0)
     keep = usable & ~saturated
     a, b = told[keep], seen[keep]
     centred = (
@@ -58,10 +58,10 @@ def test_what_noise_explains_is_not_missed():
     by_noise = 3.0 * math.sqrt(light.size) / length
     for beyond in (0.05, 0.2):
         nrmse = math.hypot(by_noise, beyond)
-        assert check.missed(nrmse, data(noisy), 11.0) == pytest.approx(
+        assert check.unexplained_share(nrmse, data(noisy), 11.0) == pytest.approx(
             beyond, rel=0.15
         )  # the noise to 1 %
-    assert check.missed(0.9 * by_noise, data(noisy), 11.0) == 0.0
+    assert check.unexplained_share(0.9 * by_noise, data(noisy), 11.0) == 0.0
 
 
 def waves(order):
@@ -108,7 +108,7 @@ def test_noise_is_the_robust_scatter_of_steps_about_their_median():
         * math.sqrt(planes.size)
         / math.sqrt(((planes - 30) ** 2).sum())
     )
-    assert check.missed(
+    assert check.unexplained_share(
         math.hypot(by_noise, 0.03), data(planes), 30.0
     ) == pytest.approx(0.03, rel=1e-9)
 
@@ -133,13 +133,13 @@ def test_a_spot_predicted_too_wide_is_doubted_from_a_quarter_on_and_refused_from
     planes = np.stack([spot(3.5)] * 5)  # too few for an order
     other = spot(3.5 * wider)
     told = np.stack([other * (other * spot(3.5)).sum() / (other**2).sum()] * 5)
-    score = agree(told, data(planes), 0.0)
-    share = check.missed(score.nrmse, data(planes), 0.0)
+    score = measure_agreement(told, data(planes), 0.0)
+    share = check.unexplained_share(score.nrmse, data(planes), 0.0)
     assert share == pytest.approx((wider**2 - 1) / (wider**2 + 1), rel=1e-3)
     assert any(
         "misses" in words
-        for words in check.problems(data(planes), score.ncc, share, "")
+        for words in check.pupil_problems(data(planes), score.ncc, share, "")
     ) == (said == "refused")
-    assert any("misses" in words for words in check.doubts(share, "")) == (
+    assert any("misses" in words for words in check.pupil_warnings(share, "")) == (
         said == "doubted"
     )

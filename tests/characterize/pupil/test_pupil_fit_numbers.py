@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.inference import Data
+from characterize.inference import FitImages
 from characterize.pupil import fit as pupilfit
-from characterize.pupil.judge import agree, spline
+from characterize.pupil.judge import measure_agreement, predict_by_splines
 from characterize.pupil.record import PupilModel, PupilSpec
 
 RNG = np.random.default_rng(8)
@@ -28,7 +28,7 @@ SPEC = PupilSpec(
 
 def data_of(light):
     everywhere = np.ones(light.shape, bool)
-    return Data(
+    return FitImages(
         light, everywhere, ~everywhere, np.full(light.shape, 4.0), np.ones(light.shape)
     )
 
@@ -212,7 +212,7 @@ def test_what_is_free_is_found_from_some_planes_where_there_are_twice_as_many(
         asked.update(part=part, planes=planes, step_um=step_um)
         return spec, np.array([1.5]), 1.25
 
-    monkeypatch.setattr(pupilfit, "freed", freed)
+    monkeypatch.setattr(pupilfit, "fit_free_settings", freed)
     light = RNG.uniform(5, 9, (count, 16, 16))
     made, scaled, optics = pupilfit._freed(SPEC, position, data_of(light), sparse)
     assert made is SPEC
@@ -263,8 +263,10 @@ def test_planes_left_out_are_told_with_gains_and_levels_between_their_neighbours
     assert asked[0][1] == pytest.approx(position[seen])
     assert np.array_equal(asked[0][2].electrons, seen_data.electrons[seen])
     assert (told.ncc, told.nrmse) == pytest.approx((1.0, 0.0), abs=1e-12)
-    smooth = spline(position, seen_data, np.array(seen), np.array(hidden))
-    assert between == agree(smooth, seen_data.planes(np.array(hidden)), 12.0)
+    smooth = predict_by_splines(position, seen_data, np.array(seen), np.array(hidden))
+    assert between == measure_agreement(
+        smooth, seen_data.planes(np.array(hidden)), 12.0
+    )
     large = PupilModel(spec, position, phase_order=4, amplitude_order=2).layout()
     assert large.size == len(start)
     phase, amplitude, dx, dy, dz, blur, gains, levels = large.split(start)

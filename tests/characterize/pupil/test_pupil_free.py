@@ -11,7 +11,7 @@ import pytest
 from characterize.captures import capture
 from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilModel, PupilSpec, phase_mask
-from metalens.ground.errors import CaptureError, FitError
+from metalens.core.errors import CaptureError, FitError
 
 SPEC = PupilSpec(
     0.32,

@@ -114,7 +114,9 @@ def test_what_is_freed_is_known_to_its_usual_error_and_its_bar_grows_with_a_misf
     monkeypatch.setattr(free.leastsquares, "fit", fit)
     size = free._Images(SPEC, Z).model.layout().size
     coarse = np.random.default_rng(1).normal(size=size)
-    made, optics, longer = free.freed(SPEC, Z, None, lambda model: coarse, step_um=2.6)
+    made, optics, longer = free.fit_free_settings(
+        SPEC, Z, None, lambda model: coarse, step_um=2.6
+    )
     (start, prior, settings), n = given[0], size + 3
     assert start == pytest.approx(np.concatenate([coarse, np.zeros(3)]))
     stage = slice(size - 13, size - 9)  # before blur, gains and backgrounds
@@ -142,13 +144,13 @@ def test_what_is_freed_is_known_to_its_usual_error_and_its_bar_grows_with_a_misf
     assert [bar for *_, bar in optics] == pytest.approx(
         np.array([0.336, 2.34, 0.408]) * spread
     )
-    assert free.freed(dataclasses.replace(SPEC, free=()), Z, None, None, step_um=1.0)[
-        1:
-    ] == ((), 1.0)
+    assert free.fit_free_settings(
+        dataclasses.replace(SPEC, free=()), Z, None, None, step_um=1.0
+    )[1:] == ((), 1.0)
 
 
 def test_what_was_freed_is_said_beside_what_was_stated():
-    told = free.told(
+    told = free.freed_text(
         SPEC, (("numerical_aperture", 0.336, 0.004), ("step_um", 2.34, 0.05))
     )
     assert told == [

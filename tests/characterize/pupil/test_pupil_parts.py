@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.inference.leastsquares import Data
+from characterize.inference.leastsquares import FitImages
 from characterize.pupil import fit as pupilfit
 from characterize.pupil.record import PupilModel, PupilSpec
 
@@ -71,7 +71,7 @@ def test_offset_of_the_bead_from_the_middle():
     for row, column, want in ((10 + 6, 12 - 4, (6, -4)), (10 + 1, 12 + 1, (0, 0))):
         light = 30 + 500 * np.exp(-((y - row) ** 2 + (x - column) ** 2) / 4.0)
         stack = np.tile(light, (3, 1, 1))
-        seen = Data(
+        seen = FitImages(
             stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack
         )
         assert tuple(pupilfit._offset(seen)) == want
@@ -122,7 +122,7 @@ def test_what_is_known_of_a_pupil_beforehand():
 def test_a_start_takes_light_and_level_from_the_frames():
     stack = np.full((4, 16, 16), 12.0)
     stack[:, 5:9, 6:11] += np.array([40.0, 90.0, 70.0, 30.0])[:, None, None]
-    seen = Data(
+    seen = FitImages(
         stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack
     )
     pupil = model()
@@ -146,7 +146,7 @@ def test_error_bars_grow_with_a_misfit_and_never_shrink(monkeypatch, chi2, widen
     mixed = RNG.normal(size=(n, n))
     covariance = mixed @ mixed.T
     stack = RNG.uniform(5, 9, (4, 16, 16))
-    seen = Data(
+    seen = FitImages(
         stack, np.ones(stack.shape, bool), np.zeros(stack.shape, bool), stack, stack
     )
     solution = SimpleNamespace(

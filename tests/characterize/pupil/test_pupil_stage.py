@@ -11,7 +11,7 @@ import pytest
 from characterize.captures import capture
 from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilModel, PupilSpec
-from metalens.ground.errors import FitError
+from metalens.core.errors import FitError
 
 SPEC = PupilSpec(
     0.9, 0.52, 0.13, window=34, phase_order=5, amplitude_order=2, drift_order=1

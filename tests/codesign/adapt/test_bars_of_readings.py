@@ -17,7 +17,7 @@ def test_the_interval_of_a_mean_is_its_95_percent():
     draws leave 2 % of it, skewness
     of Γ(2.3), 1.32, moves both ends by 1.32 / (6 √700) (1.96² - 1) = 2.4 % of one."""
     values = np.random.default_rng(3).gamma(2.3, 0.41, 700)
-    low, high = reading.bootstrap(values, draws=4000, seed=8)
+    low, high = reading.bootstrap_interval(values, draws=4000, seed=8)
     error = values.std() / np.sqrt(700)
     assert (low, high) == pytest.approx(
         (values.mean() - 1.96 * error, values.mean() + 1.96 * error), abs=0.1 * error
@@ -30,7 +30,9 @@ def test_intervals_hold_the_mean_in_95_of_100_sets():
     """
     draw, held = np.random.default_rng(21), 0
     for k in range(400):
-        low, high = reading.bootstrap(draw.normal(3.7, 1.3, 60), draws=400, seed=k)
+        low, high = reading.bootstrap_interval(
+            draw.normal(3.7, 1.3, 60), draws=400, seed=k
+        )
         held += low < 3.7 < high
     assert 0.915 < held / 400 < 0.975
 
@@ -49,7 +51,7 @@ def test_a_table_is_used_where_its_widest_entry_is_known_to_two_nanometres(
     result = SimpleNamespace(
         samples=lambda n, seed: drawn[:n], parameters=lambda row: row, names=()
     )
-    found = sure.judge(result, lambda x: 7.0 + x * np.array(ends))
+    found = sure.judge_correction(result, lambda x: 7.0 + x * np.array(ends))
     assert found.sigma_nm == pytest.approx(np.array(ends), rel=1e-9)
     assert found.usable == usable
     assert found.table_nm.shape == (24, 2)

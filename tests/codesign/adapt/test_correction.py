@@ -5,12 +5,12 @@ reading of the table, real gain.
 import numpy as np
 import pytest
 
-from characterize.model.parameters import state, vector
+from characterize.model.parameters import parameter_vector, process_state_of
 from codesign.adapt import correction
 from codesign.optics import built
 from layout.process import process as processes
+from metalens.core.errors import ConfigError
 from metalens.fabrication import sensitivity, transmission
-from metalens.ground.errors import ConfigError
 from tests.codesign import made_lens as m
 
 OLD = """
@@ -22,8 +22,8 @@ table_nm = [[80, -6.0], [120, -3.5], [180, -1.0], [260, 0.5], [340, 1.0]]
 def _plan(old=None, **values):
     lens = m.small()
     none = correction.present_bias(None)
-    return correction.propose(
-        lens, vector(values), response=sensitivity(lens), old=old or none
+    return correction.propose_correction(
+        lens, parameter_vector(values), response=sensitivity(lens), old=old or none
     )
 
 
@@ -41,15 +41,21 @@ def test_a_constant_bias_adds_to_the_present_table(tmp_path):
 
 
 def test_what_height_takes_from_the_phase_the_diameters_give_back():
-    lens, x = m.small(), vector({"height_nm": -12.0})
+    lens, x = m.small(), parameter_vector({"height_nm": -12.0})
     response = sensitivity(lens)
     plan = _plan(height_nm=-12.0)
     now = np.angle(
-        transmission(lens.proxy, response, plan.wanted_um, 0.85, state(x).answers())
+        transmission(
+            lens.proxy, response, plan.wanted_um, 0.85, process_state_of(x).answers()
+        )
     )
     meant = np.angle(
         transmission(
-            lens.proxy, response, plan.designed_um, 0.85, state(vector()).answers()
+            lens.proxy,
+            response,
+            plan.designed_um,
+            0.85,
+            process_state_of(parameter_vector()).answers(),
         )
     )
     off = np.angle(np.exp(1j * (now - meant)))
@@ -59,7 +65,7 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
 
 def test_the_layout_draws_what_the_table_means(tmp_path):
     plan = _plan(bias_nm=5.0, height_nm=-8.0)
-    correction.write(tmp_path, plan)
+    correction.write_correction(tmp_path, plan)
     made = processes.load(tmp_path / "bias.toml")
     assert np.allclose(
         made.bias.drawn_nm(plan.designed_um * 1e3), plan.drawn_nm, atol=2e-3
@@ -94,8 +100,8 @@ def test_a_true_correction_gives_the_designed_lens_back():
     the spacer leaves aberrations.
     """
     made = built.MadeLens(m.small(), m.OPTICS)
-    x = vector({k: v for k, v in m.TRUE.items() if k != "coma_x_rad"})
-    plan = correction.propose(
+    x = parameter_vector({k: v for k, v in m.TRUE.items() if k != "coma_x_rad"})
+    plan = correction.propose_correction(
         m.small(), x, response=made.response, old=correction.present_bias(None)
     )
     before, table, mapped, placed = correction.next_lenses(made, plan, x, x)

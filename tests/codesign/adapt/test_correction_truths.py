@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from codesign.adapt import correction
-from codesign.adapt.correction import Correction
+from codesign.adapt.correction import MaskCorrection
 from metalens.lens import DiameterMap
 
 RNG = np.random.default_rng(29)
@@ -19,16 +19,16 @@ FORM_KEPT = SimpleNamespace(by_edges=lambda diameter_um: None)
 def test_an_overlap_is_the_strehl_ratio_with_the_best_piston():
     """exp(-V) to second order for a phase of variance V; 1 for a wave times any number."""
     wave = RNG.normal(size=(30, 40)) + 1j * RNG.normal(size=(30, 40))
-    assert correction.overlap(wave, (0.3 - 1.7j) * wave) == pytest.approx(
+    assert correction.wavefront_overlap(wave, (0.3 - 1.7j) * wave) == pytest.approx(
         1.0, rel=1e-12
     )
     one, other = np.array([1.0, 2j, 0.5]), np.array([0.7, 1.0 + 1j, -0.2])
     cross = abs(1.0 * 0.7 + (-2j) * (1 + 1j) + 0.5 * -0.2) ** 2
-    assert correction.overlap(one, other) == pytest.approx(
+    assert correction.wavefront_overlap(one, other) == pytest.approx(
         cross / (5.25 * (0.49 + 2 + 0.04)), rel=1e-12
     )
     off = 0.05 * RNG.normal(size=100_000)
-    turned = correction.overlap(np.exp(1j * off), np.ones(100_000))
+    turned = correction.wavefront_overlap(np.exp(1j * off), np.ones(100_000))
     assert turned == pytest.approx(np.exp(-off.var()), abs=1e-5)
 
 
@@ -56,7 +56,7 @@ def process(monkeypatch):
     monkeypatch.setattr(correction, "State", State)
     monkeypatch.setattr(
         correction,
-        "state",
+        "process_state_of",
         lambda x: State(off=0.012 if x is not None else 0.0, bias_nm=4.0),
     )
     diameters = DiameterMap(np.array([[0.12, 0.0], [0.18, 0.26]]), 0.4)
@@ -77,7 +77,7 @@ def test_made_diameters_are_wanted_that_give_the_designed_phases_up_to_a_piston(
     wanted = correction._wanted_um(process, np.array([0.12, 0.19, 0.26]), 1, FORM_KEPT)
     assert wanted == pytest.approx([0.12, 0.19, 0.26], abs=1e-6)
     old = SimpleNamespace(drawn_nm=lambda made: np.asarray(made) - 11.0)
-    table = correction.table(
+    table = correction.bias_table(
         process, 1, response=FORM_KEPT, old=old, range_um=(0.12, 0.26), knots=5
     )
     assert table.designed_um == pytest.approx(np.linspace(0.12, 0.26, 5))
@@ -95,7 +95,7 @@ def test_the_range_is_that_of_the_pillars_that_stand():
 
 
 def test_rows_for_people_are_in_nanometres():
-    made = Correction(
+    made = MaskCorrection(
         np.array([100.0]),
         np.array([7.0]),
         np.array([5.0]),

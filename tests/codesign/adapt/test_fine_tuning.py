@@ -6,18 +6,18 @@ from dataclasses import replace
 
 from codesign.adapt import RetrainConfig, train
 from codesign.train import InnerConfig
-from codesign.train.moving import Schedule
+from codesign.train.moving import LearningRateSchedule
 
 
 def test_weights_alone_move_at_the_rate_asked_from_the_first_step_to_the_last():
     run = InnerConfig(
         steps=900,
         seed=5,
-        weights=Schedule(3e-3, 0.25, 0.75, clip=0.4),
-        pitch=Schedule(0.01),
+        weights=LearningRateSchedule(3e-3, 0.25, 0.75, clip=0.4),
+        pitch=LearningRateSchedule(0.01),
     )
     made = train.fine_tuning(run, RetrainConfig(steps=30, rate=7e-4))
-    assert made.weights == Schedule(7e-4, 0.0, 1.0, clip=0.4)
+    assert made.weights == LearningRateSchedule(7e-4, 0.0, 1.0, clip=0.4)
     assert made.optics.rate == made.pitch.rate == 0.0
     assert made.steps == 30
     kept = replace(

@@ -10,24 +10,26 @@ import pytest
 import torch
 
 import codesign
-from characterize.bench.bench import Truth
-from characterize.model.parameters import Known
+from characterize.bench.bench import HiddenLens
+from characterize.model.parameters import KnownValue
 from codesign.adapt import reading
 from codesign.adapt import train as retraining
-from codesign.adapt.reading import Accuracy
+from codesign.adapt.reading import NetworkAccuracy
 from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.train import Outcome
+from codesign.adapt.train import RetrainingOutcome
 from codesign.optics import formed
 from codesign.optics.built import MadeLens
-from codesign.optics.stack import Stack
-from codesign.train import place
-from metalens.ground.errors import ConfigError, FitError, TrainingError
+from codesign.optics.stack import PixelPsfStack
+from codesign.train import place_on_device
+from metalens.core.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
 from tests.codesign import made_lens as m
 from tests.elsewhere import AWAY, elsewhere
 
 SHORT = RetrainConfig(steps=2, draws=2, judge=1, test_batches=1)
-TRUTH = Truth((3000.0,), parameter=tuple(Known(n, v) for n, v in m.TRUE.items()))
+TRUTH = HiddenLens(
+    (3000.0,), parameter=tuple(KnownValue(n, v) for n, v in m.TRUE.items())
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +41,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found():
-    return retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT, TRUTH)
+    return retraining.lens_psfs(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT, TRUTH)
 
 
 def _accuracy(error, n=50):
-    return Accuracy(torch.full((n, 3), error), torch.ones(n))
+    return NetworkAccuracy(torch.full((n, 3), error), torch.ones(n))
 
 
 def test_bars_of_a_gap_and_of_an_accuracy():
@@ -53,12 +55,12 @@ def test_bars_of_a_gap_and_of_an_accuracy():
     generator = torch.Generator().manual_seed(5)
     shared = torch.rand(4000, 1, generator=generator) * 3
     own = torch.randn(4000, 3, generator=generator) * torch.tensor([0.3, 0.6, 0.9])
-    better = Accuracy(
+    better = NetworkAccuracy(
         (shared + torch.tensor([1.0, 2.0, 6.0])).expand(4000, 3),
         torch.full((4000,), 0.75),
     )
-    worse = Accuracy(better.error_mm + 0.21 + own, better.iou)
-    told = Outcome(better, better, worse, better, None)
+    worse = NetworkAccuracy(better.error_mm + 0.21 + own, better.iou)
+    told = RetrainingOutcome(better, better, worse, better, None)
     assert told.gap_mm == pytest.approx(0.21, abs=4 * 0.374 / math.sqrt(4000))
     # the mean of three axes scatters by sqrt(0.09 + 0.36 + 0.81) / 3 = 0.374
     assert told.gap_sigma_mm == pytest.approx(0.374 / math.sqrt(4000), rel=0.05)
@@ -78,21 +80,21 @@ def test_a_gap_within_two_of_its_errors_is_no_gap(gap, counted):
         99 / 100
     )  # bar of 0.01
     nominal, before = (
-        Accuracy(torch.ones(100, 3), torch.ones(100)),
-        Accuracy(1 + gap + scatter, torch.ones(100)),
+        NetworkAccuracy(torch.ones(100, 3), torch.ones(100)),
+        NetworkAccuracy(1 + gap + scatter, torch.ones(100)),
     )
-    told = Outcome(nominal, nominal, before, nominal, None)
+    told = RetrainingOutcome(nominal, nominal, before, nominal, None)
     assert told.gap_sigma_mm == pytest.approx(0.01, rel=1e-5)
     assert (told.recovered is not None) == counted
 
 
 def test_share_won_back_is_that_of_the_gap():
     cases = [_accuracy(e) for e in (0.5, 0.4, 0.9, 0.45, 0.44)]
-    told = Outcome(*cases)
+    told = RetrainingOutcome(*cases)
     assert told.gap_mm == pytest.approx(0.5)
     assert told.recovered == pytest.approx(0.9)
     assert replace(told, before=_accuracy(0.4)).recovered is None
-    scattered = Accuracy(
+    scattered = NetworkAccuracy(
         0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50)
     )
     assert replace(told, before=scattered).gap_mm > 0
@@ -112,7 +114,7 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
-        low, high = reading.bootstrap(rng.exponential(1.0, 200), draws=200)
+        low, high = reading.bootstrap_interval(rng.exponential(1.0, 200), draws=200)
         hits += low <= 1.0 <= high
     assert (
         0.88 <= hits / 200 <= 0.99
@@ -124,7 +126,7 @@ def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(f
     assert len(found.drawn) == 2
     true = MadeLens(m.small(), m.SEEN).stack(TRUTH.vector())
     assert torch.equal(found.judges[0].intensity, true.intensity)
-    blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT)
+    blind = retraining.lens_psfs(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT)
     assert not blind.known
     assert not any(
         torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn
@@ -136,17 +138,17 @@ def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(fo
     and three compare.
     """
     config = replace(SHORT, judge=3)
-    source = retraining.load(folder)
-    blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), config)
-    going = retraining.trainer(source, config, (blind.nominal,))
-    told = retraining.outcome(
+    source = retraining.load_finished_run(folder)
+    blind = retraining.lens_psfs(MadeLens(m.small(), m.SEEN), m.asbuilt(), config)
+    going = retraining.make_trainer(source, config, (blind.nominal,))
+    told = retraining.retraining_outcome(
         source, config, blind, {"nominal": going, "retrained": going}
     )
     assert told.known is None
     assert told.gap_sigma_mm > 0
-    frames = retraining.held(source, config)
+    frames = retraining.render_test_frames(source, config)
     apart = [
-        retraining.judge(going, source, config, (one,), frames=frames)
+        retraining.judge_network(going, source, config, (one,), frames=frames)
         for one in blind.judges
     ]
     assert len(apart) == 3
@@ -172,10 +174,10 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
         asked.append(image)
         return f"image {len(asked)}"
 
-    monkeypatch.setattr(formed, "above", above)
-    source = retraining.load(folder)
-    going = retraining.trainer(source, SHORT, (found.nominal,))
-    told = retraining.outcome(
+    monkeypatch.setattr(formed, "image_tolerance_problem", above)
+    source = retraining.load_finished_run(folder)
+    going = retraining.make_trainer(source, SHORT, (found.nominal,))
+    told = retraining.retraining_outcome(
         source, SHORT, found, {"nominal": going, "retrained": going, "known": going}
     )
     cases = (told.designed, told.nominal, told.before, told.after, told.known)
@@ -191,18 +193,18 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
 
 
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
-    source = retraining.load(folder)
-    whole = retraining.job(source, SHORT, found, "retrained")
-    list(retraining.train(whole, tmp_path / "whole", SHORT))
-    first = retraining.train(
-        retraining.job(source, SHORT, found, "retrained"),
+    source = retraining.load_finished_run(folder)
+    whole = retraining.make_job(source, SHORT, found, "retrained")
+    list(retraining.run_job(whole, tmp_path / "whole", SHORT))
+    first = retraining.run_job(
+        retraining.make_job(source, SHORT, found, "retrained"),
         tmp_path / "part",
         SHORT,
         every=1,
     )
     next(first), next(first)  # the checkpoint of step 1 is written
-    second = retraining.job(source, SHORT, found, "retrained")
-    list(retraining.train(second, tmp_path / "part", SHORT))
+    second = retraining.make_job(source, SHORT, found, "retrained")
+    list(retraining.run_job(second, tmp_path / "part", SHORT))
     for a, b in zip(
         whole.model.net.state_dict().values(),
         second.model.net.state_dict().values(),
@@ -219,25 +221,27 @@ def test_a_job_trains_where_its_run_is_placed(folder, found):
     """On the played device its losses are the processor's, and its frames are imaged
     there.
     """
-    plain = retraining.job(retraining.load(folder), SHORT, found, "retrained")
+    plain = retraining.make_job(
+        retraining.load_finished_run(folder), SHORT, found, "retrained"
+    )
     want = next(plain.run(until=1))
-    source = retraining.load(folder)
+    source = retraining.load_finished_run(folder)
     with elsewhere() as done:
-        place(source.run.trainer, AWAY)
-        going = retraining.job(source, SHORT, found, "retrained")
+        place_on_device(source.run.trainer, AWAY)
+        going = retraining.make_job(source, SHORT, found, "retrained")
         told = next(going.run(until=1))
-        judged = retraining.judge(going, source, SHORT, found.judges)
+        judged = retraining.judge_network(going, source, SHORT, found.judges)
     assert {"convolution_backward", "_fft_r2c"} <= done
     assert told.loss == pytest.approx(want.loss, rel=1e-5)
     list(plain.run(until=1))
     assert judged.slip_mm == pytest.approx(
-        retraining.judge(plain, source, SHORT, found.judges).slip_mm, rel=1e-3
+        retraining.judge_network(plain, source, SHORT, found.judges).slip_mm, rel=1e-3
     )
 
 
 def test_only_weights_move(folder, found):
-    source = retraining.load(folder)
-    going = retraining.job(source, SHORT, found, "known")
+    source = retraining.load_finished_run(folder)
+    going = retraining.make_job(source, SHORT, found, "known")
     list(going.run())
     assert torch.equal(
         going.model.coefficients_rad, source.run.trainer.model.coefficients_rad
@@ -266,7 +270,7 @@ def test_half_written_runs_are_named(folder, tmp_path, name, message):
         if path.name != name:
             (tmp_path / path.name).write_bytes(path.read_bytes())
     with pytest.raises(TrainingError, match=message):
-        retraining.load(tmp_path)
+        retraining.load_finished_run(tmp_path)
 
 
 def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(
@@ -276,17 +280,17 @@ def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(
         TrainingError,
         match=r"is no run folder: .* give the folder that `metalens codesign",
     ):
-        retraining.load(tmp_path)
+        retraining.load_finished_run(tmp_path)
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "result.json").write_text((folder / "result.json").read_text()[:-9])
     with pytest.raises(TrainingError, match="cut short or of another version"):
-        retraining.load(tmp_path)
+        retraining.load_finished_run(tmp_path)
     with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are 2"):
-        retraining.load(folder, budget_mmacs=7.0)
+        retraining.load_finished_run(folder, budget_mmacs=7.0)
 
 
-@pytest.mark.parametrize("take_up", [retraining.load, retraining.rows_of])
+@pytest.mark.parametrize("take_up", [retraining.load_finished_run, retraining.rows_of])
 def test_a_retraining_is_no_run_and_said_to_be_none(folder, tmp_path, take_up):
     for name in ("retrain.toml", "result.json"):
         (tmp_path / name).write_text("{}")
@@ -322,9 +326,13 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
     averaged over, 5 %.
     """
     settings = replace(m.SEEN, image="true", image_tolerance=0.1)
-    made = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.judges[0])
-    other = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.nominal)
-    assert made is formed.imager(
+    made = formed.make_imager(
+        settings, torch.zeros(0), 43, margin=4, made=found.judges[0]
+    )
+    other = formed.make_imager(
+        settings, torch.zeros(0), 43, margin=4, made=found.nominal
+    )
+    assert made is formed.make_imager(
         settings, torch.zeros(0), 43, margin=4, made=found.judges[0]
     )
     centres = [
@@ -338,9 +346,9 @@ def test_a_made_lens_images_truly_as_its_pillars_do(found):
     assert moved == pytest.approx(
         told, rel=0.35
     )  # depths differ: the image places its own nodes
-    bare = Stack(found.nominal.intensity, found.nominal.depths_um)
+    bare = PixelPsfStack(found.nominal.intensity, found.nominal.depths_um)
     with pytest.raises(TrainingError, match="PSFs on axis alone"):
-        formed.imager(settings, torch.zeros(0), 43, margin=4, made=bare)
+        formed.make_imager(settings, torch.zeros(0), 43, margin=4, made=bare)
 
 
 def _units(*stacks):

@@ -8,7 +8,7 @@ import pytest
 from characterize.inference.asbuilt import WithinModel
 from characterize.model import PLACE
 from codesign.adapt import correction, sure
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 from tests.codesign import made_lens as m
 
 KNOTS = np.array([0.7, 1.0, 1.6])
@@ -20,7 +20,7 @@ def table(x):
 
 
 def test_a_narrow_posterior_is_used_and_its_spread_told():
-    found = sure.judge(m.asbuilt(sigma=0.3), table)
+    found = sure.judge_correction(m.asbuilt(sigma=0.3), table)
     assert found.usable
     assert np.allclose(
         found.sigma_nm, 0.3 * KNOTS, rtol=0.5
@@ -28,7 +28,7 @@ def test_a_narrow_posterior_is_used_and_its_spread_told():
 
 
 def test_a_wide_posterior_is_refused_with_what_would_settle_it():
-    found = sure.judge(m.asbuilt(sigma=6.0), table)
+    found = sure.judge_correction(m.asbuilt(sigma=6.0), table)
     assert not found.usable
     for words in ("bias_nm", "focus", "micrographs", "AFM"):
         assert words in found.words
@@ -55,7 +55,7 @@ def test_what_nobody_stated_refuses_and_is_named():
         causes=causes,
         by_cause=by_cause,
     )
-    found = sure.judge(open_, table)
+    found = sure.judge_correction(open_, table)
     assert not found.usable
     assert found.words.index("cross-section") < found.words.index("ellipsometry")
     for words in ("lamp", "both sides of focus"):  # the frames have said what they can
@@ -72,8 +72,8 @@ def test_two_lenses_that_fit_alike_are_wide_however_sharp_each_is():
     i = narrow.names.index("bias_nm")
     draws = np.tile(narrow.value, (60, 1))
     draws[::2, i] += 9.3
-    assert sure.judge(narrow, table).usable
-    assert not sure.judge(replace(narrow, draws=draws), table).usable
+    assert sure.judge_correction(narrow, table).usable
+    assert not sure.judge_correction(replace(narrow, draws=draws), table).usable
 
 
 def test_a_map_is_judged_apart_from_the_table():
@@ -85,21 +85,21 @@ def test_a_map_is_judged_apart_from_the_table():
     covariance = sharp.covariance.copy()
     covariance[i, i] = 25.0
     bowed = replace(sharp, covariance=covariance)
-    assert sure.judge(bowed, table).usable
-    found = sure.judge(bowed, correction.uneven_nm, part=sure.MAP)
+    assert sure.judge_correction(bowed, table).usable
+    found = sure.judge_correction(bowed, correction.uneven_nm, part=sure.MAP)
     assert found.sigma_nm == pytest.approx(
         [2.5] + [1.25] * 8 + [2.5] * 8, rel=0.45
     )  # 24 draws: 15 % is one sigma
     assert "what varies over the lens open" in found.words
     assert "bias_r_nm" in found.words
     assert "height_nm" not in found.words
-    assert sure.judge(sharp, correction.uneven_nm, part=sure.MAP).usable
+    assert sure.judge_correction(sharp, correction.uneven_nm, part=sure.MAP).usable
 
 
 def test_draws_that_no_table_can_hold_are_refused():
     def impossible(x):
         raise ConfigError("the table would change by 3 nm per nm")
 
-    assert "3 nm per nm" in sure.judge(m.asbuilt(), impossible).words
+    assert "3 nm per nm" in sure.judge_correction(m.asbuilt(), impossible).words
     with pytest.raises(TypeError):
-        sure.judge(m.asbuilt(), None)
+        sure.judge_correction(m.asbuilt(), None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from codesign.adapt import sure
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 NAMES = ("bias_nm", "focus_um", "height_nm")  # the second is none that a table follows
 SLOPES = {
@@ -117,7 +117,7 @@ def test_a_spread_up_to_what_is_allowed_is_a_table(about, limit, seed):
         found.samples = lambda count, seed, rows=rows, asked=asked: (
             asked.append((count, seed)) or [(row, 0.0, 0.0) for row in rows]
         )
-        told = sure.judge(found, table, **about)
+        told = sure.judge_correction(found, table, **about)
         assert asked == [(24, seed)]
         assert told.usable is usable
         assert told.sigma_nm == pytest.approx(
@@ -135,9 +135,9 @@ def test_a_spread_up_to_what_is_allowed_is_a_table(about, limit, seed):
 def test_a_spread_of_just_what_is_allowed_is_a_table():
     found, rows = fit(), drawn(0.3)
     found.samples = lambda count, seed: [(row, 0.0, 0.0) for row in rows]
-    widest = float(sure.judge(found, table).sigma_nm.max())
-    assert sure.judge(found, table, wide_nm=widest).usable
-    assert not sure.judge(found, table, wide_nm=widest * (1 - 1e-12)).usable
+    widest = float(sure.judge_correction(found, table).sigma_nm.max())
+    assert sure.judge_correction(found, table, wide_nm=widest).usable
+    assert not sure.judge_correction(found, table, wide_nm=widest * (1 - 1e-12)).usable
 
 
 def test_a_draw_that_no_table_can_hold_leaves_no_numbers():
@@ -147,6 +147,6 @@ def test_a_draw_that_no_table_can_hold_leaves_no_numbers():
     def impossible(x):
         raise ConfigError("3 nm per nm")
 
-    told = sure.judge(found, impossible)
+    told = sure.judge_correction(found, impossible)
     assert (told.table_nm.shape, told.sigma_nm.shape) == ((0, 0), (0,))
     assert told.words == "no correction: for lenses of the posterior 3 nm per nm"

@@ -9,15 +9,15 @@ from pathlib import Path
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import Batch, Pose
-from codesign.batches.pool import PoolScenes, fill
+from codesign.batches.batch import EyePose, FrameBatch
+from codesign.batches.pool import PoolScenes, render_pool
 from codesign.batches.scenes import EyeScenes, SceneConfig
-from codesign.network.architecture import Architecture, Space
+from codesign.network.architecture import Architecture, SearchSpace
 from codesign.optics.stack import OpticsConfig
 from codesign.train import evolution, inner
-from codesign.train.evolution import Plan
-from codesign.train.inner import InnerConfig, Schedule, Trainer
-from metalens.ground.errors import TrainingError
+from codesign.train.evolution import EvolutionSettings
+from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
+from metalens.core.errors import TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
@@ -41,17 +41,21 @@ def trained():
         polynomials=6,
         image="uniform",
     )
-    space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
+    space = SearchSpace(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
     config = InnerConfig(
-        steps=1, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0
+        steps=1,
+        batch=4,
+        seed=1,
+        optics=LearningRateSchedule(0.02, 0.0, 1.0),
+        optics_weight=0.0,
     )
     member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)
-    made = inner.model(optics, pitch_um=24.0, seed=1, space=space)
+    made = inner.make_model(optics, pitch_um=24.0, seed=1, space=space)
     trainer = Trainer(
         config,
         optics,
         Sensor(24.0),
-        PoolScenes(fill(scenes, 12), 8, 0.2, 1),
+        PoolScenes(render_pool(scenes, 12), 8, 0.2, 1),
         made,
         architecture=member,
     )
@@ -70,14 +74,14 @@ def searched():
         return sum(architecture.kernels) / 7 + abs(architecture.width - 1.0)
 
     history = evolution.search(
-        Space(),
-        Plan(8, 3, 40, together=4),
+        SearchSpace(),
+        EvolutionSettings(8, 3, 40, together=4),
         error,
         lambda a: 1e6 * sum(a.depths),
         budget=1e9,
         seed=5,
     )
-    return evolution.dumps(evolution.Search(history)), len(judged)
+    return evolution.state_to_json(evolution.EvolutionState(history)), len(judged)
 
 
 def gradients(rank):
@@ -96,10 +100,10 @@ def averaged():
         for g in (torch.zeros(7), *gradients(0), torch.zeros(2))
     ]
     for parameter, grad in zip(
-        parameters[1:-1], gradients(parallel.rank()), strict=True
+        parameters[1:-1], gradients(parallel.process_rank()), strict=True
     ):
         parameter.grad = grad
-    parallel.average(parameters)
+    parallel.average_gradients(parameters)
     return [parameter.grad for parameter in parameters]
 
 
@@ -107,8 +111,8 @@ def batch(count):
     """Frames with their pose, no two numbers alike."""
     draw = torch.Generator().manual_seed(9)
     frames = Frames(*(torch.rand(count, 2, 4, 4, generator=draw) for _ in range(3)))
-    pose = Pose(*(torch.rand(count, 2, generator=draw) for _ in Pose.__slots__))
-    return Batch(
+    pose = EyePose(*(torch.rand(count, 2, generator=draw) for _ in EyePose.__slots__))
+    return FrameBatch(
         frames,
         torch.rand(count, 4, 4, generator=draw),
         torch.rand(count, 3, generator=draw),
@@ -133,7 +137,7 @@ def normalised():
     to them.
     """
     x, weight, bias, loss = normal()
-    half = slice(2 * parallel.rank(), 2 * parallel.rank() + 2)
+    half = slice(2 * parallel.process_rank(), 2 * parallel.process_rank() + 2)
     mine = x[half].requires_grad_()
     out = parallel.batch_norm(mine, weight, bias)
     return out.detach(), torch.autograd.grad((out * loss[half]).sum(), mine)[0]
@@ -150,8 +154,8 @@ def refused():
 def main(folder: Path) -> None:
     """All of it; then the second process goes, and the first is told."""
     torch.set_num_threads(1)
-    parallel.join()
-    rank, done = parallel.rank(), []
+    parallel.join_processes()
+    rank, done = parallel.process_rank(), []
     found = {
         "trained": trained(),
         "searched": searched(),
@@ -160,10 +164,12 @@ def main(folder: Path) -> None:
         "normalised": normalised(),
         "refused": refused(),
         "mean": parallel.mean_of([1.5 + rank, -2.0 * rank]),
-        "each": parallel.each(lambda item: done.append(item) or 10.0 * item, ITEMS),
+        "each": parallel.share_work(
+            lambda item: done.append(item) or 10.0 * item, ITEMS
+        ),
         "done": done,
     }
-    parallel.wait()
+    parallel.wait_for_all()
     if rank == 0:
         try:
             while True:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import Pose
+from codesign.batches.batch import EyePose
 from tests.codesign.batches import of_two
 
 ROOT = Path(__file__).parents[3]
@@ -82,7 +82,7 @@ def test_every_process_takes_its_frames_with_their_pose_and_its_share_of_the_wor
             assert torch.equal(
                 getattr(mine.frames, name), getattr(whole.frames, name)[rows]
             )
-        for name in Pose.__slots__:
+        for name in EyePose.__slots__:
             assert torch.equal(
                 getattr(mine.pose, name), getattr(whole.pose, name)[rows]
             )
@@ -115,4 +115,8 @@ def test_a_lost_process_is_named_with_the_way_on(two):
 def test_one_process_takes_the_whole_batch():
     batch = of_two.batch(3)
     assert parallel.part_of(batch) is batch
-    assert (parallel.rank(), parallel.ranks(), parallel.mean_of([1.5])) == (0, 1, [1.5])
+    assert (
+        parallel.process_rank(),
+        parallel.process_count(),
+        parallel.mean_of([1.5]),
+    ) == (0, 1, [1.5])

@@ -11,7 +11,7 @@ import torch
 from codesign.batches import pool
 from codesign.batches.scenes import TEST, TRAINING, EyeScenes, SceneConfig
 from codesign.network.cost import POINTS
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 SMALL = SceneConfig(pixels=48, margin=8)
 
@@ -144,7 +144,7 @@ def test_poses_of_a_pool_are_those_of_the_renderer_whatever_the_view():
     turns with the face.
     """
     wide = EyeScenes(replace(SMALL, variety=3.0), 18.0, 2000.0, 4)
-    direct, made = wide.batch(0, 24), pool.fill(wide, 24)
+    direct, made = wide.batch(0, 24), pool.render_pool(wide, 24)
     states = wide.states(0, 24)
     drawn = pool.PoolScenes(made, wide.margin, 0.0, seed=1).rows(
         np.arange(24), np.random.default_rng(0)

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from codesign.batches import flat, pool
-from codesign.batches.flat import Flat, flattened, irradiance
+from codesign.batches.flat import SingleSurfaceFrames, flatten_layers, sensor_irradiance
 from codesign.batches.pool import PoolScenes
-from codesign.batches.scenes import EyeScenes, SceneConfig, decoupled
+from codesign.batches.scenes import EyeScenes, SceneConfig, depth_factors
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
-from metalens.ground.errors import SceneError, TrainingError
+from metalens.core.errors import SceneError, TrainingError
 from metalens.image import scene
 
 SCENES = EyeScenes(
@@ -29,8 +29,8 @@ OPTICS = OpticsConfig(
 
 
 def _imager(size=80, margin=8):
-    made = optics.stack(OPTICS, torch.zeros(0, dtype=torch.float64))
-    return optics.prepared(OPTICS, made, size, margin=margin)
+    made = optics.lens_psf_stack(OPTICS, torch.zeros(0, dtype=torch.float64))
+    return optics.prepare_transfers(OPTICS, made, size, margin=margin)
 
 
 def test_one_surface_is_imaged_as_the_two_sheet_formula_does():
@@ -46,9 +46,9 @@ def test_one_surface_is_imaged_as_the_two_sheet_formula_does():
         torch.stack([zero, zero + 1], 1),
         torch.stack([zero + 20_000, depth], 1),
     )
-    one = flattened(sheets, torch.ones(2))
+    one = flatten_layers(sheets, torch.ones(2))
     imager = _imager()
-    got = irradiance(one, imager, margin=8)
+    got = sensor_irradiance(one, imager, margin=8)
     blurred = torch.fft.irfft2(
         (
             torch.fft.rfft2(scene.weight_maps(imager.psf, depth) * light)
@@ -63,9 +63,9 @@ def test_one_surface_is_imaged_as_the_two_sheet_formula_does():
 
 def test_eyes_as_one_surface_are_near_their_two_sheets():
     made = SCENES.rendered(0, 8)
-    exact = irradiance(made.frames, _imager(), margin=8)
-    quick = irradiance(
-        flattened(made.frames, SCENES.states(0, 8).scale), _imager(), margin=8
+    exact = sensor_irradiance(made.frames, _imager(), margin=8)
+    quick = sensor_irradiance(
+        flatten_layers(made.frames, SCENES.states(0, 8).scale), _imager(), margin=8
     )
     error = (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
     assert (
@@ -74,14 +74,14 @@ def test_eyes_as_one_surface_are_near_their_two_sheets():
 
 
 def test_spare_rows_continue_the_border():
-    constant = Flat(
+    constant = SingleSurfaceFrames(
         np.full((1, 67, 67), 100, np.uint8),
         np.full((1, 67, 67), 20_000, np.uint16),
         np.ones(1),
     )
     imager = _imager(67, margin=0)
     assert imager.shape[0] > 67
-    inside = irradiance(constant, imager, margin=0)
+    inside = sensor_irradiance(constant, imager, margin=0)
     torch.testing.assert_close(
         inside, torch.full_like(inside, 100 / 255), rtol=2e-3, atol=0.0
     )  # tolerance of the basis
@@ -91,13 +91,15 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
     from dataclasses import replace
 
     settings = replace(OPTICS, polynomials=6, tolerance=1e-5)
-    frames = flattened(SCENES.rendered(0, 2).frames, SCENES.states(0, 2).scale)
+    frames = flatten_layers(SCENES.rendered(0, 2).frames, SCENES.states(0, 2).scale)
     weight = torch.randn(2, 64, 64, generator=torch.Generator().manual_seed(2))
 
     def value(coefficients):
-        made = optics.stack(settings, coefficients)
+        made = optics.lens_psf_stack(settings, coefficients)
         return (
-            irradiance(frames, optics.prepared(settings, made, 80, margin=8), margin=8)
+            sensor_irradiance(
+                frames, optics.prepare_transfers(settings, made, 80, margin=8), margin=8
+            )
             * weight
         ).sum()
 
@@ -116,9 +118,9 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
 
 
 def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_path):
-    made = pool.fill(SCENES, 12)
-    pool.save(tmp_path / "pool.h5", made)
-    again = pool.load(tmp_path / "pool.h5")
+    made = pool.render_pool(SCENES, 12)
+    pool.save_pool(tmp_path / "pool.h5", made)
+    again = pool.load_pool(tmp_path / "pool.h5")
     draws = PoolScenes(made, 8, 0.2, seed=1)
     same = PoolScenes(again, 8, 0.2, seed=1).batch(1, 4)
     batch = draws.batch(1, 4)
@@ -133,7 +135,7 @@ def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_
 
 
 def test_slippage_of_a_pool_is_that_of_the_renderer_at_its_scale():
-    made = pool.fill(SCENES, 4)
+    made = pool.render_pool(SCENES, 4)
     states = SCENES.states(0, 4)
     batch = PoolScenes(made, 8, 0.0, seed=1).rows(
         np.arange(4), np.random.default_rng(0)
@@ -145,31 +147,31 @@ def test_slippage_of_a_pool_is_that_of_the_renderer_at_its_scale():
 
 def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
     depth = torch.linspace(18_000, 24_000, 4000, dtype=torch.float64)
-    factor = decoupled(depth, (18_000.0, 24_000.0), 0.4, np.random.default_rng(0))
+    factor = depth_factors(depth, (18_000.0, 24_000.0), 0.4, np.random.default_rng(0))
     assert (
         abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05
     )  # 3 / sqrt(4000)
     assert torch.equal(
-        decoupled(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
+        depth_factors(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
         torch.ones(4000).double(),
     )
 
 
 def test_pools_too_small_and_fields_of_psfs_are_refused():
     with pytest.raises(TrainingError, match="smaller than a batch"):
-        PoolScenes(pool.fill(SCENES, 2), 8, 0.2, seed=1).batch(0, 4)
-    made = optics.stack(OPTICS, torch.zeros(0, dtype=torch.float64)).intensity
+        PoolScenes(pool.render_pool(SCENES, 2), 8, 0.2, seed=1).batch(0, 4)
+    made = optics.lens_psf_stack(OPTICS, torch.zeros(0, dtype=torch.float64)).intensity
     field = scene.uniform_imager(
         scene.basis(made[None, None].expand(2, 2, -1, -1, -1), OPTICS.depths_um),
         (80, 80),
         margin=8,
     )
-    frames = flattened(SCENES.rendered(0, 1).frames, torch.ones(1))
+    frames = flatten_layers(SCENES.rendered(0, 1).frames, torch.ones(1))
     with pytest.raises(SceneError, match="one PSF for the whole image"):
-        irradiance(frames, field, margin=8)
+        sensor_irradiance(frames, field, margin=8)
     with pytest.raises(SceneError, match=r"need \(n, y, x\) twice"):
-        Flat(frames.light, frames.depth_um[:, :4], frames.scale)
-    assert flat.samples(frames) == 80
+        SingleSurfaceFrames(frames.light, frames.depth_um[:, :4], frames.scale)
+    assert flat.frame_samples(frames) == 80
 
 
 def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
@@ -179,14 +181,17 @@ def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
     random = np.random.default_rng(7)
     light = random.integers(0, 256, (2, 80, 80)).astype(np.uint8)
     depth = random.integers(9_000, 60_000, (2, 80, 80)).astype(np.uint16)
-    frames, imager = Flat(light, depth, np.array([1.0, 0.83])), _imager()
+    frames, imager = SingleSurfaceFrames(light, depth, np.array([1.0, 0.83])), _imager()
     want, got = (
-        irradiance(frames, imager, margin=8),
+        sensor_irradiance(frames, imager, margin=8),
         flat._elsewhere(frames, imager, margin=8),
     )
     contrast = (want - want.mean((1, 2), keepdim=True)).norm()
     assert (
         float((got - want).norm() / contrast) < 1e-3
     )  # single precision, and a pixel between two codes of 4096
-    near = Flat(light, np.full_like(depth, 16_000), frames.scale)
-    assert float((irradiance(near, imager, margin=8) - want).norm() / contrast) > 0.05
+    near = SingleSurfaceFrames(light, np.full_like(depth, 16_000), frames.scale)
+    assert (
+        float((sensor_irradiance(near, imager, margin=8) - want).norm() / contrast)
+        > 0.05
+    )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign.batches import flat
-from codesign.batches.flat import Flat, flattened
+from codesign.batches.flat import SingleSurfaceFrames, flatten_layers
 from metalens.image import Frames, PsfBasis, uniform_imager
 
 DEPTHS_UM = np.array([10_000.0, 16_000.0, 40_000.0])
@@ -41,7 +41,7 @@ def test_light_adds_up_to_255_and_the_depth_is_of_the_sheet_that_covers_more():
     than a half: 60 % and 51 %, not at
     a half; depths over the scale of 1.25 and 0.8."""
     frames, scale = sheets([1.25, 0.8])
-    made = flattened(frames, scale)
+    made = flatten_layers(frames, scale)
     assert made.light.tolist() == [[[128, 230, 255], [0, 77, 1]]] * 2
     assert made.depth_um[0].tolist() == [
         [16_800, 17_600, 18_960],
@@ -57,13 +57,13 @@ def test_light_adds_up_to_255_and_the_depth_is_of_the_sheet_that_covers_more():
         np.uint16,
         np.float32,
     )
-    assert flat.samples(made) == flat.samples(frames) == 3
+    assert flat.frame_samples(made) == flat.frame_samples(frames) == 3
 
 
 def test_depths_come_back_with_their_scale_and_without_the_margin():
     """Also those above 32 767 of two bytes; nothing stands nearer than 1 um."""
     frames, _ = sheets([1.25, 0.8])
-    kept = Flat(
+    kept = SingleSurfaceFrames(
         np.zeros((2, 5, 5), np.uint8),
         np.arange(50, dtype=np.uint16).reshape(2, 5, 5) * 1_300,
         np.array([1.25, 0.8]),
@@ -123,12 +123,12 @@ def test_images_are_what_every_pixel_sends_by_its_depth(rows, columns):
     depth = draw.integers(7_000, 60_000, (5, rows, columns)).astype(np.uint16)
     depth[:, 4, 5] = 0
     frames, optics = (
-        Flat(light, depth, np.array([0.83, 1.0, 1.21, 0.9, 1.1])),
+        SingleSurfaceFrames(light, depth, np.array([0.83, 1.0, 1.21, 0.9, 1.1])),
         imager(rows, columns),
     )
     want = expected(frames)
     ways = [
-        flat.irradiance,
+        flat.sensor_irradiance,
         *([flat._elsewhere] if columns >= rows else []),
     ]  # on a device frames are not tall
     for got in (way(frames, optics, margin=MARGIN) for way in ways):
@@ -142,11 +142,11 @@ def test_weights_at_the_depths_of_the_stack_are_its_own():
     """
     depth = np.array(DEPTHS_UM, np.uint16)[None, None].repeat(7, 1).repeat(3, 2)
     frames, optics = (
-        Flat(np.full((1, 7, 9), 200, np.uint8), depth, np.ones(1)),
+        SingleSurfaceFrames(np.full((1, 7, 9), 200, np.uint8), depth, np.ones(1)),
         imager(7, 9),
     )
     want = expected(frames)
-    got = flat.irradiance(frames, optics, margin=MARGIN).numpy()
+    got = flat.sensor_irradiance(frames, optics, margin=MARGIN).numpy()
     assert got == pytest.approx(want, abs=3e-4)
     table = flat._table(optics)
     assert table.shape == (4096, 2)
@@ -164,14 +164,14 @@ def test_two_sheets_go_their_own_way():
     """
     frames = Frames(*(torch.full((1, 2, 11, 11), v) for v in (0.0, 0.0, 20_000.0)))
     frames.radiance[:, 1], frames.coverage[:, 1] = 0.6, 1.0
-    got = flat.irradiance(frames, imager(11, 11), margin=MARGIN)
+    got = flat.sensor_irradiance(frames, imager(11, 11), margin=MARGIN)
     assert got.shape == (1, 7, 7)
     assert got.numpy() == pytest.approx(0.6, abs=1e-5)
 
 
 def test_frames_that_are_wider_than_high_lose_their_margin_on_every_side():
     """Nine columns of five rows: one row and five columns are left of a margin of two."""
-    kept = Flat(
+    kept = SingleSurfaceFrames(
         np.zeros((1, 5, 9), np.uint8),
         np.arange(45, dtype=np.uint16).reshape(1, 5, 9) + 7,
         np.ones(1),

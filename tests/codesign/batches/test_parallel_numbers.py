@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from codesign.batches import parallel
-from codesign.batches.batch import Batch, Pose
-from metalens.ground.errors import TrainingError
+from codesign.batches.batch import EyePose, FrameBatch
+from metalens.core.errors import TrainingError
 from metalens.image import Frames
 
 COUNT = 3
@@ -71,12 +71,12 @@ def batch(size):
             for k in (0.1, 0.2, 0.3)
         )
     )
-    pose = Pose(
+    pose = EyePose(
         rows[:, None] + torch.ones(3),
         rows[:, None] + torch.ones(3) / 2,
         rows[:, None, None] + torch.ones(2, 2),
     )
-    return Batch(
+    return FrameBatch(
         frames,
         rows[:, None, None] * torch.ones(size, 4, 5),
         rows[:, None] * torch.ones(3) * 0.7,
@@ -87,7 +87,7 @@ def batch(size):
 @pytest.mark.parametrize("posed", [True, False])
 def test_a_batch_falls_into_parts_in_the_order_of_ranks(together, posed):
     whole = batch(12)
-    whole = whole if posed else Batch(whole.frames, whole.mask, whole.slip_mm)
+    whole = whole if posed else FrameBatch(whole.frames, whole.mask, whole.slip_mm)
     for rank, part in enumerate(together(lambda rank: parallel.part_of(whole))):
         rows = [4 * rank, 4 * rank + 1, 4 * rank + 2, 4 * rank + 3]
         assert torch.equal(part.mask, whole.mask[rows])
@@ -121,7 +121,7 @@ def test_gradients_and_numbers_are_means_over_the_three(together):
         ]
         for parameter, pattern in zip(parameters, patterns, strict=False):
             parameter.grad = pattern * 10**rank
-        parallel.average(parameters)
+        parallel.average_gradients(parameters)
         return [p.grad for p in parameters], parallel.mean_of([0.3 + rank, -7.0 * rank])
 
     for grads, means in together(work):
@@ -138,7 +138,7 @@ def test_gradients_of_one_kind_are_means_as_well(together):
         parameters = [torch.nn.Parameter(torch.zeros(n)) for n in (2, 5)]
         for parameter in parameters:
             parameter.grad = (4.0 + 3 * rank) * torch.arange(1.0, 1 + len(parameter))
-        parallel.average(parameters)
+        parallel.average_gradients(parameters)
         return [p.grad.tolist() for p in parameters]
 
     assert together(work) == [[[7.0, 14.0], [7.0, 14.0, 21.0, 28.0, 35.0]]] * COUNT
@@ -148,14 +148,16 @@ def test_work_is_dealt_out_in_turn_and_told_to_all(together):
     done = [[] for _ in range(COUNT)]
 
     def work(rank):
-        return parallel.each(
+        return parallel.share_work(
             lambda item: done[rank].append(item) or 2.5 * item, [3, 4, 5, 6, 7, 8, 9]
         )
 
     assert together(work) == [[7.5, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5]] * COUNT
     assert done == [[3, 6, 9], [4, 7], [5, 8]]
     assert (
-        together(lambda rank: parallel.each(lambda item: item + 0.5, [1, 2, 4]), 2)
+        together(
+            lambda rank: parallel.share_work(lambda item: item + 0.5, [1, 2, 4]), 2
+        )
         == [[1.5, 2.5, 4.5]] * 2
     )
 
@@ -198,14 +200,14 @@ def test_statistics_of_a_layer_and_their_gradients_are_those_of_all_frames(toget
 
 def test_one_process_alone_asks_nobody(monkeypatch):
     monkeypatch.setattr(parallel, "dist", SimpleNamespace(is_initialized=lambda: False))
-    assert (parallel.rank(), parallel.ranks()) == (0, 1)
+    assert (parallel.process_rank(), parallel.process_count()) == (0, 1)
     whole = batch(5)
     assert parallel.part_of(whole) is whole
     assert parallel.mean_of([0.3, 0.9]) == [0.3, 0.9]
-    assert parallel.each(lambda item: item + 0.5, [3, 1]) == [3.5, 1.5]
+    assert parallel.share_work(lambda item: item + 0.5, [3, 1]) == [3.5, 1.5]
     parameter = torch.nn.Parameter(torch.ones(3))
     parameter.grad = torch.tensor([0.2, 0.4, 0.7])
-    parallel.average([parameter])
+    parallel.average_gradients([parameter])
     assert parameter.grad.tolist() == pytest.approx([0.2, 0.4, 0.7])
 
 
@@ -226,7 +228,7 @@ def test_only_several_processes_join_and_once(monkeypatch, world, begun, joins):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     if world:
         monkeypatch.setenv("WORLD_SIZE", world)
-    parallel.join(torch.device("cpu"))
+    parallel.join_processes(torch.device("cpu"))
     assert asked == (["gloo"] if joins else [])
 
 
@@ -243,7 +245,7 @@ def test_waiting_is_for_others(monkeypatch, count):
         "dist",
         SimpleNamespace(**about, destroy_process_group=lambda: waited.append("part")),
     )
-    parallel.wait()
+    parallel.wait_for_all()
     assert waited == ["wait"] * (count - 1)
-    parallel.leave()
+    parallel.leave_processes()
     assert waited[count - 1 :] == ["wait", "part"]

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from codesign.batches import EyeScenes, SceneConfig, pool
-from codesign.batches.pool import Pool, PoolScenes
-from metalens.ground.errors import TrainingError
+from codesign.batches.pool import FramePool, PoolScenes
+from metalens.core.errors import TrainingError
 
 COUNT = 7
 
@@ -33,7 +33,7 @@ def made():
     mask = np.full((COUNT, 2, 2), 30, np.uint8) + 17 * rows[:, None, None].astype(
         np.uint8
     )
-    return Pool(light, depth, mask, place, seen, axis, points * rows[:, None, None].astype(np.float32),
+    return FramePool(light, depth, mask, place, seen, axis, points * rows[:, None, None].astype(np.float32),
                 np.array([120.0, -340.0, 20_500.0]), np.array([15_000.0, 24_000.0]))  # fmt: skip
 
 
@@ -106,7 +106,7 @@ def filled(request):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pool, "CHUNK", 2)
-        return scenes, pool.fill(scenes, 5)
+        return scenes, pool.render_pool(scenes, 5)
 
 
 def test_a_pool_keeps_what_is_true_at_unit_scale_of_its_stream(filled):
@@ -158,8 +158,8 @@ def test_masks_are_means_over_squares_on_a_grid_of_64_where_the_frame_allows_it(
 
 def test_a_kept_pool_is_read_as_it_was(tmp_path):
     held = made()
-    pool.save(tmp_path / "pool.h5", held)
-    again = pool.load(tmp_path / "pool.h5")
-    for name in Pool.__slots__:
+    pool.save_pool(tmp_path / "pool.h5", held)
+    again = pool.load_pool(tmp_path / "pool.h5")
+    for name in FramePool.__slots__:
         assert np.array_equal(getattr(again, name), getattr(held, name))
         assert getattr(again, name).dtype == getattr(held, name).dtype

@@ -11,7 +11,7 @@ import torch
 
 from codesign.batches import scenes
 from codesign.batches.scenes import EyeScenes, SceneConfig
-from codesign.eye import POPULATION, Motion
+from codesign.eye import POPULATION, MotionRanges
 
 OWN = SceneConfig(
     pixels=50,
@@ -51,7 +51,7 @@ LIMITS |= {"iris": (0.05, 0.95), "pupil_radius_um": (700.0, 4300.0)}
 
 @pytest.mark.parametrize("variety", [0.5, 1.0, 2.5])
 def test_looks_spread_about_their_mean_and_stay_above_nothing(variety):
-    made = scenes.looks(variety)
+    made = scenes.widen_traits(variety)
     for name, trait in made.items():
         usual = POPULATION[name]
         assert trait.mean == usual.mean
@@ -62,8 +62,8 @@ def test_looks_spread_about_their_mean_and_stay_above_nothing(variety):
         assert trait.high == pytest.approx(
             min(usual.mean + (usual.high - usual.mean) * variety, most)
         )
-    low, high = Motion().aperture
-    assert scenes.varied(variety).aperture == pytest.approx(
+    low, high = MotionRanges().aperture
+    assert scenes.widen_motion(variety).aperture == pytest.approx(
         (max(1 - (1 - low) * variety, 0.1), high)
     )
 
@@ -73,7 +73,7 @@ def test_scales_bring_every_depth_to_one_that_knows_nothing_of_it():
     ends there.
     """
     depth = torch.tensor([15e3, 20e3, 26e3, 31e3], dtype=torch.float64)
-    got = scenes.decoupled(depth, (18e3, 27e3), 0.15, np.random.default_rng(9))
+    got = scenes.depth_factors(depth, (18e3, 27e3), 0.15, np.random.default_rng(9))
     wanted = np.random.default_rng(9).uniform(18e3, 27e3, 4)
     assert got.numpy() == pytest.approx(np.clip(wanted / depth.numpy(), 0.85, 1.15))
 

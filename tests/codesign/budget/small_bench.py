@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from codesign.budget.prepared import Bench, Given, bench
+from codesign.budget.prepared import BudgetInputs, PreparedDevice, prepare_device
 from codesign.budget.task import TaskSetting
 from codesign.evaluate import ExperimentConfig
-from codesign.optics import Numerics
+from codesign.optics import OpticsNumerics
 from metalens import design
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
 from metalens.fabrication import Printed, Spread
-from metalens.lens import Layers, Lens, Neighbours
+from metalens.lens import Layers, Lens, NeighbourRows
 from metalens.pillars.proxy import Proxy
 
 SLOPE = 55.0  # rad a um: phase of a pillar over its diameter, a straight line
@@ -30,13 +30,13 @@ SETTING = TaskSetting(scenes=2, pixels=16, margin=3, pitch_um=4.1)
 FRAMES = ExperimentConfig(
     subjects=1, grid=(4, 3), share=0.5, axial_mm=(-2.5,), lateral_mm=(1.5,), hidden=0
 )
-GIVEN = Given(
-    Numerics(4, 1, 1e-3, 1e-2), mask=Printed(spread=Spread.only(bias_nm=1.3, gradient_nm=0.9), diameter_step_nm=4.0),
+GIVEN = BudgetInputs(
+    OpticsNumerics(4, 1, 1e-3, 1e-2), mask=Printed(spread=Spread.only(bias_nm=1.3, gradient_nm=0.9), diameter_step_nm=4.0),
     frames=FRAMES, draws=3,
 )  # fmt: skip
 
 
-ROWS = Neighbours(
+ROWS = NeighbourRows(
     np.array([0.05, 0.11, 0.09]), np.array([False, False, True]),
     0.97 * np.exp(1j * np.array([[0.06, 0.17, 0.13], [0.05, 0.15, 0.11]])),
     0.96 * np.exp(1j * np.array([[0.04, 0.13, 0.12], [0.05, 0.12, 0.10]])),
@@ -65,12 +65,14 @@ def lens(*, films: bool = False) -> Lens:
 
 
 @functools.cache
-def bare() -> Bench:
+def bare() -> PreparedDevice:
     """In light of one wavelength, without films."""
-    return bench(lens(), GIVEN, SETTING)
+    return prepare_device(lens(), GIVEN, SETTING)
 
 
 @functools.cache
-def filmed() -> Bench:
+def filmed() -> PreparedDevice:
     """In light of a diode, between films, with rows of unlike pillars."""
-    return bench(lens(films=True), replace(GIVEN, fwhm_nm=24.0, mask=None), SETTING)
+    return prepare_device(
+        lens(films=True), replace(GIVEN, fwhm_nm=24.0, mask=None), SETTING
+    )

@@ -11,9 +11,15 @@ import torch
 
 from codesign.budget import task
 from codesign.budget.prepared import finest_of, same_lens
-from codesign.eye import POPULATION, Camera, Rig, render
-from codesign.optics import Numerics, OpticsConfig, device, gathered, image_difference
-from metalens.ground.errors import LensError
+from codesign.eye import POPULATION, CameraRig, PinholeCamera, render
+from codesign.optics import (
+    OpticsConfig,
+    OpticsNumerics,
+    gather_lens_plane,
+    image_difference,
+    make_device,
+)
+from metalens.core.errors import LensError
 from metalens.image import Frames, Grid
 from metalens.psf import Source
 from tests.codesign.budget import small_bench as small
@@ -29,7 +35,7 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
     assert bench.setting.sensor_distance_um == pytest.approx(
         300.0 - line * 45.0 * (1 - 1 / 1.52)
     )
-    assert bench.finest == Numerics(8, 7 if line else 1, 1e-5, 1e-4)
+    assert bench.finest == OpticsNumerics(8, 7 if line else 1, 1e-5, 1e-4)
     near, far = bench.eyes.depths_um
     assert (bench.window.near_um, bench.window.far_um, bench.window.pitch_um) == (
         near,
@@ -37,10 +43,10 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
         4.1,
     )
     lens, source = bench.lens, Source(850.0, 24.0) if line else None
-    wave = gathered(
+    wave = gather_lens_plane(
         lens, *bench.aperture.maps(bench.aperture.designed()), window_um=7 * 4.1
     )
-    want = device(
+    want = make_device(
         wave, Grid((16, 16), 4.1, (near, far), 3, 7), layers=lens.layers, distance_um=300.0, spectrum=source
     ).whole  # fmt: skip
     assert image_difference(bench.device.whole, want) < 1e-6
@@ -48,16 +54,17 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
         want.energy.numpy(), rel=1e-6
     )
     assert bench.reader.image.numpy() == pytest.approx(
-        task.electrons(bench.eyes.anchor, want, bench.setting).numpy(), rel=1e-5
+        task.expected_electrons(bench.eyes.anchor, want, bench.setting).numpy(),
+        rel=1e-5,
     )
 
 
 def test_finest_settings_end_at_64_depths_and_are_never_coarser_than_a_setting_of_their_own():
-    coarse = finest_of(Numerics(12, 3, 1e-3, 1e-2), fwhm_nm=30.0)
-    fine = finest_of(Numerics(40, 3, 2e-5, 3e-4), fwhm_nm=0.0)
+    coarse = finest_of(OpticsNumerics(12, 3, 1e-3, 1e-2), fwhm_nm=30.0)
+    fine = finest_of(OpticsNumerics(40, 3, 2e-5, 3e-4), fwhm_nm=0.0)
     for got, want in (
-        (coarse, Numerics(24, 9, 1e-5, 1e-4)),
-        (fine, Numerics(64, 1, 2e-6, 3e-5)),
+        (coarse, OpticsNumerics(24, 9, 1e-5, 1e-4)),
+        (fine, OpticsNumerics(64, 1, 2e-6, 3e-5)),
     ):
         assert (got.depth_count, got.wavelength_count) == (
             want.depth_count,
@@ -93,8 +100,10 @@ def test_a_reader_of_another_lens_is_refused_beyond_two_per_cent(off, refused):
 
 def rendered(setting, states, lit):
     """Radiance, coverage and depth of every pixel, from its nine rays, in numpy."""
-    camera = Camera(3 * (setting.pixels + 2 * setting.margin), setting.pitch_um / 3)
-    rig = Rig(sensor_distance_um=setting.sensor_distance_um)
+    camera = PinholeCamera(
+        3 * (setting.pixels + 2 * setting.margin), setting.pitch_um / 3
+    )
+    rig = CameraRig(sensor_distance_um=setting.sensor_distance_um)
     fine = render(states, rig=rig, camera=camera, exposed=lit).frames
     return averaged(
         *(
@@ -116,12 +125,14 @@ def averaged(radiance, coverage, depth):
 
 def test_views_are_of_both_sides_of_every_unknown_at_the_exposure_of_the_still_eye():
     bench = small.bare()
-    states, steps = bench.setting.states, task.steps()
+    states, steps = bench.setting.states, task.view_derivatives()
     assert len(bench.eyes.moved) == len(steps) == len(task.NAMES) - 1
     cases = [(bench.eyes.anchor, states)]
     for unknown in (0, 4, 5, len(steps) - 1):
         for seen, sign in zip(bench.eyes.moved[unknown], (1, -1), strict=True):
-            cases.append((seen, task.shifted(states, unknown, sign * steps[unknown])))
+            cases.append(
+                (seen, task.shift_states(states, unknown, sign * steps[unknown]))
+            )
     for seen, moved in cases:
         want = rendered(bench.setting, moved, states)
         for got, plain in zip(
@@ -138,8 +149,8 @@ def test_other_exposures_and_states_are_those_given():
         slip_um=states.slip_um
         + torch.tensor([0.0, 0.0, -6000.0], dtype=states.slip_um.dtype),
     )
-    moved = task.shifted(states, 0, 0.02)
-    seen = task.views(setting, moved, exposed=darker)
+    moved = task.shift_states(states, 0, 0.02)
+    seen = task.render_views(setting, moved, exposed=darker)
     want = rendered(setting, moved, darker)[0]
     assert seen.anchor.radiance.numpy() == pytest.approx(
         want, rel=1e-5, abs=1e-6 * want.max()
@@ -178,7 +189,7 @@ def test_every_unknown_is_moved_alone_by_its_step():
     assert len(places) == len(task.NAMES) - 1
     for unknown, (field, column) in enumerate(places):
         amount = 0.03 + 0.01 * unknown
-        moved = task.shifted(still, unknown, amount)
+        moved = task.shift_states(still, unknown, amount)
         for name in ("gaze_rad", "slip_um", "scale", "traits"):
             off = getattr(moved, name) - getattr(still, name)
             want = torch.zeros_like(off)
@@ -190,7 +201,7 @@ def test_every_unknown_is_moved_alone_by_its_step():
 
 
 def test_steps_and_priors_are_those_of_the_population():
-    steps, widths = task.steps(), task.priors()
+    steps, widths = task.view_derivatives(), task.unknown_priors()
     assert len(steps) + 1 == len(widths) == len(task.NAMES)
     assert steps[:6] == pytest.approx((3.4906585e-4, 3.4906585e-4, 5, 5, 5, 1e-3))
     assert widths[:6] == (0.18, 0.13, 1200.0, 900.0, 2000.0, 0.12)
@@ -204,9 +215,12 @@ def test_steps_and_priors_are_those_of_the_population():
 def test_what_is_seen_spans_the_depths_that_something_covers():
     depth = torch.tensor([3e3, 7e3, 22e3, 90e3]).reshape(1, 2, 1, 2)
     cover = torch.tensor([0.0, 0.1, 1.0, 0.0]).reshape(1, 2, 1, 2)
-    assert task.Views(Frames(cover, cover, depth), ()).depths_um == (7e3, 22e3)
+    assert task.RenderedViews(Frames(cover, cover, depth), ()).depths_um == (7e3, 22e3)
     near = torch.tensor([3e3, 4e3, 3e3, 5e3]).reshape(1, 2, 1, 2)
-    assert task.Views(Frames(cover, cover + 0.1, near), ()).depths_um == (5e3, 6e3)
+    assert task.RenderedViews(Frames(cover, cover + 0.1, near), ()).depths_um == (
+        5e3,
+        6e3,
+    )
 
 
 def test_a_mean_gaze_error_is_of_angles_over_eyes():

@@ -8,16 +8,22 @@ import pytest
 
 from codesign.budget import links as budget
 from codesign.budget import page as budget_page
-from codesign.budget.entry import MEASURED, TOTAL, Entry, total
-from codesign.budget.prepared import Given, bench
+from codesign.budget.entry import MEASURED, TOTAL, BudgetEntry, quadrature_total
+from codesign.budget.prepared import BudgetInputs, prepare_device
 from codesign.commands import budget as command_budget
-from codesign.optics.numerics import Aperture, Numerics, Window, kernels, psf_difference
+from codesign.optics.numerics import (
+    ImageWindow,
+    OpticsNumerics,
+    TabulatedLens,
+    pixel_kernels,
+    psf_difference,
+)
 from metalens import design
 from metalens.cell.record import Cell, Index
 from metalens.cell.shapes import Rectangle
+from metalens.core.errors import ConfigError, LensError, StoreError
 from metalens.design.profiles import Focus
 from metalens.fabrication import Printed, Spread, of_process
-from metalens.ground.errors import ConfigError, LensError, StoreError
 from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6))
@@ -37,7 +43,7 @@ def lens():
 
 
 def test_the_table_gives_the_phase_of_every_pillar(lens):
-    aperture = Aperture(lens)
+    aperture = TabulatedLens(lens)
     phase, level = aperture.maps(aperture.designed())
     built = lens.diameters.diameter_um > 0
     turn = np.angle(np.exp(1j * (phase.numpy() - lens.phase_rad())))[built]
@@ -49,7 +55,7 @@ def test_the_table_gives_the_phase_of_every_pillar(lens):
 
 
 def test_a_bias_moves_every_pillar_along_its_curve(lens):
-    aperture = Aperture(lens)
+    aperture = TabulatedLens(lens)
     built = lens.diameters.diameter_um > 0
     middle = (
         built & (lens.diameters.diameter_um > 0.09) & (lens.diameters.diameter_um < 0.2)
@@ -62,10 +68,11 @@ def test_a_bias_moves_every_pillar_along_its_curve(lens):
 
 
 def test_the_same_optics_do_not_differ_and_finer_ones_agree(lens):
-    aperture, window = Aperture(lens), Window(15e3, 30e3, 18.0)
+    aperture, window = TabulatedLens(lens), ImageWindow(15e3, 30e3, 18.0)
     maps = aperture.maps(aperture.designed())
     found = [
-        kernels(lens, maps, Numerics(n, 1, 1e-4, 1e-4), window) for n in (4, 8, 16)
+        pixel_kernels(lens, maps, OpticsNumerics(n, 1, 1e-4, 1e-4), window)
+        for n in (4, 8, 16)
     ]
     assert psf_difference(found[2], found[2], window) == 0
     coarse, fine = (psf_difference(f, found[2], window) for f in found[:2])
@@ -75,7 +82,7 @@ def test_the_same_optics_do_not_differ_and_finer_ones_agree(lens):
 
 
 def test_rounding_to_nothing_changes_nothing(lens):
-    aperture = Aperture(lens)
+    aperture = TabulatedLens(lens)
     table = aperture.designed()
     fine, coarse = (
         np.abs(aperture.rounded(table, s) - table).max() for s in (1e-6, 5e-3)
@@ -86,12 +93,12 @@ def test_rounding_to_nothing_changes_nothing(lens):
 
 def test_the_total_is_the_root_of_the_squares_of_what_counts():
     rows = [
-        Entry("a", 3.0, math.nan, 3e-3, ""),
-        Entry("b", math.nan, 1.0, 4e-3, ""),
-        Entry("known", 7.0, 2.0, 9e-3, "", counted=False),
-        Entry("reader", math.nan, math.nan, math.nan, ""),
+        BudgetEntry("a", 3.0, math.nan, 3e-3, ""),
+        BudgetEntry("b", math.nan, 1.0, 4e-3, ""),
+        BudgetEntry("known", 7.0, 2.0, 9e-3, "", counted=False),
+        BudgetEntry("reader", math.nan, math.nan, math.nan, ""),
     ]
-    found = total(rows)
+    found = quadrature_total(rows)
     assert (found.phase_rad, found.psf, found.gaze_rad) == pytest.approx(
         (3.0, 1.0, 5e-3)
     )
@@ -100,20 +107,20 @@ def test_the_total_is_the_root_of_the_squares_of_what_counts():
 
 def test_files_come_back_as_they_were(tmp_path):
     rows = [
-        Entry("mask grid", 0.1, 0.2, 1e-4, "rounded", counted=False),
-        Entry("sensor noise", math.nan, math.nan, 1e-3, "bound"),
+        BudgetEntry("mask grid", 0.1, 0.2, 1e-4, "rounded", counted=False),
+        BudgetEntry("sensor noise", math.nan, math.nan, 1e-3, "bound"),
     ]
-    command_budget.save(
+    command_budget.save_budget(
         tmp_path / "b.h5", rows, command_budget.store.Provenance(config="x = 1\n")
     )
-    assert [str(r) for r in command_budget.load(tmp_path / "b.h5")] == [
+    assert [str(r) for r in command_budget.load_budget(tmp_path / "b.h5")] == [
         str(r) for r in rows
     ]
     with pytest.raises(StoreError):
-        command_budget.load(tmp_path / "absent.h5")
-    assert "mask grid" in command_budget.text(rows)
-    budget_page.write(
-        tmp_path / "b.html", [*rows, Entry("all links", 0.1, 0.2, 1e-3, "sum")]
+        command_budget.load_budget(tmp_path / "absent.h5")
+    assert "mask grid" in command_budget.budget_text(rows)
+    budget_page.write_budget_page(
+        tmp_path / "b.html", [*rows, BudgetEntry("all links", 0.1, 0.2, 1e-3, "sum")]
     )
     assert "sensor noise" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
@@ -144,28 +151,28 @@ def test_spread_and_run_are_read_or_refused(tmp_path):
 
 def test_the_sum_stands_beside_what_was_measured():
     rows = [
-        Entry(MEASURED, math.nan, math.nan, 4e-3, "", counted=False),
-        Entry(TOTAL, 0.0, 0.0, 5e-3, ""),
+        BudgetEntry(MEASURED, math.nan, math.nan, 4e-3, "", counted=False),
+        BudgetEntry(TOTAL, 0.0, 0.0, 5e-3, ""),
     ]
-    assert command_budget.summary(rows) == pytest.approx(
+    assert command_budget.budget_summary(rows) == pytest.approx(
         {
             "gaze_error_deg": math.degrees(5e-3),
             "measured_deg": math.degrees(4e-3),
             "closure": 1.25,
         }
     )
-    assert set(command_budget.summary(rows[1:])) == {"gaze_error_deg"}
+    assert set(command_budget.budget_summary(rows[1:])) == {"gaze_error_deg"}
 
 
 def test_a_budget_of_few_depths_is_refused():
     with pytest.raises(LensError, match="depths"):
-        Numerics(depth_count=1)
+        OpticsNumerics(depth_count=1)
 
 
 @pytest.mark.slow
 def test_the_whole_budget_of_a_small_lens(lens):
-    given = Given(Numerics(12, 1, 1e-3, 1e-2), mask=Printed(), draws=2)
-    rows = list(budget.entries(bench(lens, given)))
+    given = BudgetInputs(OpticsNumerics(12, 1, 1e-3, 1e-2), mask=Printed(), draws=2)
+    rows = list(budget.budget_entries(prepare_device(lens, given)))
     found = {r.link: r for r in rows}
     assert set(found) == {
         "subject and calibration", "fixation", "reader", "sensor noise", "field", "radiometry", "spectrum", "glass",

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from codesign.adapt import train as retraining
-from codesign.budget import links, total
+from codesign.budget import links, quadrature_total
 from codesign.budget.entry import MEASURED
-from codesign.budget.prepared import Given, bench
-from codesign.budget.reading import Reading
+from codesign.budget.prepared import BudgetInputs, prepare_device
+from codesign.budget.reading import NetworkReading
 from codesign.budget.task import TaskSetting
-from codesign.evaluate import AXIAL, ExperimentConfig, experiment
-from codesign.optics import Numerics, formed, image_difference
-from metalens.ground.errors import LensError
+from codesign.evaluate import AXIAL, ExperimentConfig, run_experiment
+from codesign.optics import OpticsNumerics, formed, image_difference
+from metalens.core.errors import LensError
 from tests.codesign import made_lens as m
 
 FRAMES = ExperimentConfig(
@@ -37,15 +37,17 @@ def source(tmp_path_factory):
     m.finished_run(
         folder, m.TINY.replace("batch = 8", "batch = 48")
     )  # a subject's frames are read at once
-    return retraining.load(folder)
+    return retraining.load_finished_run(folder)
 
 
 @pytest.fixture(scope="module")
 def before(source):
     """The run's own lens as a bench, read by its network."""
     setting = TaskSetting(scenes=1, pixels=8, margin=2, pitch_um=3.0)
-    return bench(
-        m.small(), Given(Numerics(2, 1, 1e-2, 1e-1), run=source, frames=FRAMES), setting
+    return prepare_device(
+        m.small(),
+        BudgetInputs(OpticsNumerics(2, 1, 1e-2, 1e-1), run=source, frames=FRAMES),
+        setting,
     )
 
 
@@ -64,21 +66,21 @@ def test_the_links_add_up_to_what_the_experiment_measures(source, before, readin
         "subject and calibration", "fixation", "reader, pupil", "reader, slippage", "sensor noise", "field",
         "radiometry", "spectrum",
     ]  # fmt: skip
-    *_, (_, (found,)) = experiment([source], FRAMES)
+    *_, (_, (found,)) = run_experiment([source], FRAMES)
     assert reading.measured_deg[AXIAL] == pytest.approx(found.gaze(AXIAL), rel=1e-6)
-    together = math.degrees(total(rows).gaze_rad)
+    together = math.degrees(quadrature_total(rows).gaze_rad)
     assert 1 / 1.5 < together / found.gaze(AXIAL) < 1.5
     change = reading.changed("nothing", reading.true.whole, reading.true.whole, "")
     assert change.gaze_rad < 1e-7
     assert change.psf == 0
-    (seen,) = links.measured(before)
+    (seen,) = links.measured_entry(before)
     assert (seen.link, seen.counted, seen.gaze_rad) == (
         MEASURED,
         False,
         pytest.approx(math.radians(found.gaze(AXIAL))),
     )
     assert f"{FRAMES.frames} frames" in seen.method
-    rows = {row.link: row for row in links.device(before)}
+    rows = {row.link: row for row in links.pillar_device_entry(before)}
     smooth = before.device.image(wave=reading.true.wave, layers=reading.true.layers)
     assert rows["pillars on a lattice"].psf == pytest.approx(
         image_difference(before.device.whole, smooth), rel=1e-6
@@ -94,7 +96,9 @@ def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
     optics = source.run.trainer.optics
     source.run.trainer.optics = replace(optics, image="true")
     try:
-        rows = {row.link: row for row in Reading(source, FRAMES, fwhm_nm=0.0).path()}
+        rows = {
+            row.link: row for row in NetworkReading(source, FRAMES, fwhm_nm=0.0).path()
+        }
     finally:
         source.run.trainer.optics = optics
     assert not rows["field"].counted
@@ -110,7 +114,7 @@ def test_the_reader_of_another_lens_is_refused(source):
     kept, source.run.settings = source.run.settings, run
     try:
         with pytest.raises(LensError, match=r"0\.4 mm.*lens file"):
-            bench(m.small(), Given(run=source, frames=FRAMES))
+            prepare_device(m.small(), BudgetInputs(run=source, frames=FRAMES))
     finally:
         source.run.settings = kept
 

@@ -12,11 +12,17 @@ import torch
 
 from characterize.model import NAMES
 from codesign.budget import links, task
-from codesign.budget.links import Made
-from codesign.optics import Aperture, Window, image_difference, kernels, psf_difference
-from metalens.cell import Light
+from codesign.budget.links import FabricatedDevice
+from codesign.optics import (
+    ImageWindow,
+    TabulatedLens,
+    image_difference,
+    pixel_kernels,
+    psf_difference,
+)
+from metalens.cell import Incidence
+from metalens.core.errors import LensError
 from metalens.fabrication import Printed, Spread, State, draws, sensitivity
-from metalens.ground.errors import LensError
 from metalens.pillars import PillarLibrary, Sweep, engines
 from tests.codesign import made_lens
 from tests.codesign.budget import small_bench as small
@@ -55,9 +61,9 @@ def errors(bench, optics):
     """(psf, gaze) errors of an image against that of the bench, by its stack and by the
     pull of its estimator.
     """
-    change = task.electrons(bench.eyes.anchor, optics, bench.setting) - task.electrons(
-        bench.eyes.anchor, bench.device.whole, bench.setting
-    )
+    change = task.expected_electrons(
+        bench.eyes.anchor, optics, bench.setting
+    ) - task.expected_electrons(bench.eyes.anchor, bench.device.whole, bench.setting)
     shift = np.einsum("skp,sp->sk", bench.reader.pull.numpy(), change.numpy())
     return image_difference(optics, bench.device.whole), np.hypot(
         shift[:, 0], shift[:, 1]
@@ -72,7 +78,7 @@ def test_a_rounded_mask_turns_every_pillar_by_its_own_rounding():
     takes them the other way.
     """
     bench = small.bare()
-    (got,) = links.mask(bench)
+    (got,) = links.mask_entry(bench)
     d, table = bench.lens.diameters.diameter_um, bench.aperture
     rounded = np.where(
         d > 0, np.rint(table.diameter_um[table.place] / 4e-3) * 4e-3, 0.0
@@ -82,14 +88,14 @@ def test_a_rounded_mask_turns_every_pillar_by_its_own_rounding():
     other = replace(
         bench.lens, diameters=replace(bench.lens.diameters, diameter_um=rounded)
     )
-    aperture = Aperture(other)
+    aperture = TabulatedLens(other)
     psf, gaze = of_wave(
         bench, bench.gathered(*aperture.maps(aperture.designed()), lens=other)
     )
     assert got.psf == pytest.approx(psf, rel=0.05)  # both tables round by 1 mrad of 64
     assert got.gaze_rad == pytest.approx(gaze, rel=0.05)
     assert "4 nm" in got.method
-    assert not list(links.mask(given(bench, mask=None)))
+    assert not list(links.mask_entry(given(bench, mask=None)))
 
 
 @functools.cache
@@ -98,8 +104,8 @@ def solved():
     waves: the budget asks the modal
     solver."""
     lens, d = small.lens(), pillars_um(small.bare())
-    solve = engines.precise(
-        lens.cell, Light(lens.wavelength_um), tolerance=4e-3, engine="rcwa"
+    solve = engines.solve_to_tolerance(
+        lens.cell, Incidence(lens.wavelength_um), tolerance=4e-3, engine="rcwa"
     )
     at = np.linspace(d.min(), d.max(), 12)
     return at, np.array([solve(float(one)).t for one in at])
@@ -125,7 +131,7 @@ def test_a_library_errs_by_what_is_wrong_with_it_and_the_proxy_by_what_it_leaves
     for a factor: the scatter of the factor, its amplitude in the image alone."""
     bench = small.bare()
     d, (at, t) = pillars_um(bench), solved()
-    solver, _ = links.pillars(
+    solver, _ = links.solver_entries(
         given(bench, library=library_of(t * np.exp(1j * (0.1 + 9 * at))))
     )
     assert solver.link == "pillar solver"
@@ -137,7 +143,7 @@ def test_a_library_errs_by_what_is_wrong_with_it_and_the_proxy_by_what_it_leaves
         1j * small.PROXY.phase_rad(at, 0.85)
     )
     factor = (1.2 - at) * np.exp(1j * (4.0 - 7 * at))
-    _, proxy = links.pillars(given(bench, library=library_of(proxy_t * factor)))
+    _, proxy = links.solver_entries(given(bench, library=library_of(proxy_t * factor)))
     assert proxy.phase_rad == pytest.approx(np.std(7 * d), abs=ROUNDING_RAD)
     aperture = bench.aperture
     turned = (
@@ -157,7 +163,7 @@ def test_without_a_library_solver_and_proxy_err_together():
     pillar by its own diameter.
     """
     bench, (at, t) = given(small.bare(), tolerance=3e-3), solved()
-    (got,) = links.pillars(bench)
+    (got,) = links.solver_entries(bench)
     assert got.link == "pillar solver and proxy"
     assert "1e-04, 12 diameters" in got.method
     d = pillars_um(bench)
@@ -179,12 +185,12 @@ def sines(bench):
 
 def test_rows_of_unlike_pillars_turn_the_pillars_by_the_sine_there():
     bench = small.bare()
-    got = links.among(bench, small.ROWS, "rows")
+    got = links.other_rows_entry(bench, small.ROWS, "rows")
     turn = np.angle(small.ROWS.mean(sines(bench)))
     assert got.phase_rad == pytest.approx(np.std(turn), rel=1e-6)
     assert got.phase_rad > 0.02
     holding = replace(bench.lens, neighbours=small.ROWS)
-    aperture = Aperture(holding)
+    aperture = TabulatedLens(holding)
     psf, gaze = of_wave(
         bench, bench.gathered(*aperture.maps(aperture.designed()), lens=holding)
     )
@@ -194,7 +200,7 @@ def test_rows_of_unlike_pillars_turn_the_pillars_by_the_sine_there():
     )
     # 0.85 um turned by 0.05 and 0.11 over pillars 0.3 um apart: 56.7 and 25.8 of them;
     # the diagonal is not told
-    assert links.lengths(small.ROWS, 0.3) == [57, 26]
+    assert links.row_lengths(small.ROWS, 0.3) == [57, 26]
 
 
 def test_what_is_open_of_rows_that_the_lens_holds_adds_in_quadrature():
@@ -202,7 +208,7 @@ def test_what_is_open_of_rows_that_the_lens_holds_adds_in_quadrature():
     against the rows held.
     """
     bench = small.filmed()
-    (got,) = links.neighbours(bench)
+    (got,) = links.neighbour_coupling_entry(bench)
     s, rows = sines(bench), small.ROWS
     others = rows.doubted(s)
     apart = [
@@ -211,7 +217,7 @@ def test_what_is_open_of_rows_that_the_lens_holds_adds_in_quadrature():
     assert got.phase_rad == pytest.approx(
         math.sqrt(sum(v * v for v in apart)), rel=1e-5
     )
-    alone = [links.among(bench, other, "") for other in others]
+    alone = [links.other_rows_entry(bench, other, "") for other in others]
     assert min(one.psf for one in alone) > 0
     assert got.psf == pytest.approx(math.hypot(*(one.psf for one in alone)), rel=1e-6)
     assert got.gaze_rad == pytest.approx(
@@ -225,7 +231,7 @@ def test_rows_of_tilted_walls_are_not_solved():
     tilted = replace(
         bench, lens=replace(bench.lens, cell=replace(small.CELL, sidewall_rad=0.05))
     )
-    assert not list(links.neighbours(tilted))
+    assert not list(links.neighbour_coupling_entry(tilted))
 
 
 WIDER = {"bias_nm": 1.7, "bias_x_nm": 0.9, "bias_y_nm": -1.4, "bias_r_nm": 1.1}
@@ -239,13 +245,15 @@ def test_a_made_lens_turns_its_pillars_by_their_bias_and_its_wave_front_by_its_b
     bench, made = small.bare(), State.of(causes)
     u, v = places(bench)
     turn = small.SLOPE * made.bias_um(u, v) + made.phase_rad(u, v)
-    got = links.drawn(bench, "made", [Made(made)], "so")
+    got = links.rms_over_lenses(bench, "made", [FabricatedDevice(made)], "so")
     assert got.phase_rad == pytest.approx(np.std(turn), abs=ROUNDING_RAD / 2)
     assert got.phase_rad > 10 * ROUNDING_RAD
     d = bench.lens.diameters
     u, v = np.meshgrid(d.x_um / d.radius_um, d.y_um / d.radius_um)
     wider = np.where(d.diameter_um > 0, d.diameter_um + made.bias_um(u, v), 0.0)
-    aperture = Aperture(replace(bench.lens, diameters=replace(d, diameter_um=wider)))
+    aperture = TabulatedLens(
+        replace(bench.lens, diameters=replace(d, diameter_um=wider))
+    )
     phase, level = aperture.maps(aperture.designed())
     wave = bench.gathered(
         phase + torch.from_numpy(made.phase_rad(u, v).astype(np.float32)), level
@@ -259,17 +267,17 @@ def test_a_made_lens_turns_its_pillars_by_their_bias_and_its_wave_front_by_its_b
 
 def test_a_sensor_that_is_off_is_told_by_the_device_and_lenses_count_by_their_root_mean_square():
     bench = small.bare()
-    moved = Made(State.of(), -7.0)
-    far = links.drawn(bench, "made", [moved], "so")
+    moved = FabricatedDevice(State.of(), -7.0)
+    far = links.rms_over_lenses(bench, "made", [moved], "so")
     assert far.phase_rad == pytest.approx(0, abs=1e-6)
     psf, gaze = errors(bench, bench.device.image(shift_um=-7.0))
     assert (far.psf, far.gaze_rad) == (
         pytest.approx(psf, rel=1e-4),
         pytest.approx(gaze, rel=1e-3),
     )
-    wide = Made(State.of(WIDER))
-    near = links.drawn(bench, "made", [wide], "so")
-    both = links.drawn(bench, "made", [moved, wide], "so")
+    wide = FabricatedDevice(State.of(WIDER))
+    near = links.rms_over_lenses(bench, "made", [wide], "so")
+    both = links.rms_over_lenses(bench, "made", [moved, wide], "so")
     for name in ("phase_rad", "psf", "gaze_rad"):
         one, other = getattr(far, name), getattr(near, name)
         assert getattr(both, name) == pytest.approx(
@@ -282,7 +290,7 @@ def test_a_process_is_drawn_as_often_as_asked_and_doubles_with_its_spread():
     nothing is drawn.
     """
     bench = small.bare()
-    (got,) = links.process(bench)
+    (got,) = links.process_entries(bench)
     u, v = places(bench)
     biases = [
         draw.state().bias_um(u, v) for draw in draws(bench.given.mask.spread, 3, seed=5)
@@ -293,13 +301,13 @@ def test_a_process_is_drawn_as_often_as_asked_and_doubles_with_its_spread():
     twice = Spread.only(
         **{name: 2 * value for name, value in bench.given.mask.spread.values().items()}
     )
-    (more,) = links.process(given(bench, mask=Printed(spread=twice)))
+    (more,) = links.process_entries(given(bench, mask=Printed(spread=twice)))
     assert more.phase_rad == pytest.approx(2 * got.phase_rad, rel=0.03)
     assert more.gaze_rad == pytest.approx(
         2 * got.gaze_rad, rel=0.1
     )  # to first order in 0.03 rad
     assert got.method.startswith("3 draws")
-    assert not list(links.process(given(bench, mask=None)))
+    assert not list(links.process_entries(given(bench, mask=None)))
 
 
 def fit_of(lens, sigma):
@@ -317,11 +325,11 @@ def fit_of(lens, sigma):
 
 def test_a_fit_leaves_open_what_its_draws_scatter_about_the_best_estimate():
     bench = small.bare()
-    (none,) = links.calibration(given(bench, asbuilt=fit_of(bench.lens, {})))
+    (none,) = links.calibration_entry(given(bench, asbuilt=fit_of(bench.lens, {})))
     assert (none.phase_rad, none.psf) == pytest.approx((0, 0), abs=1e-6)
     one, two = (
         next(
-            links.calibration(
+            links.calibration_entry(
                 given(bench, asbuilt=fit_of(bench.lens, {"bias_x_nm": s}), draws=2)
             )
         )
@@ -343,7 +351,7 @@ def test_a_fit_leaves_open_what_its_draws_scatter_about_the_best_estimate():
     )
     assert two.gaze_rad == pytest.approx(2 * one.gaze_rad, rel=0.1)
     assert one.method.startswith("2 draws")
-    (shifted,) = links.calibration(
+    (shifted,) = links.calibration_entry(
         given(bench, asbuilt=fit_of(bench.lens, {"distance_um": 2.5}), draws=1)
     )
     place = list(NAMES).index("distance_um")
@@ -356,7 +364,7 @@ def test_a_fit_leaves_open_what_its_draws_scatter_about_the_best_estimate():
         ),
     )
     assert shifted.psf == pytest.approx(psf, rel=1e-3)
-    assert not list(links.calibration(bench))
+    assert not list(links.calibration_entry(bench))
 
 
 @pytest.mark.parametrize(
@@ -371,7 +379,7 @@ def test_a_fit_of_another_lens_is_refused(off_um, size, refused):
     other[80, 71] += off_um
     its = replace(d, diameter_um=other)
     fitted = replace(fit_of(bench.lens, {}), design=replace(bench.lens, diameters=its))
-    told = links.calibration(given(bench, asbuilt=fitted, draws=1))
+    told = links.calibration_entry(given(bench, asbuilt=fitted, draws=1))
     if refused:
         with pytest.raises(LensError, match="another lens"):
             list(told)
@@ -393,24 +401,28 @@ def test_numerics_err_each_by_its_own_setting(make):
         depth_count=4,
         wavelength_count=min(bench.finest.wavelength_count, 2),
     )
-    window = Window(
+    window = ImageWindow(
         bench.window.near_um, bench.window.far_um, bench.window.pitch_um, NARROW
     )
     bench = replace(given(bench, numerics=setting), finest=setting, window=window)
     names = ["propagation", "depth sampling", "wavelength sampling", "image kernels"]
     if not bench.given.fwhm_nm:
         names.remove("wavelength sampling")
-    rows = list(links.numerics(bench))
+    rows = list(links.numerics_entries(bench))
     assert [row.link for row in rows] == names
     assert all((row.psf, row.gaze_rad) == (0, 0) for row in rows)
     coarser = [{"psf_tolerance": 3e-2}, {"depth_count": 2}, {"basis_tolerance": 0.2}]
     if bench.given.fwhm_nm:
         coarser.insert(2, {"wavelength_count": 1})
     maps = bench.aperture.maps(bench.aperture.designed())
-    finest = kernels(bench.lens, maps, setting, window, fwhm_nm=bench.given.fwhm_nm)
+    finest = pixel_kernels(
+        bench.lens, maps, setting, window, fwhm_nm=bench.given.fwhm_nm
+    )
     for name, change in zip(names, coarser, strict=True):
-        rows = list(links.numerics(given(bench, numerics=replace(setting, **change))))
-        other = kernels(
+        rows = list(
+            links.numerics_entries(given(bench, numerics=replace(setting, **change)))
+        )
+        other = pixel_kernels(
             bench.lens,
             maps,
             replace(setting, **change),
@@ -418,7 +430,8 @@ def test_numerics_err_each_by_its_own_setting(make):
             fwhm_nm=bench.given.fwhm_nm,
         )
         images = [
-            task.electrons(bench.eyes.anchor, o, bench.setting) for o in (other, finest)
+            task.expected_electrons(bench.eyes.anchor, o, bench.setting)
+            for o in (other, finest)
         ]
         gaze = task.gaze_mean(
             bench.reader.shift(images[0]) - bench.reader.shift(images[1])
@@ -440,7 +453,7 @@ def test_without_a_run_the_answer_errs_by_noise_and_what_the_estimator_knows_is_
     sqrt(pi / 2).
     """
     bench = make()
-    rows = {row.link: row for row in links.answer(bench)}
+    rows = {row.link: row for row in links.oracle_answer_entry(bench)}
     sigma = np.sqrt(
         [np.trace(c) / 2 for c in bench.reader.covariance[:, :2, :2].numpy()]
     )
@@ -471,7 +484,7 @@ def test_without_a_run_the_answer_errs_by_noise_and_what_the_estimator_knows_is_
 
 def test_films_are_taken_away_on_both_faces_and_a_lens_without_them_errs_by_none():
     bench = small.filmed()
-    rows = {row.link: row for row in links.device(bench)}
+    rows = {row.link: row for row in links.pillar_device_entry(bench)}
     layers = replace(bench.lens.layers, front=(), behind=())
     assert rows["glass"].psf == pytest.approx(
         errors(bench, bench.device.image(layers=layers))[0], rel=1e-6
@@ -486,9 +499,9 @@ def test_films_are_taken_away_on_both_faces_and_a_lens_without_them_errs_by_none
         "glass",
         "polarisation",
     }  # no run: nothing smooth to compare with
-    bare = {row.link: row for row in links.device(small.bare())}["glass"]
+    bare = {row.link: row for row in links.pillar_device_entry(small.bare())}["glass"]
     assert (bare.psf, bare.gaze_rad) == (0.0, 0.0)
 
 
 def test_nothing_is_measured_without_a_run():
-    assert not list(links.measured(small.bare()))
+    assert not list(links.measured_entry(small.bare()))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from codesign.budget.response import between, put_right, scatter_rad
+from codesign.budget.response import interpolate_response, put_right, scatter_rad
 
 
 def test_the_phase_of_a_link_is_its_scatter_about_the_mean_over_the_pillars():
@@ -34,7 +34,7 @@ def test_between_the_diameters_level_and_unwound_phase_are_straight():
         np.array([0.9, 0.7, 0.8]),
         np.array([2.0, 3.6, 5.9]),
     )
-    got = between(level * np.exp(1j * phase), d, np.array([[0.11, 0.18]]))
+    got = interpolate_response(level * np.exp(1j * phase), d, np.array([[0.11, 0.18]]))
     want = [
         [0.85 * np.exp(2.4j), (0.7 + 0.1 * 2 / 3) * np.exp(1j * (3.6 + 2.3 * 2 / 3))]
     ]

@@ -27,12 +27,12 @@ def _optics(sigma_px):
 
 @pytest.fixture(scope="module")
 def eyes():
-    return task.views(SETTING)
+    return task.render_views(SETTING)
 
 
 @pytest.fixture(scope="module")
 def reader(eyes):
-    return task.linear(eyes, _optics(0.8), SETTING)
+    return task.linear_estimator(eyes, _optics(0.8), SETTING)
 
 
 def test_the_same_image_is_no_error(eyes, reader):
@@ -48,10 +48,10 @@ def test_a_moved_eye_is_read_as_moved(eyes, reader, unknown, amount):
     other unknowns hold back.
     """
     states = SETTING.states
-    moved = task.views(
-        SETTING, task.shifted(states, unknown, amount), exposed=states
+    moved = task.render_views(
+        SETTING, task.shift_states(states, unknown, amount), exposed=states
     ).anchor
-    image = task.electrons(moved, _optics(0.8), SETTING)
+    image = task.expected_electrons(moved, _optics(0.8), SETTING)
     if (
         unknown < 2
     ):  # slip along the axis is confounded with size and anatomy, the gaze is not
@@ -77,7 +77,7 @@ def test_brighter_light_is_not_read_as_gaze(reader):
 def test_other_optics_shift_the_answer_in_proportion(eyes, reader):
     """First order: twice the change of blur, twice the error."""
     small, large = (
-        reader.shift(task.electrons(eyes.anchor, _optics(s), SETTING))
+        reader.shift(task.expected_electrons(eyes.anchor, _optics(s), SETTING))
         for s in (0.8 * 1.005, 0.8 * 1.01)
     )
     assert task.gaze_rms(large) == pytest.approx(2 * task.gaze_rms(small), rel=0.1)

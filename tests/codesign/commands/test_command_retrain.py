@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from characterize.bench import Truth
+from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
 from codesign.adapt import retrained
 from codesign.evaluate import gaze_experiment as experiment
@@ -20,7 +20,7 @@ from codesign.optics import MadeLens, formed
 from layout.process import process
 from metalens import lens
 from metalens.cli import main
-from metalens.ground import config
+from metalens.core import config
 from tests.codesign import made_lens as m
 from tests.command_line import run
 
@@ -105,7 +105,9 @@ def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch
         monkeypatch.context() as patched
     ):  # images that miss what the run asks for, of every lens that judges
         patched.setattr(
-            formed, "above", lambda settings, image: "the image's error is too large"
+            formed,
+            "image_tolerance_problem",
+            lambda settings, image: "the image's error is too large",
         )
         assert (
             _retrain(folder, *truth, "--resume") == 1
@@ -246,10 +248,13 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
         "out: through the lens as made"
         in (folder / "shown" / "report.html").read_text()
     )
-    made, plain = retrained.load(folder / "out"), retrained.load(folder / "run")
+    made, plain = (
+        retrained.load_retrained(folder / "out"),
+        retrained.load_retrained(folder / "run"),
+    )
     design = lens.load_plain(folder / "run" / "lens.h5")
     response = asbuilt.load(folder / "asbuilt.h5").response
-    true = config.load(folder / "truth.toml", Truth)
+    true = config.load(folder / "truth.toml", HiddenLens)
     wanted = MadeLens(design, made.settings.optics, response=response).stack(
         true.vector()
     )
@@ -267,7 +272,7 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
         torch.equal(weights, kept[f"/trainer/net/{name}"])
         for name, weights in moved.items()
     )
-    through = [experiment.ready(source, image="true") for source in (plain, made)]
+    through = [experiment.prepare_run(source, image="true") for source in (plain, made)]
     assert not torch.equal(through[0].stack, through[1].stack)
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from metalens import cli
-from metalens.ground import store
+from metalens.core import store
 
 TOML = "frames = 6\npixels = 64\npitch_um = 22.5\nseed = 4\nscale = 0.1\n"
 

@@ -40,7 +40,7 @@ def test_a_fine_tuned_network_is_read_back_as_it_was_exported(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     text = SHORT.replace("[run]", "[run]\nfinetune_steps = 6")
     out = _run(tmp_path / "tuned", text, "--export")
-    source = retraining.load(out)
+    source = retraining.load_finished_run(out)
     session = onnxruntime.InferenceSession(out / "subnet_2.onnx")
     generator = torch.Generator().manual_seed(3)
     size = session.get_inputs()[0].shape[-1]
@@ -61,7 +61,7 @@ def test_a_fine_tuned_network_is_read_back_as_it_was_exported(tmp_path):
     assert row["budget_mmacs"] == 2.0
     from codesign.train import run as runs
 
-    raw = runs.resume(out / "checkpoint.safetensors", source.settings)
+    raw = runs.resume_run(out / "checkpoint.safetensors", source.settings)
     before = raw.trainer.model.net.state_dict()["calibration.slip.weight"]
     after = net.state_dict()["calibration.slip.weight"]
     assert float((before - after).abs().max()) > 1e-5

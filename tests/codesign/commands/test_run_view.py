@@ -7,8 +7,8 @@ import pytest
 
 from codesign.commands import view
 from metalens import cli
-from metalens.ground import store
-from metalens.ground.errors import StoreError
+from metalens.core import store
+from metalens.core.errors import StoreError
 
 
 def line(step, loss):
@@ -28,7 +28,7 @@ def test_a_run_that_goes_on_shows_what_its_log_holds_so_far(tmp_path):
     (tmp_path / "log.jsonl").write_text(
         "\n".join([line(1, 0.7), line(3, 0.5), birth, line(4, 0.3), '{"kind": "st'])
     )
-    panels = view.panels(tmp_path)
+    panels = view.run_panels(tmp_path)
     # the seed stands still
     assert [panel.title for panel in panels] == [
         "Training: loss",
@@ -48,14 +48,14 @@ def test_networks_are_a_row_each(tmp_path):
         {"budget_mmacs": None, "axial_mm": 0.48},
     ]
     (tmp_path / "result.json").write_text(json.dumps({"rows": rows}))
-    (table,) = view.panels(tmp_path)
+    (table,) = view.run_panels(tmp_path)
     assert table.head == ["axial / mm", "budget / million MACs"]
     assert table.rows == [[0.61, 3.5], [0.48, None]]
     (tmp_path / "result.json").write_text("[1]")
     with pytest.raises(
         StoreError, match=r"result.json: need a table of names and values, found list"
     ):
-        view.panels(tmp_path)
+        view.run_panels(tmp_path)
 
 
 def birth(mmacs, error, kernel, budget=3.0):
@@ -91,14 +91,14 @@ def test_networks_of_the_searches_are_points_to_pick_with_the_pareto_set_among_t
         (1.1, float("nan"), 3),
     ]
     (tmp_path / "log.jsonl").write_text("\n".join(birth(*one) for one in born))
-    (points,) = view.panels(tmp_path)
+    (points,) = view.run_panels(tmp_path)
     assert points.x == [2.5, 1.5, 2.8, 1.2, 2.0]
     assert points.front == [3, 1, 2]
     assert points.notes[1]["stage 1"] == "3×3 × 3"  # one block of two slots is used
     assert points.notes[1]["stage 2"] == "5×5 × 6, 7×7 × 3"
     old = json.dumps({"kind": "birth", "budget_mmacs": 3.0, "error": 0.7, "mmacs": 2.0})
     (tmp_path / "log.jsonl").write_text(old)  # of a run that did not say what was born
-    assert view.panels(tmp_path)[0].notes == [{}]
+    assert view.run_panels(tmp_path)[0].notes == [{}]
 
 
 def test_the_cost_of_budgets_that_take_turns_is_a_curve_each(tmp_path):
@@ -109,7 +109,7 @@ def test_the_cost_of_budgets_that_take_turns_is_a_curve_each(tmp_path):
     ]
     born = [birth(1.9, 0.8, 5, budget=2.0), birth(3.0, 0.6, 5, budget=3.5)]
     (tmp_path / "log.jsonl").write_text("\n".join([*lines, *born]))
-    curves = view.panels(tmp_path)[0].lines
+    curves = view.run_panels(tmp_path)[0].lines
     np.testing.assert_array_equal(curves["budget 2"], [1.9, 1.9, 1.8, 1.8, 1.7])
     np.testing.assert_array_equal(curves["budget 3.5"], [np.nan, 3.1, 3.1, 3.3, 3.3])
 
@@ -130,7 +130,7 @@ def test_answers_stand_beside_the_truth(tmp_path):
         arrays,
         attributes={"network_0": "budget 3 million MACs"},
     )
-    frames, pupil, table = view.answers(tmp_path / "a.h5")
+    frames, pupil, table = view.prediction_panels(tmp_path / "a.h5")
     assert frames.values.shape == (2, 6, 6)
     assert np.array_equal(
         pupil.values[0, 1, 0], arrays["pupil"][1]
@@ -149,4 +149,4 @@ def test_the_bound_is_drawn_over_depth(tmp_path):
         "bound": {"depth_mm": [14.0, 18.0, 27.0], "window_depth_mm": [0.1, 0.7, 0.3]},
     }
     (tmp_path / "result.json").write_text(json.dumps(held))
-    assert view.panels(tmp_path)[-1].lines.popitem()[1].tolist() == [0.1, 0.7, 0.3]
+    assert view.run_panels(tmp_path)[-1].lines.popitem()[1].tolist() == [0.1, 0.7, 0.3]

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from codesign.budget.entry import Entry
+from codesign.budget.entry import BudgetEntry
 from codesign.commands import budget, view
-from metalens.ground import store
+from metalens.core import store
 
 FRAMES, SIZE = 3, 6
 
@@ -27,7 +27,7 @@ def test_eyes_are_shown_with_the_light_and_depth_of_the_sheet_in_front(tmp_path)
         "labels/slip_um": slip,
     }
     store.save(tmp_path / "scene.h5", "scene", arrays, provenance=store.Provenance())
-    eyes, far, pupil, table = view.scene(tmp_path / "scene.h5")
+    eyes, far, pupil, table = view.scene_panels(tmp_path / "scene.h5")
     assert np.allclose(
         eyes.values, (radiance[:, 0].astype(float) + radiance[:, 1]) / 255, rtol=1e-12
     )
@@ -44,11 +44,11 @@ def test_eyes_are_shown_with_the_light_and_depth_of_the_sheet_in_front(tmp_path)
 def test_a_budget_is_a_row_a_link_in_degrees(tmp_path):
     nan = math.nan
     rows = [
-        Entry("fixation", nan, nan, 0.0123, "scatter"),
-        Entry("field", 0.2, 1.5, nan, "off", counted=False),
+        BudgetEntry("fixation", nan, nan, 0.0123, "scatter"),
+        BudgetEntry("field", 0.2, 1.5, nan, "off", counted=False),
     ]
-    budget.save(tmp_path / "budget.h5", rows, store.Provenance())
-    (table,) = view.budget(tmp_path / "budget.h5")
+    budget.save_budget(tmp_path / "budget.h5", rows, store.Provenance())
+    (table,) = view.budget_panels(tmp_path / "budget.h5")
     assert table.rows[0] == (
         "fixation",
         "–",

@@ -9,7 +9,7 @@ from codesign.commands.codesign import trained_lens
 from codesign.optics.stack import OpticsConfig
 from metalens import lens
 from metalens.cli import main
-from metalens.ground.store import Provenance
+from metalens.core.store import Provenance
 
 OPTICS = OpticsConfig(
     aperture_mm=0.02,

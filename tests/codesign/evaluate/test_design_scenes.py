@@ -5,17 +5,17 @@ gradient is right.
 import pytest
 import torch
 
-from codesign.evaluate.optics import Scenes
+from codesign.evaluate.optics import SensitivityScenes
 from codesign.evaluate.scenes import SceneObjective
+from metalens.core.errors import ConfigError
 from metalens.design import Focus
-from metalens.design.free_form.search import optimise
-from metalens.design.free_form.settings import Fisher
-from metalens.ground.errors import ConfigError
+from metalens.design.free_form.search import optimize_free_form
+from metalens.design.free_form.settings import FisherSettings
 from metalens.image import scene
 from metalens.image.pupil import Pupil
 
 PUPIL = Pupil(nodes=96)
-SETTINGS = Fisher(
+SETTINGS = FisherSettings(
     objective="scenes",
     scenes=1,
     grids=(4,),
@@ -24,7 +24,7 @@ SETTINGS = Fisher(
     zones=(0,),
     encircled=0.0,
 ).about(Focus(0.85, 2000.0, 20e3), PUPIL.radius_um)
-SMALL = Scenes(count=1, pitch_um=22.0, pixels=48, window_um=154.0)
+SMALL = SensitivityScenes(count=1, pitch_um=22.0, pixels=48, window_um=154.0)
 
 
 @pytest.fixture(scope="module")
@@ -67,5 +67,8 @@ def test_a_sharp_lens_loses_less_than_a_blurred_one(objective):
 
 def test_a_scene_design_needs_its_scenes(objective):
     with pytest.raises(ConfigError, match="scenes"):
-        optimise(PUPIL, SETTINGS)
-    assert optimise(PUPIL, SETTINGS, objective=objective).controls.shape == (4, 4)
+        optimize_free_form(PUPIL, SETTINGS)
+    assert optimize_free_form(PUPIL, SETTINGS, objective=objective).controls.shape == (
+        4,
+        4,
+    )

@@ -18,7 +18,7 @@ CONFIG = ExperimentConfig(subjects=1, people=2, grid=(4, 3), share=0.3, snr_db=1
 def source(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dim") / "run"
     m.finished_run(folder)
-    return retraining.load(folder)
+    return retraining.load_finished_run(folder)
 
 
 def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):
@@ -30,7 +30,7 @@ def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):
         source,
         run=replace(source.run, settings=replace(source.settings, optics=narrow)),
     )
-    here, there, half = experiment.lighting([source, source, other], CONFIG)
+    here, there, half = experiment.experiment_sensors([source, source, other], CONFIG)
     assert here == there
     scenes = source.run.scenes(experiment.EXPERIMENT)
     states, _ = experiment.states_of(CONFIG, 0, scenes)
@@ -46,7 +46,9 @@ def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):
 
 def test_good_light_is_each_run_s_own(source):
     bright = replace(CONFIG, snr_db=None)
-    assert experiment.lighting([source], bright) == [source.run.trainer.sensor]
+    assert experiment.experiment_sensors([source], bright) == [
+        source.run.trainer.sensor
+    ]
 
 
 def test_subjects_have_the_variety_of_training(source):

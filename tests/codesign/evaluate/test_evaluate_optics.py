@@ -11,8 +11,8 @@ import torch
 
 from codesign.commands.evaluate_optics import tuned_like
 from codesign.evaluate import optics as evaluate
-from codesign.evaluate.optics import Scenes, Setting
-from codesign.evaluate.tables import ratio
+from codesign.evaluate.optics import MeasurementSettings, SensitivityScenes
+from codesign.evaluate.tables import scene_ratio
 from codesign.eye import dataset
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
@@ -52,7 +52,7 @@ def test_full_lens_agrees_with_the_pupil_model():
     """Same honest information from pillars through the PSF engine as from the smooth
     pupil: two independent paths.
     """
-    setting = Setting(
+    setting = MeasurementSettings(
         depths_mm=(1.6, 2.6),
         count=3,
         angles_deg=(0.0,),
@@ -60,7 +60,7 @@ def test_full_lens_agrees_with_the_pupil_model():
         window_um=96.0,
     )
     setting = setting.about(_lens(2000.0))
-    got = evaluate.axial(_lens(2000.0), setting)
+    got = evaluate.measure_axial_information(_lens(2000.0), setting)
     optics = Pupil(RADIUS_UM, 600.0, nodes=96)
     depths = torch.tensor([1600.0, 2100.0, 2600.0], dtype=torch.float64)
     flat = torch.zeros(96, 96, dtype=torch.float64)
@@ -79,7 +79,7 @@ def test_full_lens_agrees_with_the_pupil_model():
         )  # oblique rim, window edge
     assert float(got.encircled.min()) > 0.5
     assert float(got.encircled.max()) <= 1.0
-    small = evaluate.axial(
+    small = evaluate.measure_axial_information(
         _lens(2000.0), replace(setting, radius_um=4.5, binnings=(1,))
     )
     held = evaluate.most_encircled(
@@ -109,10 +109,10 @@ def test_scene_energies_tell_lenses_apart():
     states = dataset.states_at(torch.arange(2), 2)
     lenses = [_lens(20e3), _lens(20e3, zones=3)]
     plain, helix = evaluate.scene_energies(
-        lenses, states, Scenes(pixels=32, pitch_um=24.0, window_um=96.0)
+        lenses, states, SensitivityScenes(pixels=32, pitch_um=24.0, window_um=96.0)
     )
     assert 0 < plain.image_error < 0.2  # of the true image: its own estimate
-    assert ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
+    assert scene_ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
     assert not torch.allclose(helix.gaze, plain.gaze, rtol=1e-3)
     assert bool((plain.separability > 0).all())
     assert bool(
@@ -125,7 +125,9 @@ def test_one_psf_for_the_whole_image_says_how_far_from_the_true_image_it_is():
     hyperbolic lens rule off the axis.
     """
     states, lens = dataset.states_at(torch.arange(2), 2), _lens(20e3)
-    small = Scenes(pixels=48, pitch_um=12.0, window_um=96.0, image_tolerance=0.2)
+    small = SensitivityScenes(
+        pixels=48, pitch_um=12.0, window_um=96.0, image_tolerance=0.2
+    )
     (true,) = evaluate.scene_energies([lens], states, small)
     (one,) = evaluate.scene_energies([lens], states, replace(small, image="uniform"))
     assert true.image_error < 0.2 < one.image_error
@@ -141,7 +143,7 @@ def test_bootstrap_interval_covers_the_true_ratio():
             torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40))
             for level in (1.5, 1.0)
         )
-        _, low, high = ratio(a, b, draws=400, seed=k)
+        _, low, high = scene_ratio(a, b, draws=400, seed=k)
         covered += low <= 1.5 <= high
     assert (
         85 <= covered <= 100
@@ -165,7 +167,7 @@ def test_simple_lenses_stand_in_the_surroundings_of_the_lens_that_they_are_compa
     focus = Focus(0.85, 300.0, 2000.0, layers)
     phase = design.phase_of(None, focus, radius_um=45.0)
     made, _ = design.make(phase, focus, aperture_um=90.0, cell=CELL, proxy=IDEAL)
-    setting = Setting(
+    setting = MeasurementSettings(
         depths_mm=(1.6, 2.6), count=3, angles_deg=(0.0,), binnings=(1,), window_um=40.0
     )
     simple = tuned_like(made, setting)
@@ -217,8 +219,8 @@ def test_encircled_energy_is_the_share_of_the_light_that_goes_through(
         binnings=(1,),
         radius_um=7.0,
     )
-    found = evaluate.axial(
-        lens, Setting(window_um=60.0, sample_um=1.0, **about)
+    found = evaluate.measure_axial_information(
+        lens, MeasurementSettings(window_um=60.0, sample_um=1.0, **about)
     ).encircled.item()
     place = np.arange(26) - 12.5
     light, through = _summed(

@@ -13,14 +13,14 @@ from codesign.adapt import train as retraining
 from codesign.batches import EyeScenes, SceneConfig
 from codesign.commands import experiment as command
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Trial
+from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentTrials
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
-from codesign.eye.population import Rig
+from codesign.eye.population import CameraRig
 from codesign.gaze import people_file, personal, regressor, shared
-from codesign.gaze.readings import Readings
+from codesign.gaze.readings import NetworkReadings
 from metalens.cli import main
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.core.errors import ConfigError, TrainingError
 from tests.codesign import made_lens as m
 from tests.referees.seen_pupil import pupil_of
 
@@ -56,11 +56,16 @@ def _trial(config, subjects):
         )
     )
     one = [
-        Trial(np.full(len(state), s), point, state, stimuli[point], slips[state])
+        ExperimentTrials(
+            np.full(len(state), s), point, state, stimuli[point], slips[state]
+        )
         for s in range(subjects)
     ]
-    return Trial(
-        *(np.concatenate([getattr(t, f) for t in one]) for f in Trial.__slots__)
+    return ExperimentTrials(
+        *(
+            np.concatenate([getattr(t, f) for t in one])
+            for f in ExperimentTrials.__slots__
+        )
     )
 
 
@@ -76,13 +81,13 @@ def test_the_paper_s_counts():
 
 
 def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
-    scenes = retraining.load(folder / "run").run.scenes(9)
+    scenes = retraining.load_finished_run(folder / "run").run.scenes(9)
     states, trial = experiment.states_of(SMALL, 1, scenes)
     assert np.allclose(states.slip_um.numpy() * 1e-3, trial.slip_mm)
     assert np.ptp(states.trait("size").numpy()) == 0  # one subject
     assert np.ptp(states.trait("pupil_radius_um").numpy()) > 0  # whose pupil moves
     still = replace(states, mount_rad=states.mount_rad * 0)
-    _, visual = eye.directions(still, scenes.rig)
+    _, visual = eye.eye_axes(still, scenes.rig)
     face = eye._face(scenes.rig, still)
     right, down, out = ((visual * face[i]).sum(1).numpy() for i in range(3))
     x, y = np.radians(trial.stimulus_deg).T
@@ -104,7 +109,7 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
             [np.tanh(v[:, 0] + 0.5 * v[:, 2]), v[:, 1] * (1 + 0.3 * v[:, 4])], 1
         )
 
-    made = regressor.fit(x, target(x), penalty=1e-5)
+    made = regressor.fit_regressor(x, target(x), penalty=1e-5)
     new = rng.uniform(-0.8, 0.8, (200, 5))
     assert (
         np.abs(made(new) - target(new)).mean() < 0.02
@@ -122,27 +127,27 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
         column = np.ravel_multi_index(place, array.shape) + (inside.size if k else 0)
         assert np.abs(slope[:, column] - difference).max() < 1e-8
     with pytest.raises(TrainingError, match="2 points"):
-        regressor.fit(x[:2], target(x[:2]))
+        regressor.fit_regressor(x[:2], target(x[:2]))
 
 
 def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_much():
     """The mean eye, a sphere: the pupil's image moves with gaze and slip; only a slip
     that is read tells them apart.
     """
-    config, rig = ExperimentConfig(subjects=2), Rig()
+    config, rig = ExperimentConfig(subjects=2), CameraRig()
     trial = _trial(config, 2)
-    person = personal.fit(
+    person = personal.calibrate_person(
         np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0
     )
     s, c = np.sin(rig.elevation_rad), np.cos(rig.elevation_rad)
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
     direction = torch.from_numpy(
-        personal.direction(np.radians(trial.stimulus_deg)) @ axes
+        personal.gaze_direction(np.radians(trial.stimulus_deg)) @ axes
     )
     pupil = pupil_of(direction, torch.from_numpy(-trial.slip_mm), person.mean).numpy()
     for slip, low, high in ((trial.slip_mm, 0.0, 0.5), (0 * trial.slip_mm, 1.5, 20.0)):
-        predicted, judged = experiment.calibrated(
-            Readings(pupil, slip), trial, config, personal.Sphere(rig)
+        predicted, judged = experiment.calibrated_gaze(
+            NetworkReadings(pupil, slip), trial, config, personal.SphereCalibrator(rig)
         )
         error = personal.angle_deg(predicted, trial.stimulus_deg)[judged]
         assert low <= error.mean() < high
@@ -155,7 +160,7 @@ def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_muc
 
 def test_spread_points_reach_the_corners():
     grid = ExperimentConfig().stimuli_deg
-    chosen = experiment.spread(grid, 10, first=24)
+    chosen = experiment.farthest_points(grid, 10, first=24)
     assert len(set(chosen)) == 10
     assert set(chosen[1:5]) == {0, 6, 42, 48}  # the middle first, then the corners
     gaps = np.linalg.norm(grid[:, None] - grid[chosen], axis=2).min(1)
@@ -192,12 +197,12 @@ def test_an_eye_that_would_slip_into_the_lens_is_refused():
     ("axial", "words"), [((-9.5,), "11.5 to 21 mm"), ((2.5, 19.5), "21 to 40.5 mm")]
 )
 def test_eyes_that_slip_to_where_images_hold_no_depth_are_refused(folder, axial, words):
-    source = retraining.load(folder / "run")
+    source = retraining.load_finished_run(folder / "run")
     with pytest.raises(
         ConfigError,
         match=rf"{words} before the lens, where the run's images hold optics.depths_mm",
     ):
-        next(experiment.experiment([source], replace(SMALL, axial_mm=axial)))
+        next(experiment.run_experiment([source], replace(SMALL, axial_mm=axial)))
 
 
 def test_the_command_writes_numbers_and_figures_once(folder, capsys):
@@ -242,7 +247,7 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
         "ambiguity.png",
         "errors.png",
     }
-    one, two = (people_file.load(out / f"people_{n}.h5") for n in (1, 2))
+    one, two = (people_file.load_people(out / f"people_{n}.h5") for n in (1, 2))
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
@@ -265,7 +270,7 @@ def test_slippage_beyond_training_is_told_apart():
     )
     read = trial.slip_mm + np.stack([0 * off, 0 * off, off], 1)
     blank = np.zeros((len(off), 2))
-    made = experiment.Result(
+    made = experiment.RunResult(
         "a", 1.0, trial, read, blank, off, off, blank, off, (3.9, 1.0, 2.5)
     )
     found = command._beyond(made)
@@ -283,8 +288,8 @@ def test_places_that_cover_a_plane_are_each_the_farthest_from_all_before():
     places = np.array(
         [[0.0, 0.0], [1.0, 0.2], [9.0, 1.0], [8.0, 7.0], [0.5, 6.0], [4.6, 3.6]]
     )
-    assert experiment.spread(places, 5, first=1).tolist() == [1, 3, 2, 4, 5]
-    assert experiment.spread(places, 1, first=4).tolist() == [4]
+    assert experiment.farthest_points(places, 5, first=1).tolist() == [1, 3, 2, 4, 5]
+    assert experiment.farthest_points(places, 1, first=4).tolist() == [4]
 
 
 def test_slippage_is_told_from_where_its_wearer_calibrated():
@@ -296,7 +301,9 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
     off = np.array([[0.5, 0.0, -0.7], [-0.4, 0.9, 0.2]])[trial.subject]
     read = trial.slip_mm + off + judged[:, None] * np.array([0.1, -0.2, 0.3])
     blank, error = np.zeros((len(read), 2)), np.where(judged, 1.0, np.nan)
-    result = experiment.Result("a", 1.0, trial, read, blank, error, error, blank, error)
+    result = experiment.RunResult(
+        "a", 1.0, trial, read, blank, error, error, blank, error
+    )
     whole = np.array([[0.6, 0.2, 0.4], [0.3, 0.7, 0.5]])[trial.subject]
     assert result.slip_error_mm[judged] == pytest.approx(whole[judged])
     assert result.slip_error_mm[~judged] == pytest.approx(np.abs(off[~judged]))
@@ -319,9 +326,9 @@ def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(fold
     """Read exactly, it errs by a constant of the subject: where the eye stands before
     the turned camera.
     """
-    source = retraining.load(folder / "run")
+    source = retraining.load_finished_run(folder / "run")
     config = replace(SMALL, subjects=2, people=2, axial_mm=(2.5,), lateral_mm=(-5.0,))
-    *_, (_, (found,)) = experiment.experiment([source], config)
+    *_, (_, (found,)) = experiment.run_experiment([source], config)
     place = np.array([2.4, -0.3, 21.0])
     for subject in range(2):
         states, _ = experiment.states_of(config, subject, source.run.scenes(9))
@@ -336,7 +343,7 @@ def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(fold
         assert found.slip_visible_mm[mine] == pytest.approx(
             np.tile(np.abs(off), (mine.sum(), 1)), abs=1e-9
         )
-    (row,) = command.summary([found], config)["runs"]
+    (row,) = command.experiment_summary([found], config)["runs"]
     assert row["slip_visible_mm"] == pytest.approx(
         np.abs(found.visible_mm - found.trial.slip_mm).mean(), rel=1e-9
     )
@@ -357,20 +364,20 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     person = np.repeat(np.arange(12), 20)
     gaze, slip = rng.uniform(-17, 17, (240, 2)), rng.uniform(-5, 5, (240, 3))
     pupil = rng.normal(0, 0.3, (240, 2))
-    theirs = Readings(
+    theirs = NetworkReadings(
         pupil, slip, misread(gaze, slip, rng.normal(5, 2, (12, 2))[person])
     )
-    people = shared.learn(theirs, gaze, person)
+    people = shared.learn_population(theirs, gaze, person)
     axis = misread(
         trial.stimulus_deg,
         trial.slip_mm,
         np.array([[3.0, -1.0], [7.0, 4.0]])[trial.subject],
     )
-    read = Readings(np.zeros((len(axis), 2)), trial.slip_mm, axis)
-    predicted, judged = experiment.calibrated(read, trial, config, people)
+    read = NetworkReadings(np.zeros((len(axis), 2)), trial.slip_mm, axis)
+    predicted, judged = experiment.calibrated_gaze(read, trial, config, people)
     assert personal.angle_deg(predicted, trial.stimulus_deg)[judged].mean() < 0.05
-    alone, _ = experiment.calibrated(
-        read, trial, config, personal.Sphere(Rig(), hidden=0)
+    alone, _ = experiment.calibrated_gaze(
+        read, trial, config, personal.SphereCalibrator(CameraRig(), hidden=0)
     )
     assert (
         personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5
@@ -378,10 +385,10 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
 
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
-    source = retraining.load(folder / "run")
-    config, imager = replace(SMALL, people=2), experiment.ready(source)
+    source = retraining.load_finished_run(folder / "run")
+    config, imager = replace(SMALL, people=2), experiment.prepare_run(source)
     found, again, dim = (
-        experiment.calibrator(source, imager, c, experiment.lighting([source], c)[0])
+        experiment.run_calibrator(source, imager, c, experiment.experiment_sensors([source], c)[0])
         for c in (config, config, replace(config, snr_db=3.0))
     )  # fmt: skip
     assert found.model.mean.shape == (36, 2)

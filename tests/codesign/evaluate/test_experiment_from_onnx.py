@@ -12,7 +12,7 @@ from codesign.commands import onnx_file
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import render
-from codesign.gaze import Readings, angle_deg, people_file
+from codesign.gaze import NetworkReadings, angle_deg, people_file
 from tests.codesign import made_lens as m
 
 CONFIG = ExperimentConfig(
@@ -40,45 +40,50 @@ def test_gaze_from_the_graph_is_that_of_the_experiment(tmp_path, pitch_um):
     m.finished_run(
         tmp_path / "run", m.TINY.replace("pitch_um = 3.0", f"pitch_um = {pitch_um}")
     )
-    source = retraining.load(tmp_path / "run")
-    *_, (_, (found,)) = experiment.experiment([source], CONFIG)
-    onnx_file.write(
+    source = retraining.load_finished_run(tmp_path / "run")
+    *_, (_, (found,)) = experiment.run_experiment([source], CONFIG)
+    onnx_file.write_network_file(
         tmp_path / "n.onnx",
         source.run,
         source.run.trainer.model.net,
         source.architecture,
     )
     session = onnxruntime.InferenceSession(tmp_path / "n.onnx")
-    imager, scenes = experiment.ready(source), source.run.scenes(experiment.EXPERIMENT)
+    imager, scenes = (
+        experiment.prepare_run(source),
+        source.run.scenes(experiment.EXPERIMENT),
+    )
     trials, read = [], []
     for subject in range(CONFIG.subjects):
         states, trial = experiment.states_of(CONFIG, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
-        seen = experiment.through(source, made, imager, seed=experiment.NOISE + subject)
+        seen = experiment.image_frames(
+            source, made, imager, seed=experiment.NOISE + subject
+        )
         levels = (300 + 41 * seen.frames.detach()).numpy()
         names = [value.name for value in session.get_outputs()]
         read.append(
             dict(zip(names, session.run(None, {"frames": levels}), strict=True))
         )
         trials.append(trial)
-    told = Readings(
+    told = NetworkReadings(
         *(
             np.concatenate([r[n] for r in read]).astype(float)
-            for n in Readings.__slots__
+            for n in NetworkReadings.__slots__
         )
     )
-    whole = experiment.joined(trials)
+    whole = experiment.join_subjects(trials)
     read_there = found.centre * source.run.window_um * 1e-3
     assert np.abs(told.pupil_mm - read_there).max() < 3e-4 * np.abs(read_there).max()
     assert (
         np.abs(told.slip_mm - found.slip_mm).max() < 3e-4 * np.abs(found.slip_mm).max()
     )
-    people_file.save(tmp_path / "people.h5", found.how)
-    how = people_file.load(tmp_path / "people.h5")
-    gaze, judged = experiment.calibrated(told, whole, CONFIG, how)
+    people_file.save_people(tmp_path / "people.h5", found.how)
+    how = people_file.load_people(tmp_path / "people.h5")
+    gaze, judged = experiment.calibrated_gaze(told, whole, CONFIG, how)
     assert angle_deg(gaze, found.predicted_deg).max() < 0.05
     assert np.array_equal(judged, np.isfinite(found.gaze_deg))
-    without, _ = experiment.calibrated(
+    without, _ = experiment.calibrated_gaze(
         replace(told, axis_deg=told.axis_deg[::-1]), whole, CONFIG, how
     )
     assert (

@@ -10,7 +10,7 @@ import pytest
 
 from codesign.evaluate import FieldSetting, field_page
 from metalens.aberrations import OverField, over_field
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 from tests.metalens.aberrations.hyperbolic import made
 
 
@@ -32,7 +32,7 @@ def typed(**changes):
 
 
 def test_every_number_stands_under_its_name_with_its_unit():
-    fields, curves = field_page.tables({"mine": typed()})
+    fields, curves = field_page.field_tables({"mine": typed()})
     rows = [dict(zip(fields.head, row, strict=False)) for row in fields.rows]
     assert list(fields.rows[0]) == [
         "mine",
@@ -75,7 +75,7 @@ def test_every_number_stands_under_its_name_with_its_unit():
 
 def test_numbers_that_are_not_there_are_null_in_the_file():
     found = json.loads(
-        json.dumps(field_page.values(typed(depth_um=math.inf)), allow_nan=False)
+        json.dumps(field_page.field_values(typed(depth_um=math.inf)), allow_nan=False)
     )
     assert found["distortion"] == [-0.01234, None]
     assert found["close_um"][1] == [None, None]
@@ -86,12 +86,12 @@ def test_numbers_that_are_not_there_are_null_in_the_file():
 
 def test_pictures_of_lenses_with_and_without_chief_rays():
     both = {"a": typed(), "b": typed(mtf=typed().mtf / 2)}
-    for image in (field_page.picture(both), field_page.mtf_picture(both)):
+    for image in (field_page.plot_over_field(both), field_page.mtf_picture(both)):
         assert image[:4] == b"\x89PNG"
     assert field_page.mtf_picture(both) != field_page.mtf_picture(
         {"a": typed(), "b": typed()}
     )
-    assert field_page.picture(both) != field_page.picture(
+    assert field_page.plot_over_field(both) != field_page.plot_over_field(
         {"a": typed(), "b": typed(distortion=np.array([0.3, 0.2]))}
     )
 

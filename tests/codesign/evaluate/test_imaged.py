@@ -11,17 +11,17 @@ import torch
 
 from codesign.commands import view
 from codesign.evaluate import imaged
-from codesign.eye import Camera, Rig, dataset, render
+from codesign.eye import CameraRig, PinholeCamera, dataset, render
 from metalens import cli, design, lens
 from metalens.cell import Film, Index
+from metalens.core.errors import SceneError
+from metalens.core.store import Provenance
 from metalens.design import Focus
-from metalens.ground.errors import SceneError
-from metalens.ground.store import Provenance
 from metalens.lens import Layers
 from tests.codesign import made_lens as m
 
-CAMERA = Camera(24, 3.0)
-RIG = replace(Rig(), elevation_rad=0.6)
+CAMERA = PinholeCamera(24, 3.0)
+RIG = replace(CameraRig(), elevation_rad=0.6)
 LENS = design.make(
     design.phase_of(None, Focus(0.85, 300.0, 3000.0), radius_um=25.0),
     Focus(0.85, 300.0, 3000.0),
@@ -34,7 +34,7 @@ LENS = design.make(
 @pytest.fixture(scope="module")
 def found():
     states = dataset.states_at(torch.arange(2), 5)
-    return imaged.imaged(
+    return imaged.image_first_frames(
         LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera)
     )
 
@@ -95,7 +95,7 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
         seen.append(rig.sensor_distance_um)
         return render(states, rig=rig, camera=camera)
 
-    made = imaged.imaged(behind, Camera(16, 4.0), RIG, rendered)
+    made = imaged.image_first_frames(behind, PinholeCamera(16, 4.0), RIG, rendered)
     assert seen == [pytest.approx(280.0)]
     beside = 36  # samples of 4 um: half a window of 288 um
     rim = math.degrees(math.atan((16 + 2 * beside - 1) / 2 * 4.0 / 280.0))
@@ -105,8 +105,8 @@ def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
 
 
 def test_what_is_written_is_what_is_shown(found, tmp_path):
-    imaged.write(tmp_path, found, Provenance())
-    both, apart, points, parts = view.image(tmp_path / "image.h5")
+    imaged.write_images(tmp_path, found, Provenance())
+    both, apart, points, parts = view.image_panels(tmp_path / "image.h5")
     assert np.array_equal(both.values[1, 0], found.scene[1])
     assert np.array_equal(both.values[1, 1], found.image[1])
     assert np.array_equal(apart.values, found.image - found.scene)
@@ -136,9 +136,9 @@ def test_light_that_the_pillars_are_not_known_for_is_told_and_no_error():
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (9.5, 12))
     states = dataset.states_at(torch.arange(1), 5)
-    made = imaged.imaged(
+    made = imaged.image_first_frames(
         known,
-        Camera(16, 9.0),
+        PinholeCamera(16, 9.0),
         RIG,
         lambda c, rig: render(states, rig=rig, camera=c),
         fwhm_nm=20.0,
@@ -175,9 +175,9 @@ def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
     with pytest.raises(
         SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"
     ):
-        imaged.imaged(
+        imaged.image_first_frames(
             near,
-            Camera(12, 9.0),
-            Rig(),
+            PinholeCamera(12, 9.0),
+            CameraRig(),
             lambda camera, rig: render(states, rig=rig, camera=camera),
         )

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from codesign.evaluate import imaged
-from codesign.eye import Camera, Rig
+from codesign.eye import CameraRig, PinholeCamera
 
 KNOWN = SimpleNamespace(wavelengths_um=(0.85, 0.85))
 LENS = SimpleNamespace(reduced_um=310.0, sensor_distance_um=340.0, proxy=KNOWN)
@@ -60,7 +60,9 @@ def test_rows_columns_and_depths_keep_their_places(monkeypatch):
         asked.update(pixels=camera.pixels, distance=rig.sensor_distance_um)
         return SimpleNamespace(frames=frames, pinhole=lambda: whole)
 
-    found = imaged.imaged(LENS, Camera(8, 3.0), Rig(), rendered)
+    found = imaged.image_first_frames(
+        LENS, PinholeCamera(8, 3.0), CameraRig(), rendered
+    )
     assert found.problem == "0.02 and 0.03"
     assert asked["reach"] == pytest.approx((0.98 * 24e3, 1.02 * 41e3))
     assert (asked["pixels"], asked["distance"]) == (8 + 2 * 48, 310.0)

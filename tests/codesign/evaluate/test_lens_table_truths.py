@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from codesign.evaluate import optics as evaluate
-from codesign.evaluate.optics import Filled, SceneEnergy, Setting
+from codesign.evaluate.optics import MeasurementSettings, ResolvedSettings, SceneEnergy
 from metalens.lens import reach
 
 RNG = np.random.default_rng(5)
@@ -106,7 +106,7 @@ def filled(**changes):
         step_um=70.0,
         tolerance=0.02,
     )
-    return Filled(**(given | changes))
+    return ResolvedSettings(**(given | changes))
 
 
 def test_axial_numbers_are_of_each_depth_and_the_next_at_every_angle(monkeypatch):
@@ -133,7 +133,7 @@ def test_axial_numbers_are_of_each_depth_and_the_next_at_every_angle(monkeypatch
     monkeypatch.setattr(evaluate, "from_lens", from_lens)
     monkeypatch.setattr(evaluate, "passed_um2", passed_um2)
     monkeypatch.setattr(evaluate, "axial_information", information)
-    found = evaluate.axial(LENS, filled())
+    found = evaluate.measure_axial_information(LENS, filled())
     view, tolerance = wanted[0]
     assert sorted(view.depths_um) == pytest.approx([1600, 1670, 2100, 2170, 2600, 2670])
     assert (view.window_um, view.samples, tolerance) == (12.0, 16, 0.02)
@@ -180,7 +180,7 @@ def test_no_lens_gives_more_light_than_goes_through_it(monkeypatch):
         "axial_information",
         lambda near, far, **about: torch.zeros(near.shape[:2]),
     )
-    found = evaluate.axial(
+    found = evaluate.measure_axial_information(
         LENS, filled(count=1, angles_deg=(0.0,), depths_mm=(1.6, 1.6), radius_um=40.0)
     )
     assert float(found.encircled) == pytest.approx(1.0, rel=1e-6)
@@ -190,8 +190,8 @@ def test_what_a_setting_leaves_out_is_that_of_the_lens():
     """Window, disc and pixel in wavelength / NA, here of 0.85 um and 1.7 mm over 240
     um: 6.02 um.
     """
-    lens = reach.Aperture(240.0, 0.85, 1700.0, 9000.0)
-    made = Setting(count=4, binnings=(2, 5)).about(lens)
+    lens = reach.ApertureSummary(240.0, 0.85, 1700.0, 9000.0)
+    made = MeasurementSettings(count=4, binnings=(2, 5)).about(lens)
     airy = 0.85 * 1700 / 240
     assert made.pixel_um == pytest.approx(0.88 * airy, rel=0.01)  # to two digits
     assert made.radius_um == pytest.approx(5.3 * airy, rel=0.02)
@@ -207,7 +207,7 @@ def test_what_a_setting_leaves_out_is_that_of_the_lens():
     assert made.step_um == pytest.approx(
         min(0.23 * 0.85 * (near / 240) ** 2, near / 50), rel=0.03
     )
-    own = Setting(
+    own = MeasurementSettings(
         depths_mm=(3.0, 4.5),
         pixel_um=7.0,
         sample_um=0.9,

@@ -9,9 +9,9 @@ import pytest
 
 from codesign.commands import paper as command_paper
 from codesign.evaluate import paper
-from codesign.evaluate.paper import Measured
+from codesign.evaluate.paper import MeasuredNumber
 from metalens.cli import main
-from metalens.ground.errors import StoreError
+from metalens.core.errors import StoreError
 from tests.codesign import made_lens as m
 
 RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
@@ -23,7 +23,7 @@ def test_every_number_stands_in_the_paper(shared):
     )
     numbers = set(re.findall(r"\d+\.\d+|\d+", text.replace(",", "")))
     known = {float(n) for n in numbers}
-    for claim in paper.claims():
+    for claim in paper.load_claims():
         for number in re.findall(r"\d+\.\d+", claim.note):
             assert float(number) in known, claim
         if not claim.picture and claim.unit != "ratio":
@@ -34,7 +34,7 @@ def test_every_number_stands_in_the_paper(shared):
 
 def test_ratios_are_those_of_the_numbers_beside_them():
     checked = 0
-    for claim in paper.claims():
+    for claim in paper.load_claims():
         found = RATIO.match(claim.note)
         if claim.unit == "ratio" and found:
             assert claim.value == pytest.approx(
@@ -45,7 +45,7 @@ def test_ratios_are_those_of_the_numbers_beside_them():
 
 
 def test_all_of_the_paper_is_there_once():
-    places = {claim.place for claim in paper.claims()}
+    places = {claim.place for claim in paper.load_claims()}
     wanted = {
         "Table 1",
         "Table 2",
@@ -59,7 +59,7 @@ def test_all_of_the_paper_is_there_once():
         "15 dB",
     }
     assert wanted <= places
-    keys = [claim.key for claim in paper.claims()]
+    keys = [claim.key for claim in paper.load_claims()]
     assert len(keys) == len(set(keys))
 
 
@@ -86,7 +86,7 @@ def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angle
     path = tmp_path / "optics.json"
     path.write_text(json.dumps(told))
     found = paper.of_optics(path)
-    assert found["scenes/axial/proposed"] == Measured(
+    assert found["scenes/axial/proposed"] == MeasuredNumber(
         1.7, 1.4, 2.3, "same states, images of equal light"
     )
     assert found["information/0/proposed"].value == pytest.approx(8.0 / 2.0)
@@ -100,7 +100,9 @@ def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angle
 def test_what_was_not_measured_says_how_to_and_what_was_has_a_ratio():
     told = {
         line.claim.key: line
-        for line in paper.lines({"iou/proposed": Measured(0.47, 0.4, 0.5, "here")})
+        for line in paper.claim_lines(
+            {"iou/proposed": MeasuredNumber(0.47, 0.4, 0.5, "here")}
+        )
     }
     assert told["iou/proposed"].ratio == pytest.approx(0.5)
     assert told["iou/proposed"].words()[3] == "0.47 [0.4, 0.5]"
@@ -139,7 +141,7 @@ def _experiment(path, axial):
 def test_measurements_are_collected_from_their_files(tmp_path):
     _experiment(tmp_path / "experiment" / "experiment.json", 1.0)
     _experiment(tmp_path / "dim" / "experiment.json", 1.5)
-    found = command_paper.collect(tmp_path, {})
+    found = command_paper.collect_measurements(tmp_path, {})
     assert found["gaze_axial/ratio"].value == 0.5
     assert found["iou/proposed"].low == 0.8
     assert found["dim/proposed"].value == pytest.approx(1.5)
@@ -176,7 +178,7 @@ def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys)
     words = ["evaluate", "paper", "-o", str(tmp_path / "out")]
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert len(told["lines"]) == len(paper.claims())
+    assert len(told["lines"]) == len(paper.load_claims())
     assert all(line["ours"] is None for line in told["lines"])
     assert "not measured" in (tmp_path / "out" / "report.html").read_text()
     assert main(words) == 2

@@ -8,17 +8,19 @@ import math
 import pytest
 
 from codesign.evaluate import paper
-from codesign.evaluate.paper import Claim, Line, Measured
+from codesign.evaluate.paper import ClaimLine, MeasuredNumber, PaperClaim
 
 
 def claim(value=math.inf, unit="", note=""):
-    return Claim("Table 9", "what", "key", "metalens this", value, unit, note)
+    return PaperClaim("Table 9", "what", "key", "metalens this", value, unit, note)
 
 
 def test_a_ratio_is_ours_over_the_papers():
-    assert Line(claim(0.8), Measured(0.2)).ratio == pytest.approx(0.25, rel=1e-12)
-    assert math.isnan(Line(claim(0.8), None).ratio)
-    assert math.isnan(Line(claim(), Measured(0.2)).ratio)
+    assert ClaimLine(claim(0.8), MeasuredNumber(0.2)).ratio == pytest.approx(
+        0.25, rel=1e-12
+    )
+    assert math.isnan(ClaimLine(claim(0.8), None).ratio)
+    assert math.isnan(ClaimLine(claim(), MeasuredNumber(0.2)).ratio)
     assert claim().picture
     assert not claim(0.0).picture
 
@@ -26,13 +28,13 @@ def test_a_ratio_is_ours_over_the_papers():
 @pytest.mark.parametrize(
     ("line", "cells"),
     [
-        (Line(claim(0.8, "mm", "a note"), Measured(0.213, 0.15, 0.31, "here")),
+        (ClaimLine(claim(0.8, "mm", "a note"), MeasuredNumber(0.213, 0.15, 0.31, "here")),
          ("0.8 mm", "0.213 [0.15, 0.31]", "0.27", "here; paper: a note")),
-        (Line(claim(1.85, "ratio"), Measured(2.7)), ("1.85", "2.7", "1.46", "")),
-        (Line(claim(1.85, "ratio", "a note"), Measured(2.7)), ("1.85", "2.7", "1.46", "paper: a note")),
-        (Line(claim(), Measured(2.7, conditions="so")), ("picture", "2.7", "", "so")),
-        (Line(claim(note="a note"), None, "fig.svg"), ("picture", "fig.svg", "", "a note")),
-        (Line(claim(7.0, "deg"), None), ("7 deg", "not measured", "", "measure with: metalens this")),
+        (ClaimLine(claim(1.85, "ratio"), MeasuredNumber(2.7)), ("1.85", "2.7", "1.46", "")),
+        (ClaimLine(claim(1.85, "ratio", "a note"), MeasuredNumber(2.7)), ("1.85", "2.7", "1.46", "paper: a note")),
+        (ClaimLine(claim(), MeasuredNumber(2.7, conditions="so")), ("picture", "2.7", "", "so")),
+        (ClaimLine(claim(note="a note"), None, "fig.svg"), ("picture", "fig.svg", "", "a note")),
+        (ClaimLine(claim(7.0, "deg"), None), ("7 deg", "not measured", "", "measure with: metalens this")),
     ],
 )  # fmt: skip
 def test_cells_of_a_line(line, cells):
@@ -40,21 +42,21 @@ def test_cells_of_a_line(line, cells):
 
 
 def test_pictures_are_looked_for_by_name_and_numbers_are_no_pictures(tmp_path):
-    shown = [c for c in paper.claims() if c.picture]
-    number = next(c for c in paper.claims() if not c.picture)
+    shown = [c for c in paper.load_claims() if c.picture]
+    number = next(c for c in paper.load_claims() if not c.picture)
     first = shown[0].key.removeprefix("picture/")
     for name in (first, number.key.replace("/", "-")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
     told = {
         line.claim.key: line
-        for line in paper.lines({number.key: Measured(3.0)}, tmp_path)
+        for line in paper.claim_lines({number.key: MeasuredNumber(3.0)}, tmp_path)
     }
     assert told[shown[0].key].picture == first
     assert told[shown[1].key].picture == ""
-    assert told[number.key].ours == Measured(3.0)
+    assert told[number.key].ours == MeasuredNumber(3.0)
     assert told[number.key].picture == ""
-    assert [line.picture for line in paper.lines({}) if line.picture] == []
+    assert [line.picture for line in paper.claim_lines({}) if line.picture] == []
 
 
 def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyperbolic_lens(
@@ -82,8 +84,8 @@ def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyper
         "slip/ratio",
         "gaze_lateral/ratio",
     }
-    assert found["slip/proposed"] == Measured(0.31, 0.2, 0.45, words)
-    assert found["gaze_axial/proposed"] == Measured(1.7, 1.1, 2.9, words)
+    assert found["slip/proposed"] == MeasuredNumber(0.31, 0.2, 0.45, words)
+    assert found["gaze_axial/proposed"] == MeasuredNumber(1.7, 1.1, 2.9, words)
     lateral = found["gaze_lateral/proposed"]
     assert lateral.value == 0.6
     assert math.isnan(lateral.low)

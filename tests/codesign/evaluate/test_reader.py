@@ -11,7 +11,7 @@ import torch
 from codesign.evaluate import reader
 from codesign.evaluate.reader import ReaderConfig
 from codesign.network import blur
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 TINY = ReaderConfig(frames=256, pool=64, test=64, pixels=32, pitch_um=36.0)
 
@@ -33,7 +33,7 @@ class _Window:
         strength = torch.exp(0.5 * vergence[:, :1, :1]) if self.told else 1.0
         pixels = (torch.randn(count, 64, 64, generator=draw) * strength)[:, None]
         slip = torch.stack([0 * depth, 0 * depth, depth * 1e-3 - 22], 1)
-        return reader.Frames(pixels, vergence, slip)
+        return reader.LensFrames(pixels, vergence, slip)
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -41,9 +41,9 @@ def test_it_reads_what_the_frames_hold_and_nothing_else(monkeypatch, told):
     """Guessing the middle of a uniform spread of 12 mm errs by 3 mm; power tells the
     depth to a few per cent.
     """
-    monkeypatch.setattr(reader, "frames", _Window(3, told))
-    seen = reader.Scenery(1, 2, 3)
-    found = reader.read(None, seen, replace(TINY, frames=512, test=256))
+    monkeypatch.setattr(reader, "lens_frames", _Window(3, told))
+    seen = reader.JudgingScenes(1, 2, 3)
+    found = reader.train_reader(None, seen, replace(TINY, frames=512, test=256))
     axial = float(found.axial_mm.mean())
     if told:
         assert axial < 1.2
@@ -62,24 +62,28 @@ def test_it_reads_what_the_frames_hold_and_nothing_else(monkeypatch, told):
 def test_the_same_numbers_come_every_time_and_the_global_generator_is_left_as_it_was(
     monkeypatch,
 ):
-    monkeypatch.setattr(reader, "frames", _Window(3, True))
+    monkeypatch.setattr(reader, "lens_frames", _Window(3, True))
     found = []
     for state in (11, 12):
         torch.manual_seed(state)
         want = torch.get_rng_state()
         found.append(
-            reader.read(None, reader.Scenery(1, 2, 3), replace(TINY, frames=128))
+            reader.train_reader(
+                None, reader.JudgingScenes(1, 2, 3), replace(TINY, frames=128)
+            )
         )
         assert torch.equal(torch.get_rng_state(), want)
     assert torch.equal(found[0].axial_mm, found[1].axial_mm)
 
 
 def test_learning_and_judging_frames_differ_and_repeat():
-    seen = reader.scenery(replace(TINY, pool=32, test=32), sensor_distance_um=2000.0)
+    seen = reader.render_scenes(
+        replace(TINY, pool=32, test=32), sensor_distance_um=2000.0
+    )
     batches = [s.batch(0, 32) for s in (seen.learn, seen.calibrate, seen.judge)]
     assert not np.array_equal(batches[0].frames.light, batches[2].frames.light)
     assert not np.array_equal(batches[1].frames.light, batches[2].frames.light)
-    again = reader.scenery(
+    again = reader.render_scenes(
         replace(TINY, pool=32, test=32), sensor_distance_um=2000.0
     ).judge.batch(0, 32)
     assert np.array_equal(again.frames.light, batches[2].frames.light)
@@ -91,7 +95,9 @@ def test_eyes_out_of_the_depths_of_the_psfs_are_refused():
     with pytest.raises(
         ConfigError, match=r"depths_mm = \(18.0, 40.0\) do not hold the eyes"
     ):
-        reader.scenery(replace(TINY, depths_mm=(18.0, 40.0)), sensor_distance_um=2000.0)
+        reader.render_scenes(
+            replace(TINY, depths_mm=(18.0, 40.0)), sensor_distance_um=2000.0
+        )
 
 
 @pytest.mark.parametrize(
@@ -115,11 +121,11 @@ def test_lenses_of_different_sensor_distances_are_refused():
             self.reduced_um = distance
 
     with pytest.raises(ConfigError, match="compare lenses of one distance"):
-        next(reader.judged({"a": Lens(2000.0), "b": Lens(1000.0)}, TINY))
+        next(reader.judge_lenses({"a": Lens(2000.0), "b": Lens(1000.0)}, TINY))
 
 
 def test_the_table_names_every_lens_and_the_light():
-    one = reader.Read(
+    one = reader.ReaderResult(
         torch.tensor([0.4, 0.6]),
         torch.tensor([0.2, 0.3]),
         torch.tensor([1.0, 1.4]),
@@ -129,7 +135,9 @@ def test_the_table_names_every_lens_and_the_light():
         0.02,
         0.9,
     )
-    lines = reader.table({"mine": one}, replace(TINY, fwhm_nm=30.0)).text.splitlines()
+    lines = reader.reader_table(
+        {"mine": one}, replace(TINY, fwhm_nm=30.0)
+    ).text.splitlines()
     assert "30 nm of light" in lines[0]
     assert "0.50 [0.40, 0.60]" in lines[2]
     assert "±1.30 mm" in lines[2]

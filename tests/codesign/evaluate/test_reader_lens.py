@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from codesign.batches import depth_um, irradiance
+from codesign.batches import depth_um, sensor_irradiance
 from codesign.evaluate import reader, reader_lens
 from codesign.evaluate.reader import ReaderConfig
 from codesign.evaluate.reader_lens import LensTraining
@@ -17,12 +17,12 @@ from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.optics import formed
 from codesign.optics.stack import OpticsConfig
-from codesign.train import Schedule
+from codesign.train import LearningRateSchedule
+from metalens.core.errors import ConfigError
 from metalens.field.engine import normalised
 from metalens.field.forming import build_imager
 from metalens.field.plan import spectral
-from metalens.ground.errors import ConfigError
-from metalens.psf.spectrum import Nodes
+from metalens.psf.spectrum import SpectralNodes
 
 CONFIG = ReaderConfig(
     frames=64, pool=32, test=32, pixels=32, pitch_um=24.0, fwhm_nm=90.0
@@ -32,12 +32,12 @@ OPTICS = OpticsConfig(
     image_tolerance=0.3, angle_deg=11.0, fwhm_nm=90.0,
 )  # fmt: skip
 BENT = torch.tensor([0.8, -0.5, 0.9, 0.4, -0.7], dtype=torch.float64)
-FEW = LensTraining(turns=2, hold=2, batch=4, phase=Schedule(0.1), seed=3)
+FEW = LensTraining(turns=2, hold=2, batch=4, phase=LearningRateSchedule(0.1), seed=3)
 
 
 @pytest.fixture(scope="module")
 def learn():
-    return reader.scenery(CONFIG, sensor_distance_um=2000.0).learn
+    return reader.render_scenes(CONFIG, sensor_distance_um=2000.0).learn
 
 
 def _psfs(whole, coefficients):
@@ -55,10 +55,12 @@ def _psfs(whole, coefficients):
 @pytest.fixture(scope="module")
 def whole():
     """The image through the lens, of two wavelengths that do not weigh alike."""
-    found = formed.imager(
+    found = formed.make_imager(
         OPTICS, BENT, CONFIG.pixels + 2 * CONFIG.margin, margin=CONFIG.margin
     )
-    waves = Nodes(np.array([0.81, 0.87]), np.array([0.3, 0.7]), found.plan.waves.error)
+    waves = SpectralNodes(
+        np.array([0.81, 0.87]), np.array([0.3, 0.7]), found.plan.waves.error
+    )
     return _psfs(replace(found, plan=replace(found.plan, waves=waves)), BENT)
 
 
@@ -86,13 +88,13 @@ def test_the_gradient_of_the_lens_is_that_of_a_finite_difference_of_the_loss(
     batch = learn.batch(0, FEW.batch)
 
     def loss(coefficients):
-        seen = irradiance(
+        seen = sensor_irradiance(
             batch.frames, _psfs(whole, coefficients), margin=CONFIG.margin
         )
         pixels = _plain(seen, 0, 0, None, generator=None, exact=False)
         told, _ = _branch()(pixels)
         return float(
-            losses.depth(
+            losses.depth_loss(
                 told, blur.window_vergence(depth_um(batch.frames, margin=CONFIG.margin))
             )
         )
@@ -131,14 +133,14 @@ def test_a_lens_that_stands_gathers_nothing_and_teaches_the_branch_all_the_same(
 def test_training_repeats_bit_for_bit_moves_by_its_rate_and_leaves_the_generator(learn):
     torch.manual_seed(11)
     before = torch.get_rng_state()
-    path, told = reader_lens.trained(OPTICS, BENT, learn, CONFIG, FEW)
-    again, _ = reader_lens.trained(OPTICS, BENT, learn, CONFIG, FEW)
+    path, told = reader_lens.train_lens(OPTICS, BENT, learn, CONFIG, FEW)
+    again, _ = reader_lens.train_lens(OPTICS, BENT, learn, CONFIG, FEW)
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(path, again)
     assert len(told) == FEW.turns == len(path) - 1
     assert torch.equal(path[0], BENT)
-    still, _ = reader_lens.trained(
-        OPTICS, BENT, learn, CONFIG, replace(FEW, phase=Schedule(0.0))
+    still, _ = reader_lens.train_lens(
+        OPTICS, BENT, learn, CONFIG, replace(FEW, phase=LearningRateSchedule(0.0))
     )
     assert torch.equal(still, BENT.expand_as(still))
     assert torch.equal(path[1], BENT)  # one gradient tells nothing of its noise
@@ -151,8 +153,11 @@ def test_a_lens_that_moved_is_imaged_through_the_plan_of_another(whole):
     """Its PSFs at the nodes are those that the engine forms of that lens; the lens that
     stands keeps its own.
     """
-    assert torch.equal(reader_lens.moved(OPTICS, whole, BENT).stack, whole.stack)
-    found, want = reader_lens.moved(OPTICS, whole, BENT + 0.2), _psfs(whole, BENT + 0.2)
+    assert torch.equal(reader_lens.moved_image(OPTICS, whole, BENT).stack, whole.stack)
+    found, want = (
+        reader_lens.moved_image(OPTICS, whole, BENT + 0.2),
+        _psfs(whole, BENT + 0.2),
+    )
     assert torch.allclose(found.stack, want.stack, rtol=1e-9, atol=1e-12)
     assert not torch.allclose(found.stack, whole.stack, rtol=1e-2)
     assert not found.stack.requires_grad
@@ -165,7 +170,7 @@ def test_a_lens_that_moved_is_imaged_through_the_plan_of_another(whole):
 )  # fmt: skip
 def test_optics_that_cannot_be_trained_are_refused(learn, change, message):
     with pytest.raises(ConfigError, match=message):
-        reader_lens.trained(replace(OPTICS, **change), BENT, learn, CONFIG, FEW)
+        reader_lens.train_lens(replace(OPTICS, **change), BENT, learn, CONFIG, FEW)
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,16 @@ import pytest
 import torch
 
 from codesign.evaluate import reader_lens
-from codesign.evaluate.reader_lens import Descent, LensTraining
-from codesign.train import Schedule
+from codesign.evaluate.reader_lens import LensTraining, ShrunkDescent
+from codesign.train import LearningRateSchedule
 
 TRAINING = LensTraining(
-    turns=4, hold=3, batch=2, phase=Schedule(0.04, 0.3, 1.0), anew=3, rate=5e-3
+    turns=4,
+    hold=3,
+    batch=2,
+    phase=LearningRateSchedule(0.04, 0.3, 1.0),
+    anew=3,
+    rate=5e-3,
 )
 SLOPE = torch.tensor([0.7, -0.2, 5.0], dtype=torch.float64)
 SHAPE = (2, 3, 1, 4, 4)  # rows and columns of the field, depths, window
@@ -58,7 +63,7 @@ def _told(monkeypatch, training):
 
     monkeypatch.setattr(torch.optim, "AdamW", Reads)
     monkeypatch.setattr(reader_lens, "Imager", Whole)
-    monkeypatch.setattr(reader_lens, "samples", lambda frames: 8)
+    monkeypatch.setattr(reader_lens, "frame_samples", lambda frames: 8)
 
     def forms(optics, place, frame, *, margin):
         assert (frame, margin) == (8, 2)
@@ -69,7 +74,7 @@ def _told(monkeypatch, training):
         said.moved.append(place)
         return planned
 
-    monkeypatch.setattr(reader_lens, "moved", moved)
+    monkeypatch.setattr(reader_lens, "moved_image", moved)
     monkeypatch.setattr(reader_lens, "gone_backward", gone)
     monkeypatch.setattr(reader_lens, "lens_gradient", gradient)
     scenes = SimpleNamespace(
@@ -120,7 +125,9 @@ def test_between_plans_the_image_is_that_of_the_lens_where_it_stands(monkeypatch
     """The first gradient moves nothing; turn 3 is planned anew, so the image follows
     before turns 2, 4 and 5.
     """
-    training = LensTraining(turns=6, hold=1, batch=2, phase=Schedule(0.04), anew=3)
+    training = LensTraining(
+        turns=6, hold=1, batch=2, phase=LearningRateSchedule(0.04), anew=3
+    )
     told = _told(monkeypatch, training)
     places = told.path.tolist()
     assert places[1] == places[0]
@@ -129,7 +136,7 @@ def test_between_plans_the_image_is_that_of_the_lens_where_it_stands(monkeypatch
 
 
 def _steps(gradients):
-    descent = Descent(torch.zeros(gradients.shape[1], dtype=torch.float64))
+    descent = ShrunkDescent(torch.zeros(gradients.shape[1], dtype=torch.float64))
     return torch.stack([descent.step(one) for one in gradients])
 
 
@@ -188,9 +195,9 @@ def test_a_wrong_turn_is_not_kept():
     """The start is read whether asked for or not; the first of equal lenses stays."""
     path = torch.tensor([[0.0], [1.0], [2.0], [3.0]], dtype=torch.float64)
     errors = {0.0: 0.7, 1.0: 0.1, 2.0: 0.8, 3.0: 0.7}
-    worse = reader_lens.kept(path, (2, 3), lambda place: errors[float(place)])
+    worse = reader_lens.best_round(path, (2, 3), lambda place: errors[float(place)])
     assert worse == (0, {0: 0.7, 2: 0.8, 3: 0.7})
-    assert reader_lens.kept(path, (0, 1), lambda place: errors[float(place)]) == (
+    assert reader_lens.best_round(path, (0, 1), lambda place: errors[float(place)]) == (
         1,
         {0: 0.7, 1: 0.1},
     )
@@ -198,7 +205,7 @@ def test_a_wrong_turn_is_not_kept():
 
 def test_the_branch_s_rate_follows_the_steps_of_the_whole_training(told):
     assert told.rates == pytest.approx(
-        [Schedule(5e-3).at(step / 12) for step in range(12)], rel=1e-12
+        [LearningRateSchedule(5e-3).at(step / 12) for step in range(12)], rel=1e-12
     )
     assert len(set(told.rates)) > 6
 

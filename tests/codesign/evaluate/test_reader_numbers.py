@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from codesign.evaluate import reader
-from codesign.evaluate.reader import Frames, Read, ReaderConfig
+from codesign.evaluate.reader import LensFrames, ReaderConfig, ReaderResult
 from codesign.network import blur
 from metalens import design
 from metalens.cell import Film, Index
+from metalens.core.errors import ConfigError
 from metalens.design import Focus
-from metalens.ground.errors import ConfigError
 from metalens.lens import Layers
 from tests.codesign import made_lens as m
 
@@ -36,7 +36,7 @@ def frames(count, seed):
     told = vergence + torch.from_numpy(rng.normal(0, 0.3, (count, 7, 7)))
     told = torch.stack([told, torch.from_numpy(rng.uniform(-2, 1, (count, 7, 7)))], 1)
     pixels = torch.arange(count, dtype=torch.float64)[:, None, None, None] + 1000 * seed
-    return Frames(pixels, vergence, slip), answer, told
+    return LensFrames(pixels, vergence, slip), answer, told
 
 
 class Stand:
@@ -109,7 +109,9 @@ def test_few_frames_to_spare_take_their_largest_ratio():
 def test_the_interval_of_the_mean_is_a_bootstrap_over_frames():
     """Of 400 errors: ± 1.96 sigma / √400 about the mean, to the 5 % of 1000 draws."""
     error = torch.from_numpy(np.random.default_rng(6).gamma(3.0, 0.2, 400))
-    values = Read(error, 2 * error, 3 * error, 2.5, 0.9, 1.1, 0.01, 0.7).values()
+    values = ReaderResult(
+        error, 2 * error, 3 * error, 2.5, 0.9, 1.1, 0.01, 0.7
+    ).values()
     mean, half = float(error.mean()), 1.96 * float(error.std()) / 20
     assert values["axial_mm"] == pytest.approx(mean)
     assert values["axial_low_mm"] == pytest.approx(mean - half, abs=0.15 * half)
@@ -245,17 +247,21 @@ def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometre
     """
     made = []
     monkeypatch.setattr(
-        reader, "scenery", lambda config, *, sensor_distance_um: sensor_distance_um
+        reader,
+        "render_scenes",
+        lambda config, *, sensor_distance_um: sensor_distance_um,
     )
     monkeypatch.setattr(
-        reader, "read", lambda optics, seen, config: made.append((optics, seen))
+        reader, "train_reader", lambda optics, seen, config: made.append((optics, seen))
     )
     config = ReaderConfig(pixels=32, pitch_um=9.0, depths_mm=(2.1, 3.4), tolerance=0.4)
     glass, focus = Layers(behind=(Film(Index(1.5), 60.0),)), Focus(0.85, 300.0, 3000.0)
     wanted = design.phase_of(None, focus, radius_um=18.0)
     bare = design.make(wanted, focus, aperture_um=36.0, cell=m.CELL, proxy=m.PROXY)[0]
     behind = replace(bare, layers=glass)
-    assert [name for name, _ in reader.judged({"glass": behind}, config)] == ["glass"]
+    assert [name for name, _ in reader.judge_lenses({"glass": behind}, config)] == [
+        "glass"
+    ]
     ((optics, seen),) = made
     assert seen == pytest.approx(240.0 + 60.0 / 1.5)
     grid = optics.grid
@@ -268,4 +274,4 @@ def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometre
     with pytest.raises(
         ConfigError, match="different sensor distances"
     ):  # 300 and 280 um
-        list(reader.judged({"glass": behind, "air": bare}, config))
+        list(reader.judge_lenses({"glass": behind, "air": bare}, config))

@@ -5,10 +5,10 @@ shards that read back.
 import torch
 
 from codesign.eye import dataset, renderer
-from codesign.eye.population import States
-from codesign.eye.renderer import Camera
+from codesign.eye.population import EyeStates
+from codesign.eye.renderer import PinholeCamera
 
-CAMERA = Camera(pixels=80, pitch_um=18.0)
+CAMERA = PinholeCamera(pixels=80, pitch_um=18.0)
 
 
 def test_same_seed_same_frames_whoever_asks():
@@ -17,7 +17,7 @@ def test_same_seed_same_frames_whoever_asks():
         dataset.states_at(torch.arange(k, 8, 3), 3) for k in range(3)
     ]  # three workers
     order = torch.cat([torch.arange(k, 8, 3) for k in range(3)])
-    for name in States.__slots__:
+    for name in EyeStates.__slots__:
         assert torch.equal(
             getattr(whole, name)[order], torch.cat([getattr(p, name) for p in parts])
         )
@@ -32,11 +32,11 @@ def test_triplets_are_in_the_linear_regime():
     with them.
     """
     states = dataset.states_at(torch.arange(6), 1)
-    exact = renderer.sensitivities(states, camera=CAMERA)
+    exact = renderer.render_sensitivities(states, camera=CAMERA)
     for name, want in (("gaze", exact.first), ("slip", exact.second)):
         errors = []
         for part in (4.0, 1.0):
-            t = dataset.triplets(
+            t = dataset.render_triplets(
                 states,
                 gaze_step_rad=3.5e-5 * part,
                 slip_step_um=1.0 * part,

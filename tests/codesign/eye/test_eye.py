@@ -11,16 +11,16 @@ import torch
 
 from codesign.eye import landmarks, model
 from codesign.eye import population as eye
-from codesign.eye.population import POPULATION, Motion, Rig, States
-from codesign.eye.renderer import Camera
-from metalens.ground.errors import SceneError
+from codesign.eye.population import POPULATION, CameraRig, EyeStates, MotionRanges
+from codesign.eye.renderer import PinholeCamera
+from metalens.core.errors import SceneError
 
-FRONTAL = Rig(elevation_rad=0.0, aim_um=(0.0, 0.0))
+FRONTAL = CameraRig(elevation_rad=0.0, aim_um=(0.0, 0.0))
 
 
 def mean_states(n=1, **changes):
     """The mean subject, looking straight ahead, nothing slipped."""
-    still = eye.draw(n, 0)
+    still = eye.draw_states(n, 0)
     traits = torch.tensor(
         [[t.mean for t in POPULATION.values()]] * n, dtype=torch.float64
     )
@@ -29,18 +29,20 @@ def mean_states(n=1, **changes):
         torch.zeros(n, 2, dtype=torch.float64),
         torch.zeros(n, 3, dtype=torch.float64),
     )
-    base = States(traits, still.textures, pair, zero, triple, pair, zero + 1, zero + 1)
+    base = EyeStates(
+        traits, still.textures, pair, zero, triple, pair, zero + 1, zero + 1
+    )
     return replace(base, **changes)
 
 
 def pack(states, rig=FRONTAL):
-    return eye.parameters(states, rig, pixel_rad=0.0045)
+    return eye.model_parameters(states, rig, pixel_rad=0.0045)
 
 
 def test_same_seed_same_states_and_limits_hold():
-    a, b = eye.draw(200, 7), eye.draw(200, 7)
+    a, b = eye.draw_states(200, 7), eye.draw_states(200, 7)
     assert all(
-        torch.equal(getattr(a, name), getattr(b, name)) for name in States.__slots__
+        torch.equal(getattr(a, name), getattr(b, name)) for name in EyeStates.__slots__
     )
     for name, trait in POPULATION.items():
         values = a.trait(name)
@@ -53,7 +55,7 @@ def test_people_are_cut_where_few_of_them_are():
     trait's: the longer tail of a normal
     cut at 1.5 and never moves it by 0.14 of a deviation. A thousand draws tell it to
     0.03, four times that."""
-    drawn = eye.draw(1000, 3)
+    drawn = eye.draw_states(1000, 3)
     for name, trait in POPULATION.items():
         values = drawn.trait(name).double().numpy()
         if trait.sd == 0:
@@ -112,7 +114,8 @@ def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
 
 def test_refracted_rays_obey_snell_at_the_cornea():
     p = pack(
-        mean_states(gaze_rad=torch.tensor([[0.35, 0.2]], dtype=torch.float64)), Rig()
+        mean_states(gaze_rad=torch.tensor([[0.35, 0.2]], dtype=torch.float64)),
+        CameraRig(),
     )
     target = torch.tensor([[[1500.0, -700.0]]], dtype=torch.float64)
     t = landmarks.iris_to_camera(p, target)[0, 0].numpy()
@@ -140,7 +143,7 @@ def test_slip_to_plus_x_moves_landmarks_by_the_pinhole_law():
         mean_states(),
         mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64)),
     )
-    camera = Camera()
+    camera = PinholeCamera()
     a, b = (
         camera.position_px(landmarks.landmark_points(pack(s)), FRONTAL)[0]
         for s in (still, moved)
@@ -154,7 +157,7 @@ def test_slip_to_plus_x_moves_landmarks_by_the_pinhole_law():
 
 def test_visual_axis_is_kappa_from_the_optic_axis():
     states = mean_states()
-    optic, visual = eye.directions(states, FRONTAL)
+    optic, visual = eye.eye_axes(states, FRONTAL)
     want = math.hypot(math.tan(math.radians(5)), math.tan(math.radians(1.5)))
     assert float(
         torch.linalg.cross(optic, visual).norm() / (optic * visual).sum()
@@ -163,10 +166,10 @@ def test_visual_axis_is_kappa_from_the_optic_axis():
 
 
 def test_gradient_of_the_parameters_is_exact():
-    states = eye.draw(3, 5)
+    states = eye.draw_states(3, 5)
 
     def packed(gaze, slip):
-        p = pack(replace(states, gaze_rad=gaze, slip_um=slip), Rig())
+        p = pack(replace(states, gaze_rad=gaze, slip_um=slip), CameraRig())
         return torch.cat(
             [p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1
         )  # edge and exposure are held
@@ -184,11 +187,13 @@ def test_unusable_states_are_refused_by_name():
     with pytest.raises(SceneError, match="gaze_rad has shape"):
         mean_states(gaze_rad=torch.zeros(1, 3, dtype=torch.float64))
     with pytest.raises(SceneError, match="lamps"):
-        Rig(lamps_um=())
+        CameraRig(lamps_um=())
 
 
 def test_motion_ranges_hold():
-    drawn = eye.draw(500, 1, motion=Motion(slip_um=(1.0, 2.0, 3.0), scale=0.2))
+    drawn = eye.draw_states(
+        500, 1, motion=MotionRanges(slip_um=(1.0, 2.0, 3.0), scale=0.2)
+    )
     assert (drawn.slip_um.abs().amax(0) <= torch.tensor([1.0, 2.0, 3.0])).all()
     assert 0.8 <= float(drawn.scale.min()) < float(drawn.scale.max()) <= 1.2
 

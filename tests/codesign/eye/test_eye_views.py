@@ -8,13 +8,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.eye import Rig, renderer
+from codesign.eye import CameraRig, renderer
 from codesign.eye import population as eye
-from codesign.eye.renderer import Camera
-from codesign.eye.view import View, face_axes, seen_axes
-from metalens.ground.errors import SceneError
+from codesign.eye.renderer import PinholeCamera
+from codesign.eye.view import CameraView, face_axes, seen_axes
+from metalens.core.errors import SceneError
 
-STATES, SMALL = eye.draw(3, 5), Camera(48, 26.0)
+STATES, SMALL = eye.draw_states(3, 5), PinholeCamera(48, 26.0)
 
 
 def views(
@@ -28,7 +28,7 @@ def views(
         torch.tensor(v, dtype=torch.float64) * (math.pi / 180)
         for v in (tilt, side, roll)
     )
-    return View(*turns, torch.tensor(wide, dtype=torch.float64))
+    return CameraView(*turns, torch.tensor(wide, dtype=torch.float64))
 
 
 def test_the_face_sees_a_camera_where_it_was_put():
@@ -65,12 +65,12 @@ def test_a_tilt_is_a_rig_of_another_elevation_frame_by_frame():
     tilt = (20.0, 0.0, -13.0)
     whole = renderer.render(STATES, camera=SMALL, view=views(tilt=tilt))
     for k in range(3):
-        rig = Rig(elevation_rad=Rig().elevation_rad - math.radians(tilt[k]))
+        rig = CameraRig(elevation_rad=CameraRig().elevation_rad - math.radians(tilt[k]))
         alone = renderer.render(STATES[k : k + 1], rig=rig, camera=SMALL)
         torch.testing.assert_close(
             whole.pinhole()[k], alone.pinhole()[0], rtol=1e-5, atol=1e-6
         )  # float32
-        for name in renderer.Labels.__slots__:
+        for name in renderer.FrameLabels.__slots__:
             torch.testing.assert_close(
                 getattr(whole.labels, name)[k],
                 getattr(alone.labels, name)[0],
@@ -87,7 +87,7 @@ def test_a_turned_camera_turns_the_picture_about_its_middle():
     still = replace(
         STATES, slip_um=torch.zeros(3, 3, dtype=torch.float64), mount_rad=zero
     )
-    rig, roll = Rig(aim_um=(0.0, 0.0)), (25.0, -14.0, 90.0)
+    rig, roll = CameraRig(aim_um=(0.0, 0.0)), (25.0, -14.0, 90.0)
     plain = renderer.render(still, rig=rig, camera=SMALL).labels
     turned = renderer.render(still, rig=rig, camera=SMALL, view=views(roll=roll)).labels
     for name in ("landmarks_px", "pupil_px"):
@@ -106,7 +106,9 @@ def test_a_wider_picture_is_that_of_a_coarser_grid_and_of_a_smaller_eye_at_its_d
     wide = (2.0, 1.0, 2.0)  # powers of two: to the bit
     got = renderer.render(STATES, camera=SMALL, view=views(wide=wide))
     for k in range(3):
-        coarse = renderer.render(STATES[k : k + 1], camera=Camera(48, 26.0 * wide[k]))
+        coarse = renderer.render(
+            STATES[k : k + 1], camera=PinholeCamera(48, 26.0 * wide[k])
+        )
         for name in ("radiance", "coverage", "depth_um"):
             assert torch.equal(
                 getattr(got.frames, name)[k], getattr(coarse.frames, name)[0]
@@ -122,7 +124,9 @@ def test_a_wider_picture_is_that_of_a_coarser_grid_and_of_a_smaller_eye_at_its_d
     )
     torch.testing.assert_close(got.labels.centre_um, near.centre_um * shrink)
     torch.testing.assert_close(got.labels.pupil_um, near.pupil_um * shrink)
-    here = torch.tensor([*Rig().aim_um, Rig().distance_um], dtype=torch.float64)
+    here = torch.tensor(
+        [*CameraRig().aim_um, CameraRig().distance_um], dtype=torch.float64
+    )
     torch.testing.assert_close(
         got.labels.slip_um, (here + STATES.slip_um) * shrink - here
     )

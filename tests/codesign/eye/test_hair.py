@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.eye.hair import lashes
+from codesign.eye.hair import draw_lashes
 
 SIZE, TOP, BOTTOM, LEFT, RIGHT = (
     120,
@@ -24,7 +24,7 @@ def drawn(sink, rise):
     """Rows that have a stroke, and the picture."""
     opening = torch.zeros(SIZE, SIZE)
     opening[TOP : BOTTOM + 1, LEFT : RIGHT + 1] = 1
-    picture = lashes(
+    picture = draw_lashes(
         opening, np.array([0.37, 0.4, sink, rise, 0.9, *[0.0] * 7])
     ).numpy()
     return np.flatnonzero(picture.any(1)), picture
@@ -80,5 +80,5 @@ def test_lashes_lean_outward():
 
 
 def test_no_lashes_without_an_opening_and_the_same_from_the_same_draws():
-    assert not lashes(torch.zeros(SIZE, SIZE), np.full(12, 0.6)).any()
+    assert not draw_lashes(torch.zeros(SIZE, SIZE), np.full(12, 0.6)).any()
     assert np.array_equal(drawn(0.3, 0.5)[1], drawn(0.3, 0.5)[1])

@@ -85,7 +85,9 @@ def test_what_is_nearer_than_half_a_millimetre_is_projected_from_there():
         dtype=torch.float64,
     )
     want = [[0.06, -0.04], [0.06, -0.04], [0.0375, -0.025]]
-    assert landmarks.project(points).numpy() == pytest.approx(np.array(want), rel=1e-12)
+    assert landmarks.project_points(points).numpy() == pytest.approx(
+        np.array(want), rel=1e-12
+    )
 
 
 def landed(tangents):

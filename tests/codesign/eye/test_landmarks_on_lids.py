@@ -8,7 +8,13 @@ import torch
 
 from codesign.eye import model
 from codesign.eye.landmarks import iris_to_camera, landmark_points
-from codesign.eye.population import POPULATION, Rig, States, draw, parameters
+from codesign.eye.population import (
+    POPULATION,
+    CameraRig,
+    EyeStates,
+    draw_states,
+    model_parameters,
+)
 
 
 def test_corners_and_margins_of_the_lids_are_where_their_ball_is_met():
@@ -62,11 +68,11 @@ def test_a_point_that_no_ray_shows_is_projected_straight_and_leaves_the_others_a
         torch.zeros(2).double(),
         torch.zeros(2, 3),
     )
-    still = draw(2, 0)
-    states = States(
+    still = draw_states(2, 0)
+    states = EyeStates(
         traits, still.textures, gaze, none, slip.double(), 0 * gaze, none + 1, none + 1
     )
-    p = parameters(states, Rig(), pixel_rad=0.0045)
+    p = model_parameters(states, CameraRig(), pixel_rad=0.0045)
     near = torch.tensor(
         [[900.0, -400.0], [0.0, 1300.0], [-700.0, -250.0]], dtype=torch.float64
     ).expand(2, 3, 2)

@@ -13,7 +13,7 @@ def test_traits_of_many_subjects_have_the_documented_mean_and_deviation():
     """4000 draws: means to 1.6 % of a deviation, deviations to 1.1 %, three times that;
     what limits of two deviations
     and more cut off takes a tenth of them at most."""
-    drawn = population.draw(4000, 3).traits.numpy()
+    drawn = population.draw_states(4000, 3).traits.numpy()
     assert drawn.shape == (4000, len(POPULATION))
     for column, (name, trait) in zip(drawn.T, POPULATION.items(), strict=True):
         assert trait.low <= column.min() <= trait.mean <= column.max() <= trait.high, (

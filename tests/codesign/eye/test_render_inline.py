@@ -106,8 +106,8 @@ def test_every_name_of_a_pass_is_assigned_once():
 
 def test_pairs_hold_every_texture_pixel_with_its_right_neighbour():
     bank, pairs = (
-        textures.bank(0),
-        textures.pairs(0).reshape(-1, textures.SIZE, textures.SIZE),
+        textures.texture_bank(0),
+        textures.packed_bank(0).reshape(-1, textures.SIZE, textures.SIZE),
     )
     steps = np.round(bank * textures.STEPS)
     np.testing.assert_array_equal((pairs << 16) >> 16, steps)

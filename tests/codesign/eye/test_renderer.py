@@ -14,20 +14,22 @@ import torch
 
 from codesign.eye import kernel, renderer
 from codesign.eye import population as eye
-from codesign.eye.population import POPULATION, Rig, States
-from codesign.eye.renderer import Camera
+from codesign.eye.population import POPULATION, CameraRig, EyeStates
+from codesign.eye.renderer import PinholeCamera
 
-SMALL = Camera(pixels=64, pitch_um=22.5)
-STATES = eye.draw(4, 5)
+SMALL = PinholeCamera(pixels=64, pitch_um=22.5)
+STATES = eye.draw_states(4, 5)
 
 
 def _p(states, camera=SMALL):
-    return eye.parameters(states, Rig(), pixel_rad=camera.pitch_um / 2000.0)
+    return eye.model_parameters(states, CameraRig(), pixel_rad=camera.pitch_um / 2000.0)
 
 
 def test_compiled_frames_agree_with_the_twin():
     out = renderer.render(STATES, camera=SMALL)
-    light, cover, depth, pupil = renderer.twin(_p(STATES), Rig(), SMALL)
+    light, cover, depth, pupil = renderer.render_in_torch(
+        _p(STATES), CameraRig(), SMALL
+    )
     assert (
         float((light - out.frames.radiance).abs().max()) < 1e-3
     )  # float32 on edges a pixel wide
@@ -48,13 +50,15 @@ def test_the_compiled_loops_are_found_again_in_the_cache():
 
 @pytest.mark.parametrize("pixels", [1, 13, 37])
 def test_frames_that_do_not_fill_the_tiles_agree_with_the_twin(pixels):
-    camera = Camera(pixels=pixels, pitch_um=1440 / pixels)
+    camera = PinholeCamera(pixels=pixels, pitch_um=1440 / pixels)
     out = renderer.render(STATES, camera=camera)
-    light, cover, _, pupil = renderer.twin(_p(STATES, camera), Rig(), camera)
+    light, cover, _, pupil = renderer.render_in_torch(
+        _p(STATES, camera), CameraRig(), camera
+    )
     assert float((light - out.frames.radiance).abs().max()) < 1e-3
     assert float((cover - out.frames.coverage).abs().max()) < 1e-3
     assert float((pupil - out.pupil).abs().max()) < 1e-3
-    slopes = renderer.sensitivities(STATES, camera=camera).frames
+    slopes = renderer.render_sensitivities(STATES, camera=camera).frames
     assert float((slopes.radiance - out.frames.radiance).abs().max()) < 1e-3
 
 
@@ -96,11 +100,15 @@ def test_the_process_that_compiles_the_loop_and_the_next_one_give_the_same_bytes
 
 def test_compiled_derivatives_agree_with_exact_ones():
     motions = ("gaze_y", "slip_z")
-    got = renderer.sensitivities(STATES, motions, camera=SMALL)
-    p, *along = renderer.parameter_tangents(STATES, motions, rig=Rig(), camera=SMALL)
+    got = renderer.render_sensitivities(STATES, motions, camera=SMALL)
+    p, *along = renderer.parameter_tangents(
+        STATES, motions, rig=CameraRig(), camera=SMALL
+    )
     for part, tangent in zip((got.first, got.second), along, strict=True):
         _, want = torch.func.jvp(
-            lambda q: renderer.twin(q, Rig(), SMALL)[:2], (p,), (tangent,)
+            lambda q: renderer.render_in_torch(q, CameraRig(), SMALL)[:2],
+            (p,),
+            (tangent,),
         )
         assert float((part.radiance - want[0]).norm() / want[0].norm()) < 1e-3
         assert float((part.coverage - want[1]).norm() / want[1].norm()) < 1e-3
@@ -111,17 +119,17 @@ def test_twin_derivative_is_the_limit_of_differences_and_usual_steps_are_not():
     move by pixels.
     """
     p, along, _ = renderer.parameter_tangents(
-        STATES, ("gaze_x", "slip_z"), rig=Rig(), camera=SMALL
+        STATES, ("gaze_x", "slip_z"), rig=CameraRig(), camera=SMALL
     )
     _, exact = torch.func.jvp(
-        lambda q: renderer.twin(q, Rig(), SMALL)[0], (p,), (along,)
+        lambda q: renderer.render_in_torch(q, CameraRig(), SMALL)[0], (p,), (along,)
     )
 
     def difference(step):
         moved = replace(STATES, gaze_rad=STATES.gaze_rad + torch.tensor([step, 0.0]))
         return (
-            renderer.twin(_p(moved), Rig(), SMALL)[0]
-            - renderer.twin(p, Rig(), SMALL)[0]
+            renderer.render_in_torch(_p(moved), CameraRig(), SMALL)[0]
+            - renderer.render_in_torch(p, CameraRig(), SMALL)[0]
         ) / step
 
     def error(step):
@@ -135,13 +143,13 @@ def test_a_pupil_smaller_than_a_pixel_is_seen_as_whole_as_it_is():
     """The same eyes on pixels sixty times as wide: of pupils of less than one pixel
     nearly all is visible still.
     """
-    coarse = Camera(pixels=5, pitch_um=600.0)
+    coarse = PinholeCamera(pixels=5, pitch_um=600.0)
     wide = replace(
         STATES,
         gaze_rad=torch.zeros(4, 2, dtype=torch.float64),
         slip_um=torch.zeros(4, 3, dtype=torch.float64),
     )
-    out = renderer.render(wide, rig=Rig(elevation_rad=0.0), camera=coarse)
+    out = renderer.render(wide, rig=CameraRig(elevation_rad=0.0), camera=coarse)
     area = out.pupil.sum((-1, -2))
     assert (
         float(area.max()) < 0.8 < float(out.labels.visible.min())
@@ -158,13 +166,13 @@ def test_nothing_is_seen_behind_closed_lids():
 
 
 def test_mask_is_centred_on_the_refracted_outline():
-    frontal = Rig(elevation_rad=0.0, aim_um=(500.0, 300.0))
+    frontal = CameraRig(elevation_rad=0.0, aim_um=(500.0, 300.0))
     wide = replace(
         STATES,
         gaze_rad=torch.zeros(4, 2, dtype=torch.float64),
         slip_um=torch.zeros(4, 3, dtype=torch.float64),
     )
-    labels = renderer.render(wide, rig=frontal, camera=Camera()).labels
+    labels = renderer.render(wide, rig=frontal, camera=PinholeCamera()).labels
     assert (
         float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4
     )  # oblique refraction: under 0.4 px
@@ -191,7 +199,7 @@ def test_same_states_same_frames_alone_or_in_a_batch():
 def extremes(count, seed):
     """States far beyond any population: every limit of the renderer is met."""
     rng = np.random.default_rng(seed)
-    base = eye.draw(count, seed)
+    base = eye.draw_states(count, seed)
     gaze = rng.choice(
         [0, 0.1, math.pi / 2, math.pi, -math.pi / 2, 2.5], (count, 2)
     ) * rng.choice([1, 1, 1.001], (count, 2))
@@ -205,25 +213,27 @@ def extremes(count, seed):
         rng.choice([0.0, 0.5, 1e4], count)
     )
     aperture = torch.from_numpy(rng.choice([0.0, 0.05, 1.0, 3.0], count))
-    return States(
+    return EyeStates(
         traits, base.textures, torch.from_numpy(gaze), base.torsion_rad, torch.from_numpy(slip), 30 * base.mount_rad,
         aperture, base.scale,
     )  # fmt: skip
 
 
 def _fuzz(count):
-    camera = Camera(pixels=20, pitch_um=90.0)
+    camera = PinholeCamera(pixels=20, pitch_um=90.0)
     for start in range(0, count, 500):
         states = extremes(min(500, count - start), start)
         out = renderer.render(states, camera=camera)
-        rates = renderer.sensitivities(states, camera=camera)
+        rates = renderer.render_sensitivities(states, camera=camera)
         checked = [
             out.frames.radiance,
             out.frames.coverage,
             out.frames.depth_um,
             out.pupil,
         ]
-        checked += [getattr(out.labels, name) for name in renderer.Labels.__slots__]
+        checked += [
+            getattr(out.labels, name) for name in renderer.FrameLabels.__slots__
+        ]
         checked += [
             f
             for part in (rates.first, rates.second)
@@ -263,7 +273,9 @@ def test_hidden_pupils_have_empty_masks_or_thin_ones(name, change):
 
 def test_gradient_of_the_twin_is_finite_at_the_limits():
     states = extremes(60, 3)
-    p = eye.parameters(states, Rig(), pixel_rad=0.045).requires_grad_(True)
-    light, *_ = renderer.twin(p, Rig(), Camera(pixels=12, pitch_um=150.0))
+    p = eye.model_parameters(states, CameraRig(), pixel_rad=0.045).requires_grad_(True)
+    light, *_ = renderer.render_in_torch(
+        p, CameraRig(), PinholeCamera(pixels=12, pitch_um=150.0)
+    )
     light.sum().backward()
     assert bool(torch.isfinite(p.grad).all())

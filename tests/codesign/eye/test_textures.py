@@ -16,7 +16,7 @@ def test_spectrum_of_a_field_falls_by_its_power_and_is_stretched_along_y(
     rng = np.random.default_rng(1)
     shape = (48, 64)
     fields = [
-        textures.noise(rng, power=power, stretch=stretch, shape=shape)
+        textures.periodic_noise(rng, power=power, stretch=stretch, shape=shape)
         for _ in range(240)
     ]
     assert all(

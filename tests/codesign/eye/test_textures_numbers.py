@@ -43,7 +43,7 @@ def noises(monkeypatch):
         asked.append((power, stretch, shape))
         return fields.setdefault(len(asked), RNG.normal(size=shape))
 
-    monkeypatch.setattr(textures, "noise", noise)
+    monkeypatch.setattr(textures, "periodic_noise", noise)
     return asked, fields
 
 
@@ -150,12 +150,12 @@ def test_values_between_pixels_wrap_along_the_turn_and_stop_at_the_rim():
 
 
 def test_pixels_are_kept_with_their_right_neighbours():
-    bank = textures.bank(0)
+    bank = textures.texture_bank(0)
     assert bank.shape == (5 * 16, 256, 256)
     assert np.abs(bank).max() <= 1
     steps = np.round(bank.astype(float) * 32767).astype(int)
     assert np.abs(bank - steps / 32767).max() < 1e-7
-    words = textures.pairs(0).reshape(bank.shape)
+    words = textures.packed_bank(0).reshape(bank.shape)
     here, right = (words << 16) >> 16, words >> 16
     assert np.array_equal(here, steps)
     assert np.array_equal(right, np.roll(steps, -1, axis=2))

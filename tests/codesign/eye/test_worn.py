@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches.flat import flattened
+from codesign.batches.flat import flatten_layers
 from codesign.batches.scenes import EyeScenes, SceneConfig
 from codesign.eye import renderer
 from codesign.eye import worn as wear
-from codesign.eye.renderer import Labels, Rendered
+from codesign.eye.renderer import FrameLabels, RenderedFrames
 from metalens.image import Frames
 
 N = 64
@@ -37,7 +37,7 @@ def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
         torch.zeros(1, 3, dtype=torch.float64),
     )
     place = torch.tensor([[34.5, 29.5]], dtype=torch.float64)
-    labels = Labels(
+    labels = FrameLabels(
         three,
         three,
         three,
@@ -49,7 +49,7 @@ def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
         one + 0.9,
         torch.zeros(1, 9, 2),
     )
-    return Rendered(Frames(light, cover, depth), pupil, labels)
+    return RenderedFrames(Frames(light, cover, depth), pupil, labels)
 
 
 def put_on(made, draws=None, **size):
@@ -58,7 +58,9 @@ def put_on(made, draws=None, **size):
         name: np.array([v]) for name, v in size.items()
     }
     placed = np.full((1, 12), 0.3) if draws is None else np.array([draws])
-    return wear.dressed(made, wear.Worn(all_of, dict.fromkeys(wear.CAUSES, placed)))
+    return wear.apply_augmentations(
+        made, wear.DrawnAugmentations(all_of, dict.fromkeys(wear.CAUSES, placed))
+    )
 
 
 def test_light_that_falls_off_is_a_plane_through_1_in_the_middle():
@@ -160,7 +162,7 @@ def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
 
 def test_dressed_frames_have_a_depth_wherever_they_are_seen():
     made = SCENES.rendered(4, 8)  # a rim is among them
-    flat = flattened(made.frames, torch.ones(8))
+    flat = flatten_layers(made.frames, torch.ones(8))
     assert (
         flat.depth_um.min() > 4000
     )  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
@@ -206,9 +208,9 @@ def test_a_moved_mask_keeps_its_area_and_centre_and_depths_stay():
 
 
 def test_nothing_is_worn_up_to_variety_1_and_the_share_of_the_record_at_2():
-    off = wear.drawn(2000, 1.0, np.random.default_rng(0))
+    off = wear.draw_augmentations(2000, 1.0, np.random.default_rng(0))
     assert not any(size.any() for size in off.size.values())
-    on = wear.drawn(2000, 2.0, np.random.default_rng(0))
+    on = wear.draw_augmentations(2000, 2.0, np.random.default_rng(0))
     for name, cause in wear.CAUSES.items():
         size = on.size[name][on.size[name] != 0]
         assert len(size) / 2000 == pytest.approx(
@@ -217,7 +219,7 @@ def test_nothing_is_worn_up_to_variety_1_and_the_share_of_the_record_at_2():
         assert cause.low <= size.min() < size.max() <= cause.high
         assert cause.unit
         assert cause.what
-    more = wear.drawn(2000, 3.0, np.random.default_rng(0))
+    more = wear.draw_augmentations(2000, 3.0, np.random.default_rng(0))
     assert all(
         np.array_equal(more.size[name][size != 0], size[size != 0])
         for name, size in on.size.items()

@@ -9,7 +9,7 @@ from codesign.eye import worn
 
 def test_causes_share_no_draw():
     """Correlation of two causes' places over 4000 frames: four sigma of 1 / √n."""
-    found = worn.drawn(4000, 2.0, np.random.default_rng(7))
+    found = worn.draw_augmentations(4000, 2.0, np.random.default_rng(7))
     for one, other in itertools.combinations(worn.CAUSES, 2):
         a, b = found.draws[one], found.draws[other]
         a, b = ((c - c.mean(0)) / c.std(0) for c in (a, b))
@@ -18,7 +18,7 @@ def test_causes_share_no_draw():
 
 
 def test_the_light_s_direction_says_nothing_of_the_rim_s():
-    found = worn.drawn(4000, 4.0, np.random.default_rng(1))
+    found = worn.draw_augmentations(4000, 4.0, np.random.default_rng(1))
     both = (found.size["gradient"] > 0) & (found.size["rim"] > 0)
     turns = [6.283 * found.draws[name][both, 7] for name in ("gradient", "rim")]
     assert both.sum() > 300

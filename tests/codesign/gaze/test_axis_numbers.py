@@ -10,7 +10,7 @@ import torch
 
 from codesign.gaze import axis
 from codesign.gaze.axis import EyeGeometry
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 
 EYE = EyeGeometry((1.5, -2.0, 40.0), radius_mm=9.0, sensor_distance_mm=3.0)
 SLIP = np.array([[0.0, 0.0, 0.0], [2.0, -1.0, 3.0], [-1.5, 0.5, -2.0]])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from codesign.gaze import axis as gaze
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from tests.referees.seen_pupil import pupil_of
 
 GEOMETRY = gaze.EyeGeometry(centre_mm=(1.0, -14.0, 27.0))

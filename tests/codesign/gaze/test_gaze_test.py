@@ -10,15 +10,15 @@ import torch
 
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
 from codesign.gaze import bench
-from codesign.gaze.bench import gaze_errors, people
-from metalens.ground.errors import TrainingError
+from codesign.gaze.bench import gaze_errors, simulate_people
+from metalens.core.errors import TrainingError
 
 SCENES = EyeScenes(SceneConfig(pixels=64, margin=8), 18.0, 2000.0, 0, TEST)
 
 
 @pytest.fixture(scope="module")
 def group():
-    return people(SCENES, 6, 60, seed=1)
+    return simulate_people(SCENES, 6, 60, seed=1)
 
 
 def _truth(group):
@@ -65,7 +65,7 @@ def test_an_axis_that_is_read_is_calibrated_by_what_other_people_s_tells(group):
     from twelve frames, and what turns
     kappa with the gaze is common. Pupil and slippage read to 0.3 mm leave the sphere
     1.8 degrees a frame."""
-    before = people(SCENES, 32, 60, seed=8)
+    before = simulate_people(SCENES, 32, 60, seed=8)
     found = []
     for seed, who in enumerate((before, group)):
         true, rng = _truth(who), torch.Generator().manual_seed(seed)
@@ -76,7 +76,7 @@ def test_an_axis_that_is_read_is_calibrated_by_what_other_people_s_tells(group):
         centre = torch.from_numpy(true.pupil_mm / (64 * 18e-3))
         found.append(bench.read_of(who, centre, slip, 1.7 * axis))
     theirs, read = found
-    told = gaze_errors(group, read, how=bench.learnt(before, theirs))
+    told = gaze_errors(group, read, how=bench.learn_from_people(before, theirs))
     assert (
         told.personal_deg < 0.38 * 1.3
     )  # twelve points for a dozen terms of one's own

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from codesign.gaze import people_file
-from codesign.gaze.shared import Mixed, People
-from metalens.ground.errors import StoreError
+from codesign.gaze.shared import MixedModel, PopulationPrior
+from metalens.core.errors import StoreError
 
 RNG = np.random.default_rng(1)
-MODEL = Mixed(
+MODEL = MixedModel(
     RNG.normal(size=(36, 2)), RNG.uniform(0.1, 2, (36, 2)), np.array([0.3, 0.7])
 )
-PEOPLE = People(MODEL, RNG.normal(size=7), RNG.uniform(0.5, 3, 7))
+PEOPLE = PopulationPrior(MODEL, RNG.normal(size=7), RNG.uniform(0.5, 3, 7))
 
 
 def test_a_file_holds_every_number_in_its_place(tmp_path):
-    people_file.save(tmp_path / "p.h5", PEOPLE)
-    again = people_file.load(tmp_path / "p.h5")
+    people_file.save_people(tmp_path / "p.h5", PEOPLE)
+    again = people_file.load_people(tmp_path / "p.h5")
     parts = [
         (again.model.mean, MODEL.mean),
         (again.model.variance, MODEL.variance),
@@ -49,14 +49,14 @@ def test_what_spreads_is_above_zero_everywhere(tmp_path, name, odd, read):
     """One number of many, by a picounit above nothing or at it."""
     value = (getattr(MODEL, name) if name != "spread" else PEOPLE.spread).copy()
     value.flat[-1] = odd
-    people_file.save(tmp_path / "p.h5", changed(name, value))
+    people_file.save_people(tmp_path / "p.h5", changed(name, value))
     if read:
-        assert people_file.load(tmp_path / "p.h5")
+        assert people_file.load_people(tmp_path / "p.h5")
     else:
         with pytest.raises(
             StoreError, match=f"p.h5: {name} of a shape or value that no people have"
         ):
-            people_file.load(tmp_path / "p.h5")
+            people_file.load_people(tmp_path / "p.h5")
 
 
 @pytest.mark.parametrize(
@@ -66,15 +66,17 @@ def test_what_spreads_is_above_zero_everywhere(tmp_path, name, odd, read):
 )  # fmt: skip
 def test_shapes_are_those_of_seven_readings_and_their_products(tmp_path, name, shape):
     """1 + 7 + 28 terms of 7 readings, two angles."""
-    people_file.save(tmp_path / "p.h5", changed(name, np.ones(shape)))
+    people_file.save_people(tmp_path / "p.h5", changed(name, np.ones(shape)))
     with pytest.raises(StoreError, match=f"{name} of a shape"):
-        people_file.load(tmp_path / "p.h5")
+        people_file.load_people(tmp_path / "p.h5")
 
 
 def test_values_of_any_sign_stand_where_nothing_spreads(tmp_path):
     made = changed("mean", -MODEL.mean)
-    people_file.save(tmp_path / "p.h5", made)
-    assert np.array_equal(people_file.load(tmp_path / "p.h5").model.mean, -MODEL.mean)
-    people_file.save(tmp_path / "q.h5", changed("middle", np.full(7, -np.inf)))
+    people_file.save_people(tmp_path / "p.h5", made)
+    assert np.array_equal(
+        people_file.load_people(tmp_path / "p.h5").model.mean, -MODEL.mean
+    )
+    people_file.save_people(tmp_path / "q.h5", changed("middle", np.full(7, -np.inf)))
     with pytest.raises(StoreError, match="middle"):
-        people_file.load(tmp_path / "q.h5")
+        people_file.load_people(tmp_path / "q.h5")

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from codesign.eye import population as eye
-from codesign.eye.population import Rig
+from codesign.eye.population import CameraRig
 from codesign.gaze import personal
 from codesign.gaze.axis import EyeGeometry
-from codesign.gaze.readings import Readings
-from metalens.ground.errors import TrainingError
+from codesign.gaze.readings import NetworkReadings
+from metalens.core.errors import TrainingError
 from tests.referees.seen_pupil import pupil_of
 
-RIG = Rig()
+RIG = CameraRig()
 GRID = np.stack(
     [g.ravel() for g in np.meshgrid(np.linspace(-17, 17, 5), np.linspace(-12, 12, 5))],
     1,
@@ -34,7 +34,7 @@ def _person(slip_mm, *, beside=(0.6, -0.4, 0.5), larger=0.4, kappa_deg=(5.0, 1.5
         (x, y, z), radius * 1e-3 + larger, RIG.sensor_distance_um * 1e-3
     )
     gaze = np.tile(GRID, (len(slip_mm), 1))
-    face = personal.direction(np.radians(gaze + kappa_deg))
+    face = personal.gaze_direction(np.radians(gaze + kappa_deg))
     s, c = math.sin(RIG.elevation_rad), math.cos(RIG.elevation_rad)
     direction = face @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
     slips = np.repeat(slip_mm, len(GRID), 0)
@@ -78,11 +78,13 @@ def test_the_sphere_of_a_person_off_the_mean_is_found_from_seven_stimuli():
     """
     pupil, slip, gaze = _person(SLIPS)
     known = _known(gaze, 4)
-    person = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG)
+    person = personal.calibrate_person(pupil[known], slip[known], gaze[known], rig=RIG)
     error = personal.angle_deg(
-        person(Readings(pupil[~known], slip[~known])), gaze[~known]
+        person(NetworkReadings(pupil[~known], slip[~known])), gaze[~known]
     )
-    alone = personal.fit(pupil[known], slip[known], gaze[known], rig=RIG, hidden=0)
+    alone = personal.calibrate_person(
+        pupil[known], slip[known], gaze[known], rig=RIG, hidden=0
+    )
     assert known.sum() == 49
     assert error.mean() < 0.15
     assert personal.angle_deg(alone.sphere(pupil, slip), gaze).mean() < 0.25
@@ -99,10 +101,10 @@ def test_noisy_slippage_makes_the_regressor_careful():
     pupil, slip, gaze = _person(SLIPS[:1])
     read = slip + 0.3 * rng.standard_normal(slip.shape)
     known = _known(gaze, 3)
-    person = personal.fit(pupil[known], read[known], gaze[known], rig=RIG)
+    person = personal.calibrate_person(pupil[known], read[known], gaze[known], rig=RIG)
     assert (
         personal.angle_deg(
-            person(Readings(pupil[~known], read[~known])), gaze[~known]
+            person(NetworkReadings(pupil[~known], read[~known])), gaze[~known]
         ).mean()
         < 4.0
     )
@@ -122,7 +124,9 @@ def test_angles_between_directions():
 
 def test_two_points_are_refused():
     with pytest.raises(TrainingError, match="2 points"):
-        personal.fit(np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2)), rig=RIG)
+        personal.calibrate_person(
+            np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2)), rig=RIG
+        )
 
 
 def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
@@ -133,7 +137,7 @@ def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
     pupil, slip, gaze = _person(SLIPS[:1], beside=(0.9, -0.7, 0.8), larger=-0.5)
     some = np.random.default_rng(2).permutation(len(gaze))[:5]
     gaze = gaze[some] + np.random.default_rng(3).normal(0, 1.5, (5, 2))
-    person = personal.fit(pupil[some], slip[some], gaze, rig=RIG, hidden=0)
+    person = personal.calibrate_person(pupil[some], slip[some], gaze, rig=RIG, hidden=0)
     differ = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
 
     def missed(unit):

@@ -18,7 +18,7 @@ Y = np.stack(
 def test_penalty_is_of_squared_weights_relative_to_the_squared_error_of_a_point(
     penalty,
 ):
-    made = regressor.fit(X, Y, hidden=4, penalty=penalty, steps=20_000)
+    made = regressor.fit_regressor(X, Y, hidden=4, penalty=penalty, steps=20_000)
     x, y = (X - X.mean(0)) / X.std(0), (Y - Y.mean(0)) / Y.std(0)
     weights = np.concatenate([made.inside.ravel(), made.outside.ravel()])
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from codesign.gaze import people_file, shared
-from codesign.gaze.readings import Readings
-from metalens.ground.errors import StoreError, TrainingError
+from codesign.gaze.readings import NetworkReadings
+from metalens.core.errors import StoreError, TrainingError
 
 
 def test_variances_of_a_balanced_layout_are_those_of_the_analysis_of_variance():
@@ -24,7 +24,7 @@ def test_variances_of_a_balanced_layout_are_those_of_the_analysis_of_variance():
         + rng.normal(0, [2.0, 0.9], (k, 2))[person]
         + rng.normal(0, [0.7, 0.4], (k * m, 2))
     )
-    found = shared.mixed(
+    found = shared.fit_mixed_model(
         np.ones((k * m, 1)), answers, person, first=np.array([4.0]), rounds=400
     )
     means = answers.reshape(k, m, 2).mean(1)
@@ -52,7 +52,9 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
     truth = rng.normal([[1.0, 0.5]], [[1.5, 1.1]], (2, 6, 2))
     answers = np.stack([(design * truth[k][person]).sum(1) for k in range(2)], 1)
     answers += rng.normal(0, [0.3, 0.8], answers.shape)
-    found = shared.mixed(design, answers, person, first=np.ones(2), rounds=1000)
+    found = shared.fit_mixed_model(
+        design, answers, person, first=np.ones(2), rounds=1000
+    )
 
     def likelihood(k, mean, variance, noise):
         total = 0.0
@@ -85,7 +87,7 @@ def test_it_begins_from_one_line_for_all_and_the_spread_given():
     rng = np.random.default_rng(9)
     design = np.stack([np.ones(11), rng.normal(0, 1, 11)], 1)
     answers = rng.normal([3.0, -40.0], [0.4, 2.5], (11, 2))
-    found = shared.mixed(
+    found = shared.fit_mixed_model(
         design, answers, np.arange(11) % 3, first=np.array([4.0, 0.25]), rounds=0
     )
     line = np.linalg.solve(design.T @ design, design.T @ answers)
@@ -103,7 +105,7 @@ def test_people_who_do_not_differ_keep_a_variance_above_zero():
     """
     design = np.stack([np.ones(12), np.linspace(-1, 1, 12)], 1)
     line = np.array([[2.0, -3.0], [0.5, 4.0]])
-    found = shared.mixed(
+    found = shared.fit_mixed_model(
         design,
         design @ line,
         np.arange(12) % 4,
@@ -130,11 +132,13 @@ def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatc
     asked = []
     monkeypatch.setattr(
         shared,
-        "mixed",
-        lambda *given, first: asked.append((*given, first)) or shared.Mixed(*given),
+        "fit_mixed_model",
+        lambda *given, first: (
+            asked.append((*given, first)) or shared.MixedModel(*given)
+        ),
     )
-    read = Readings(pupil, slip, axis)
-    people = shared.learn(read, axis + 7.0, np.arange(80) % 4)
+    read = NetworkReadings(pupil, slip, axis)
+    people = shared.learn_population(read, axis + 7.0, np.arange(80) % 4)
     ((design, answers, person, first),) = asked
     assert first.tolist() == [25.0] + [1.0] * 35
     assert answers == pytest.approx(np.full((80, 2), 7.0))
@@ -165,7 +169,7 @@ def _read(rng, people, each, common):
     )
     pupil = 0.03 * gaze + 0.1 * slip[:, :2] + 0.01 * rng.normal(0, 1, gaze.shape)
     return (
-        Readings(pupil, slip, axis + 0.2 * rng.normal(0, 1, gaze.shape)),
+        NetworkReadings(pupil, slip, axis + 0.2 * rng.normal(0, 1, gaze.shape)),
         gaze,
         person,
     )
@@ -177,7 +181,7 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
     are noise, 0.25 in the mean angle; ten points leave sqrt(1 + 4 / 10) of that, and
     twice that is the bar."""
     rng = np.random.default_rng(1)
-    people = shared.learn(*_read(rng, 32, 40, 0.2))
+    people = shared.learn_population(*_read(rng, 32, 40, 0.2))
     read, gaze, _ = _read(rng, 1, 210, 0.2)
     own = people.person(read[:10], gaze[:10])
     error = np.linalg.norm(own(read[10:]) - gaze[10:], axis=1).mean()
@@ -190,9 +194,9 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
 
 
 def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_path):
-    people = shared.learn(*_read(np.random.default_rng(6), 5, 20, 0.1))
-    people_file.save(tmp_path / "p.h5", people)
-    again = people_file.load(tmp_path / "p.h5")
+    people = shared.learn_population(*_read(np.random.default_rng(6), 5, 20, 0.1))
+    people_file.save_people(tmp_path / "p.h5", people)
+    again = people_file.load_people(tmp_path / "p.h5")
     read, gaze, _ = _read(np.random.default_rng(7), 1, 8, 0.1)
     assert np.array_equal(
         again.person(read[:5], gaze[:5])(read), people.person(read[:5], gaze[:5])(read)
@@ -201,23 +205,23 @@ def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_p
         replace(people, spread=0 * people.spread),
         replace(people, middle=people.middle[:3]),
     ):
-        people_file.save(tmp_path / "odd.h5", odd)
+        people_file.save_people(tmp_path / "odd.h5", odd)
         with pytest.raises(
             StoreError, match=r"(spread|middle) of a shape or value that no people have"
         ):
-            people_file.load(tmp_path / "odd.h5")
+            people_file.load_people(tmp_path / "odd.h5")
 
 
 def test_too_few_people_frames_or_points_are_refused():
     rng = np.random.default_rng(2)
     with pytest.raises(TrainingError, match="40 frames of 1 people"):
-        shared.learn(*_read(rng, 1, 40, 0.0))
+        shared.learn_population(*_read(rng, 1, 40, 0.0))
     with pytest.raises(
         TrainingError,
         match="36 frames of 4 people tell not how people differ in 36 terms",
     ):
-        shared.learn(*_read(rng, 4, 9, 0.0))
-    people = shared.learn(*_read(rng, 6, 20, 0.0))
+        shared.learn_population(*_read(rng, 4, 9, 0.0))
+    people = shared.learn_population(*_read(rng, 6, 20, 0.0))
     read, gaze, _ = _read(rng, 1, 2, 0.0)
     with pytest.raises(TrainingError, match="2 points"):
         people.person(read, gaze)

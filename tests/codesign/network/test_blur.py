@@ -24,7 +24,7 @@ def test_power_is_that_of_the_windows_own_fourier_transform():
     just these frequencies.
     """
     frames = _frames()
-    power, mean = windows.spectra(frames)
+    power, mean = windows.window_spectra(frames)
     weight = np.hanning(33)[1::2]  # sin² at the pixels' middles
     weight = np.outer(weight, weight) / (weight**2).sum()
     for row, column in ((0, 0), (2, 5), (6, 3)):
@@ -53,7 +53,7 @@ def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
     for size in (64, 96):
         place = (torch.arange(size, dtype=torch.float64) + 0.5) / size
         wave = torch.cos(2 * math.pi * (10 * place + 6.4 * place[:, None]))
-        found.append(windows.spectra(wave[None, None].float())[0][0, :, 3, 4])
+        found.append(windows.window_spectra(wave[None, None].float())[0][0, :, 3, 4])
     assert int(found[0].argmax()) == int(found[1].argmax())
     top = int(found[0].argmax())
     assert float(found[1][top] / found[0][top]) == pytest.approx(
@@ -62,7 +62,7 @@ def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
 
 
 def test_waves_beyond_nyquist_are_left_out_on_few_pixels():
-    power, _ = windows.spectra(
+    power, _ = windows.window_spectra(
         _frames(size=24)
     )  # 6 pixels a window: 3 periods and no more
     grid = power.reshape(2, windows.COLUMNS, windows.ROWS, blur.GRID, blur.GRID)
@@ -77,7 +77,8 @@ def test_the_count_is_that_of_a_counted_pass(size):
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         depth, features = branch(_frames(1, size))
     assert (
-        counter.get_total_flops() // 2 == blur.macs(size) - windows.STEP_MACS
+        counter.get_total_flops() // 2
+        == blur.blur_branch_macs(size) - windows.STEP_MACS
     )  # sums of slices: it counts them not
     assert depth.shape == (1, 2, blur.GRID, blur.GRID)
     assert features.shape == (1, blur.SLIP_FEATURES)
@@ -114,7 +115,7 @@ def test_a_block_adds_to_a_window_what_its_mixed_neighbours_tell():
     """A gatherer of ones and a mixer of -0.5: x - hardswish(sum of the 5 x 5 windows
     around + 0.3) / 2.
     """
-    block = blur.Around(3)
+    block = blur.NeighbourMixer(3)
     with torch.no_grad():
         block.gather.weight.fill_(1.0)
         block.gather.bias.fill_(0.3)
@@ -134,7 +135,7 @@ def test_all_windows_tell_each_their_mean_and_their_spread():
     """One window of 49 is 0.7: mean 0.7 / 49, variance 0.49 (1/49 - 1/49²), by layers
     of one and two.
     """
-    block = blur.Overall(2)
+    block = blur.GlobalContext(2)
     with torch.no_grad():
         block.take.weight.copy_(
             torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]])
@@ -154,7 +155,7 @@ def test_all_windows_tell_each_their_mean_and_their_spread():
 
 def test_windows_that_are_all_alike_have_slopes():
     x = torch.ones(1, 2, blur.GRID, blur.GRID, requires_grad=True)
-    blur.Overall(2)(x).sum().backward()
+    blur.GlobalContext(2)(x).sum().backward()
     assert bool(torch.isfinite(x.grad).all())
 
 
@@ -188,7 +189,7 @@ def test_depth_loss_is_least_at_the_truth_and_at_the_true_spread():
         told = torch.stack(
             [truth + miss + shift, torch.full_like(miss, math.log(spread))], 1
         )
-        return float(losses.depth(told, truth))
+        return float(losses.depth_loss(told, truth))
 
     assert loss(0.37) == pytest.approx(
         0.5 + math.log(0.37), abs=0.005
@@ -205,7 +206,7 @@ def test_the_uncertainty_moves_nothing_but_itself():
         torch.tensor([[0.3, 0.9, -2.0]]),
         torch.tensor([0.5, 0.7, 3.0]),
     )
-    value = losses.reading(found, *given, depth_weight=0.5)
+    value = losses.depth_reading_loss(found, *given, depth_weight=0.5)
     value.backward()
     assert slip.grad is None or not bool(slip.grad.any())
     miss = slip.detach() - torch.tensor([[0.6, 0.9 / 0.7, -2.0 / 3.0]])
@@ -214,7 +215,7 @@ def test_the_uncertainty_moves_nothing_but_itself():
     plain = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip)
     assert (
         float(
-            losses.reading(
+            losses.depth_reading_loss(
                 plain,
                 torch.zeros(1, 7, 7),
                 slip.detach(),
@@ -236,9 +237,9 @@ def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():
         return 0.2 - torch.hypot(place - 0.03, place[:, None] + 0.07)
 
     coarse, fine = 40 * disc(16)[None], (disc(64) > 0).float()[None]
-    assert float(losses.overlap(coarse, fine)) > 0.9
+    assert float(losses.mask_iou(coarse, fine)) > 0.9
     assert (
-        float(losses.overlap(coarse, fine, pixels=64)) > 0.97
+        float(losses.mask_iou(coarse, fine, pixels=64)) > 0.97
     )  # a smooth edge is interpolated well within a cell
     shifted = (
         40 * torch.roll(disc(16), 1, 1)[None]
@@ -246,6 +247,6 @@ def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():
     r, d = 0.2, 1 / 16
     both = 2 * r**2 * math.acos(d / (2 * r)) - d / 2 * math.sqrt(4 * r**2 - d**2)
     want = both / (2 * math.pi * r**2 - both)
-    assert float(losses.overlap(shifted, fine, pixels=64)) == pytest.approx(
+    assert float(losses.mask_iou(shifted, fine, pixels=64)) == pytest.approx(
         want, abs=0.02
     )  # pixels of the rim

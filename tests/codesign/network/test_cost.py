@@ -9,9 +9,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.peers import mobilenet_v3
 from codesign.network import cost, windows
-from codesign.network.architecture import Space, largest, sample, smallest
+from codesign.network.architecture import (
+    SearchSpace,
+    largest_architecture,
+    sample_architecture,
+    smallest_architecture,
+)
 from codesign.network.supernet import Supernet
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 
 
 def _counted(net, architecture, size):
@@ -26,10 +31,10 @@ def test_count_equals_a_counted_forward_pass_for_24_subnets():
     net, generator = Supernet(), np.random.default_rng(0)
     net.eval()
     for _ in range(24):  # of some fifteen blocks, each drawn
-        architecture = sample(net.space, generator)
+        architecture = sample_architecture(net.space, generator)
         size = int(generator.integers(54, 120))
         scaled = round(size * architecture.resolution)
-        assert int(cost.network(net.space, architecture).at(scaled)) == _counted(
+        assert int(cost.network_cost(net.space, architecture).at(scaled)) == _counted(
             net, architecture, size
         )
 
@@ -45,13 +50,14 @@ def test_published_counts_of_mobilenet_v3():
 
 @pytest.mark.parametrize("size", [16.0, 63.5, 64.0, 127.25, 400.0])
 def test_continuous_count_has_the_gradient_of_its_finite_difference(size):
-    space = Space()
+    space = SearchSpace()
     at = torch.tensor(size, dtype=torch.float64, requires_grad=True)
-    value = cost.macs_of_size(space, largest(space), at)
+    value = cost.macs_of_size(space, largest_architecture(space), at)
     value.backward()
     step = 1e-6
     ahead, behind = (
-        float(cost.macs_of_size(space, largest(space), size + s)) for s in (step, -step)
+        float(cost.macs_of_size(space, largest_architecture(space), size + s))
+        for s in (step, -step)
     )
     # at an integer the curvature jumps: the difference is off by that times the step,
     # 1e-4 of the mean slope
@@ -61,15 +67,17 @@ def test_continuous_count_has_the_gradient_of_its_finite_difference(size):
     )
     if size == round(size):
         assert float(value.detach()) == float(
-            cost.network(space, largest(space)).at(int(size))
+            cost.network_cost(space, largest_architecture(space)).at(int(size))
         )
 
 
 def test_the_gradient_in_the_pitch_is_that_of_its_finite_difference():
     pitch = torch.tensor(5.31, dtype=torch.float64, requires_grad=True)
-    cost.macs(largest(Space()), pitch, window_um=1152.0).backward()
+    cost.macs(largest_architecture(SearchSpace()), pitch, window_um=1152.0).backward()
     ahead, behind = (
-        float(cost.macs(largest(Space()), 5.31 + s, window_um=1152.0))
+        float(
+            cost.macs(largest_architecture(SearchSpace()), 5.31 + s, window_um=1152.0)
+        )
         for s in (1e-6, -1e-6)
     )
     assert float(pitch.grad) == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
@@ -79,15 +87,24 @@ def test_the_gradient_in_the_pitch_is_that_of_its_finite_difference():
 def test_more_pixels_never_cost_less(low):
     sizes = np.linspace(low, low + 3, 61)
     counts = np.array(
-        [float(cost.macs_of_size(Space(), smallest(Space()), s)) for s in sizes]
+        [
+            float(
+                cost.macs_of_size(
+                    SearchSpace(), smallest_architecture(SearchSpace()), s
+                )
+            )
+            for s in sizes
+        ]
     )
     assert (np.diff(counts) >= -1e-6 * counts[0]).all()
 
 
 def test_cost_falls_with_pitch_and_impossible_pitch_is_refused():
-    space = Space()
+    space = SearchSpace()
     sizes = [cost.input_size(1200.0, pitch, 1.0) for pitch in (3.0, 6.0, 12.0)]
-    counts = [float(cost.macs_of_size(space, smallest(space), s)) for s in sizes]
+    counts = [
+        float(cost.macs_of_size(space, smallest_architecture(space), s)) for s in sizes
+    ]
     assert (
         counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85
     )  # heads and windows of the blur are no pixels

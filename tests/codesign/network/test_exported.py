@@ -12,10 +12,10 @@ import torch
 from codesign.network import architecture as arch
 from codesign.network import exported
 from codesign.network.subnet import Subnet
-from codesign.network.supernet import Supernet, recalibrate
+from codesign.network.supernet import Supernet, recalibrate_batch_norm
 
-SPACE = arch.Space()
-SCALE = exported.Scale(frame_mm=1.87, slip_mm=(1.4, 0.9, 2.3), elevation_rad=0.6)
+SPACE = arch.SearchSpace()
+SCALE = exported.OutputScale(frame_mm=1.87, slip_mm=(1.4, 0.9, 2.3), elevation_rad=0.6)
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +49,12 @@ def graphs(net, tmp_path_factory):
     pytest.importorskip("onnx")
     made = {}
     for resolution, size in CASES:
-        chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
-        recalibrate(net, chosen, [_frames(4, size)])
+        chosen = dataclasses.replace(
+            arch.smallest_architecture(SPACE), resolution=resolution
+        )
+        recalibrate_batch_norm(net, chosen, [_frames(4, size)])
         path = tmp_path_factory.mktemp("graph") / "n.onnx"
-        exported.write(path, Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
+        exported.write_onnx(path, Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
         made[resolution, size] = chosen, copy.deepcopy(net), path
     return made
 
@@ -100,7 +102,9 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
 
     chosen, net, path = graphs[CASES[0]]
     bare = dataclasses.replace(SCALE, axis=False, points=False)
-    exported.write(tmp_path / "bare", Subnet(net, chosen), bare, size=61, pitch_um=30.0)
+    exported.write_onnx(
+        tmp_path / "bare", Subnet(net, chosen), bare, size=61, pitch_um=30.0
+    )
     whole, cut = (onnx.load(name) for name in (path, tmp_path / "bare"))
     onnx.checker.check_model(whole, full_check=True)
     assert [v.name for v in cut.graph.output] == [

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from codesign.network.exported import OPSET, OUTPUTS, Exported, Scale
+from codesign.network.exported import OPSET, OUTPUTS, ExportedNetwork, OutputScale
 
-SCALE = Scale(frame_mm=1.7, slip_mm=(2.0, 3.0, 5.0), elevation_rad=0.35)
+SCALE = OutputScale(frame_mm=1.7, slip_mm=(2.0, 3.0, 5.0), elevation_rad=0.35)
 
 
 class Net(nn.Module):
@@ -34,7 +34,7 @@ AXIS = [0.3, -0.2, -0.9]
 
 
 def told(scale=SCALE, frames=None):
-    made = object.__new__(Exported)
+    made = object.__new__(ExportedNetwork)
     nn.Module.__init__(made)
     made.net, made.scale = SimpleNamespace(net=Net(), architecture="member"), scale
     out = made.forward(torch.rand(2, 1, 5, 5) if frames is None else frames)
@@ -94,7 +94,7 @@ def test_answers_are_lengths_in_mm_and_angles_of_the_face_in_degrees():
     ],
 )
 def test_what_training_gave_no_weight_is_left_out(axis, points, gone):
-    scale = Scale(1.7, (2.0, 3.0, 5.0), 0.35, axis=axis, points=points)
+    scale = OutputScale(1.7, (2.0, 3.0, 5.0), 0.35, axis=axis, points=points)
     assert scale.outputs == tuple(name for name in OUTPUTS if name not in gone)
     found, _ = told(scale)
     assert set(found) == set(OUTPUTS) - gone

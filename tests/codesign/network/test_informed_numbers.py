@@ -48,7 +48,7 @@ def test_filters_are_waves_of_the_frame_under_a_hann_weight_of_power_one():
     """90 pixels: windows of 22, waves by 90 / 4 = 22.5 pixels, from the middle of the
     window on.
     """
-    cosine, sine = windows.filters(90)
+    cosine, sine = windows.hann_filters(90)
     place = np.arange(22) + 0.5
     weight = np.sin(np.pi * place / 22) ** 2
     weight /= math.sqrt((weight**2).sum())
@@ -104,7 +104,7 @@ def test_what_the_content_adds_is_counted_as_a_pass_counts_it(size):
             torch.zeros(1, 1, size, size),
             torch.zeros(1, CHANNELS, size // 4, size // 4),
         )
-    assert counter.get_total_flops() // 2 == blur.macs(
+    assert counter.get_total_flops() // 2 == blur.blur_branch_macs(
         size
     ) - windows.STEP_MACS + blur.content_macs(CHANNELS)
 
@@ -124,9 +124,9 @@ def test_the_vote_of_the_windows_is_added_to_the_axial_slippage_alone():
     all.
     """
     torch.manual_seed(3)
-    net = Supernet(arch.Space()).eval()
+    net = Supernet(arch.SearchSpace()).eval()
     frames = torch.randn(2, 1, 64, 64)
-    least = arch.smallest(net.space)
+    least = arch.smallest_architecture(net.space)
     with torch.no_grad():
         before = net(frames, least).slip
         net.blur.vote.bias += torch.tensor([0.7, 0.0])

@@ -18,8 +18,8 @@ def _mask(batch=2):
 
 def test_dice_is_zero_for_the_right_mask_and_nearly_one_for_its_complement():
     mask = _mask()
-    assert float(losses.dice(200 * (mask - 0.5), mask)) < 1e-12
-    wrong = float(losses.dice(-200 * (mask - 0.5), mask))
+    assert float(losses.dice_loss(200 * (mask - 0.5), mask)) < 1e-12
+    wrong = float(losses.dice_loss(-200 * (mask - 0.5), mask))
     assert wrong == pytest.approx(
         1 - 1 / (16 * 16 + 1), abs=1e-9
     )  # no overlap: only the smoothing is left
@@ -27,13 +27,13 @@ def test_dice_is_zero_for_the_right_mask_and_nearly_one_for_its_complement():
 
 def test_all_blink_batch_is_finite_with_finite_gradient():
     logits = torch.zeros(3, 16, 16, requires_grad=True)
-    loss = losses.segmentation(logits, torch.zeros(3, 16, 16))
+    loss = losses.segmentation_loss(logits, torch.zeros(3, 16, 16))
     loss.backward()
     assert torch.isfinite(loss)
     assert torch.isfinite(logits.grad).all()
     assert (
         float(
-            losses.overlap(torch.full((3, 16, 16), -9.0), torch.zeros(3, 16, 16)).min()
+            losses.mask_iou(torch.full((3, 16, 16), -9.0), torch.zeros(3, 16, 16)).min()
         )
         == 1
     )
@@ -50,8 +50,12 @@ def test_gradients_agree_with_finite_differences():
     scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     truth = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     mask = _mask()
-    assert torch.autograd.gradcheck(lambda a: losses.segmentation(a, mask), (logits,))
-    assert torch.autograd.gradcheck(lambda s: losses.slip(s, truth, scale), (slip,))
+    assert torch.autograd.gradcheck(
+        lambda a: losses.segmentation_loss(a, mask), (logits,)
+    )
+    assert torch.autograd.gradcheck(
+        lambda s: losses.slip_loss(s, truth, scale), (slip,)
+    )
 
 
 def test_budget_acts_only_beyond_it():
@@ -66,7 +70,7 @@ def test_overlap_of_half_a_mask():
     mask[:, :4] = 1
     logits = torch.full((1, 8, 8), -1.0)
     logits[:, :2] = 1
-    assert float(losses.overlap(logits, mask)[0]) == pytest.approx(0.5)
+    assert float(losses.mask_iou(logits, mask)[0]) == pytest.approx(0.5)
 
 
 def test_slip_is_counted_in_units_of_its_scale():
@@ -76,7 +80,9 @@ def test_slip_is_counted_in_units_of_its_scale():
     truth, scale = torch.tensor([[0.8, -2.1, 3.3]]), torch.tensor([0.4, 0.7, 3.0])
     predicted = truth / scale + torch.tensor([[0.1, 0.0, -0.5]])
     want = (0.1**2 / 2 / 0.3 + (0.5 - 0.3 / 2)) / 3
-    assert float(losses.slip(predicted, truth, scale)) == pytest.approx(want, rel=1e-5)
+    assert float(losses.slip_loss(predicted, truth, scale)) == pytest.approx(
+        want, rel=1e-5
+    )
 
 
 def test_place_is_the_distance_from_the_centroid_of_each_mask():
@@ -88,12 +94,14 @@ def test_place_is_the_distance_from_the_centroid_of_each_mask():
         [[-0.15 + 0.1, -0.2 - 0.002], [0.3, 0.3]]
     )  # the second is empty: it takes no part
     want = ((0.1 / 0.02 - 0.15) + (0.1**2 / 2 / 0.3)) / 2
-    assert float(losses.place(centre, mask)) == pytest.approx(want, rel=1e-4)
+    assert float(losses.position_loss(centre, mask)) == pytest.approx(want, rel=1e-4)
     mask[1, 9, 19] = (
         0.75  # one covered pixel is a mask: x = 19.5 / 20 - 1/2, y = 9.5 / 10 - 1/2
     )
     both = want + ((0.475 - 0.3) / 0.02 - 0.15 + (0.45 - 0.3) / 0.02 - 0.15) / 2
-    assert float(losses.place(centre, mask)) == pytest.approx(both / 2, rel=1e-4)
+    assert float(losses.position_loss(centre, mask)) == pytest.approx(
+        both / 2, rel=1e-4
+    )
 
 
 def test_task_adds_mask_and_twice_the_slip():
@@ -120,9 +128,9 @@ def test_task_adds_mask_and_twice_the_slip():
         logits[:, None], scale_factor=2, mode="bilinear", align_corners=False
     )[:, 0]
     bce = torch.nn.functional.binary_cross_entropy_with_logits(fine, mask)
-    want = losses.dice(fine, mask) + bce + 2 * losses.slip(slip, truth, scale)
+    want = losses.dice_loss(fine, mask) + bce + 2 * losses.slip_loss(slip, truth, scale)
     assert float(
-        losses.task(found, mask, truth, scale, slip_weight=2.0)
+        losses.task_loss(found, mask, truth, scale, slip_weight=2.0)
     ) == pytest.approx(float(want), rel=1e-6)
 
 
@@ -130,7 +138,7 @@ def test_dice_of_a_half_covered_mask_in_closed_form():
     logits = torch.full((1, 4, 6), 0.0, dtype=torch.float64)  # one half everywhere
     mask = torch.zeros(1, 4, 6, dtype=torch.float64)
     mask[0, :, :2] = 1
-    assert float(losses.dice(logits, mask, smooth=3.0)) == pytest.approx(
+    assert float(losses.dice_loss(logits, mask, smooth=3.0)) == pytest.approx(
         1 - (2 * 4 + 3) / (12 + 8 + 3), rel=1e-12
     )
 
@@ -144,10 +152,10 @@ def test_masks_are_held_to_the_finer_grid_of_the_two():
     steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(
         1, 4, 4
     )  # 0 at x = 7 pixels
-    assert float(losses.segmentation(steep, mask)) < 0.1
+    assert float(losses.segmentation_loss(steep, mask)) < 0.1
     entropy = (math.log(3) + 2 * math.log(3 / 2)) / 3 / 4  # of one column of four
     assert (
-        float(losses.segmentation(steep, torch.nn.functional.avg_pool2d(mask, 3)))
+        float(losses.segmentation_loss(steep, torch.nn.functional.avg_pool2d(mask, 3)))
         > entropy
         > 0.15
     )
@@ -174,12 +182,14 @@ def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
         (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2
     )  # two coordinates, two points inside
     looked = (0.1**2 / 2 / 0.3 + (2.0 - 0.15)) / 3
-    got = losses.pose(found, axis, points, axis_weight=0.7, point_weight=3.0)
+    got = losses.pose_loss(found, axis, points, axis_weight=0.7, point_weight=3.0)
     assert float(got) == pytest.approx(0.7 * looked + 3.0 * seen, rel=1e-5)
     nothing = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3))
     assert (
-        float(losses.pose(nothing, axis, points, axis_weight=0.7, point_weight=3.0))
+        float(
+            losses.pose_loss(nothing, axis, points, axis_weight=0.7, point_weight=3.0)
+        )
         == 0
     )
-    away = losses.pose(found, axis, points + 2, axis_weight=0.0, point_weight=3.0)
+    away = losses.pose_loss(found, axis, points + 2, axis_weight=0.0, point_weight=3.0)
     assert float(away) == 0  # no landmark in the image: finite

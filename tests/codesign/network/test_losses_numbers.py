@@ -36,7 +36,9 @@ def test_spreads_are_taught_by_the_errors_that_there_are_and_teach_nothing_else(
         torch.from_numpy(SLIP).requires_grad_(),
         torch.from_numpy(SPREADS).requires_grad_(),
     )
-    loss = losses.spread(found(slip=slip, slip_log_sd=spread), torch.from_numpy(TRUTH))
+    loss = losses.uncertainty_loss(
+        found(slip=slip, slip_log_sd=spread), torch.from_numpy(TRUTH)
+    )
     assert float(loss.detach()) == pytest.approx(
         likelihood(SLIP - TRUTH, SPREADS), rel=1e-12
     )
@@ -44,14 +46,17 @@ def test_spreads_are_taught_by_the_errors_that_there_are_and_teach_nothing_else(
     assert slip.grad is None
     want = (1 - (SLIP - TRUTH) ** 2 * np.exp(-2 * SPREADS)) / 12
     assert spread.grad.numpy() == pytest.approx(want, rel=1e-9)
-    assert float(losses.spread(found(slip_log_sd=None), torch.from_numpy(TRUTH))) == 0
+    assert (
+        float(losses.uncertainty_loss(found(slip_log_sd=None), torch.from_numpy(TRUTH)))
+        == 0
+    )
 
 
 def test_the_depth_of_windows_is_half_of_their_likelihood_and_the_spread_a_tenth():
     told, truth = RNG.normal(0, 0.5, (4, 2, 7, 7)), RNG.normal(0, 1, (4, 7, 7))
     depth = likelihood(told[:, 0] - truth, told[:, 1])
     assert float(
-        losses.depth(torch.from_numpy(told), torch.from_numpy(truth))
+        losses.depth_loss(torch.from_numpy(told), torch.from_numpy(truth))
     ) == pytest.approx(depth, rel=1e-12)
     given = (
         torch.from_numpy(truth),
@@ -59,27 +64,31 @@ def test_the_depth_of_windows_is_half_of_their_likelihood_and_the_spread_a_tenth
         torch.from_numpy(SCALE),
     )
     spread = likelihood(SLIP - TRUTH, SPREADS)
-    got = losses.reading(found(depth=torch.from_numpy(told)), *given, depth_weight=0.5)
-    assert float(got) == pytest.approx(0.5 * depth + 0.1 * spread, rel=1e-12)
-    got = losses.reading(found(depth=torch.from_numpy(told)), *given, depth_weight=1.7)
-    assert float(got) == pytest.approx(1.7 * depth + 0.1 * spread, rel=1e-12)
-    assert float(losses.reading(found(), *given, depth_weight=0.5)) == pytest.approx(
-        0.1 * spread, rel=1e-12
+    got = losses.depth_reading_loss(
+        found(depth=torch.from_numpy(told)), *given, depth_weight=0.5
     )
+    assert float(got) == pytest.approx(0.5 * depth + 0.1 * spread, rel=1e-12)
+    got = losses.depth_reading_loss(
+        found(depth=torch.from_numpy(told)), *given, depth_weight=1.7
+    )
+    assert float(got) == pytest.approx(1.7 * depth + 0.1 * spread, rel=1e-12)
+    assert float(
+        losses.depth_reading_loss(found(), *given, depth_weight=0.5)
+    ) == pytest.approx(0.1 * spread, rel=1e-12)
 
 
 def test_slippage_is_squared_to_three_tenths_of_its_scale_and_linear_beyond():
     off = np.abs(SLIP - TRUTH)
     for knee in (0.3, 0.9):
         want = np.where(off < knee, off**2 / (2 * knee), off - knee / 2).mean()
-        got = losses.slip(
+        got = losses.slip_loss(
             torch.from_numpy(SLIP),
             torch.from_numpy(TRUTH * SCALE),
             torch.from_numpy(SCALE),
             knee=knee,
         )
         assert float(got) == pytest.approx(want, rel=1e-9)
-    plain = losses.slip(
+    plain = losses.slip_loss(
         torch.from_numpy(SLIP), torch.from_numpy(TRUTH * SCALE), torch.from_numpy(SCALE)
     )
     assert float(plain) == pytest.approx(
@@ -108,7 +117,7 @@ def test_a_task_is_its_mask_and_twice_its_slippage():
         torch.from_numpy(TRUTH * SCALE),
         torch.from_numpy(SCALE),
     )
-    got = losses.task(
+    got = losses.task_loss(
         found(mask_logits=torch.from_numpy(logits)), *given, slip_weight=2.0
     )
     assert float(got) == pytest.approx(seen(logits, mask) + 2 * slip, rel=1e-9)
@@ -119,7 +128,7 @@ def test_a_task_is_its_mask_and_twice_its_slippage():
     drawn = np.stack(
         [map_coordinates(one, [y, x], order=1, mode="nearest") for one in logits]
     )
-    got = losses.task(
+    got = losses.task_loss(
         found(mask_logits=torch.from_numpy(logits)),
         torch.from_numpy(fine),
         *given[1:],
@@ -141,7 +150,7 @@ def test_a_network_without_a_mask_is_held_to_the_centroid():
         truth = np.array([(m.sum(0) * x).sum(), (m.sum(1) * y).sum()]) / m.sum()
         off = np.abs(one - truth) / 0.02
         each.append(np.where(off < 0.3, off**2 / 0.6, off - 0.15).mean())
-    got = losses.place(torch.from_numpy(centre), torch.from_numpy(mask))
+    got = losses.position_loss(torch.from_numpy(centre), torch.from_numpy(mask))
     assert float(got) == pytest.approx(np.mean(each), rel=1e-9)
     given = (
         torch.from_numpy(mask),
@@ -149,14 +158,14 @@ def test_a_network_without_a_mask_is_held_to_the_centroid():
         torch.from_numpy(SCALE),
     )
     whole = found(mask_logits=torch.zeros(4, 0, 0), centre=torch.from_numpy(centre))
-    slip = float(losses.slip(whole.slip, *given[1:]))
-    assert float(losses.task(whole, *given, slip_weight=2.0)) == pytest.approx(
+    slip = float(losses.slip_loss(whole.slip, *given[1:]))
+    assert float(losses.task_loss(whole, *given, slip_weight=2.0)) == pytest.approx(
         np.mean(each) + 2 * slip, rel=1e-9
     )
     dim = torch.from_numpy(
         mask * 0.45 / mask.sum((1, 2)).clip(1e-9)[:, None, None]
     )  # less than half a pixel each
-    assert float(losses.place(torch.from_numpy(centre), dim)) == 0
+    assert float(losses.position_loss(torch.from_numpy(centre), dim)) == 0
 
 
 def test_masks_are_averaged_over_cells_and_interpolated_between_them():
@@ -168,8 +177,8 @@ def test_masks_are_averaged_over_cells_and_interpolated_between_them():
         torch.from_numpy(RNG.normal(size=(2, 3, 3))),
     )
     blocks = mask.numpy().reshape(2, 3, 2, 3, 3).mean((2, 4))
-    assert losses.resized(mask, like).numpy() == pytest.approx(blocks)
-    assert losses.resized(mask, torch.zeros(2, 6, 9)) is mask
+    assert losses.resize_mask(mask, like).numpy() == pytest.approx(blocks)
+    assert losses.resize_mask(mask, torch.zeros(2, 6, 9)) is mask
     logits, seen = losses.at_pixels(like, mask[:, :2, :3], 6)
     three = mask[:, :2, :3].numpy()
     two = np.stack(
@@ -196,7 +205,7 @@ def test_a_frame_holds_the_share_of_its_cells_that_the_mask_covers(wide):
     inside = (place >= 0) & (place < 5)
     share = np.zeros((5, 5))
     np.add.at(share, (np.repeat(np.arange(5), fine)[inside], place[inside]), 1 / fine)
-    got = losses.framed(torch.from_numpy(mask), wide).numpy()
+    got = losses.mask_in_frame(torch.from_numpy(mask), wide).numpy()
     assert got == pytest.approx(
         share @ mask @ share.T, abs=2e-3
     )  # half a point at each of some edges
@@ -220,14 +229,14 @@ def test_masks_overlap_by_what_both_hold():
             [[0.5] * 3] * 2,
         ]
     )
-    assert losses.overlap(logits, mask).tolist() == pytest.approx([2 / 4, 0.0, 1.0])
-    assert losses.overlap(
+    assert losses.mask_iou(logits, mask).tolist() == pytest.approx([2 / 4, 0.0, 1.0])
+    assert losses.mask_iou(
         logits[:1], mask[1:2] * 0 + (logits[:1] == 0.1)
     ).tolist() == pytest.approx([1 / 3])
-    assert losses.overlap(logits[2:], mask[1:2]).tolist() == [
+    assert losses.mask_iou(logits[2:], mask[1:2]).tolist() == [
         0.0
     ]  # one pixel missed is not nothing at all
-    told = losses.overlap(torch.zeros(3, 0, 0), mask)
+    told = losses.mask_iou(torch.zeros(3, 0, 0), mask)
     assert told.shape == (3,)
     assert torch.isnan(told).all()
 
@@ -235,7 +244,7 @@ def test_masks_overlap_by_what_both_hold():
 def test_a_pose_needs_both_and_one_landmark_counts_whole():
     axis, points = torch.zeros(1, 3), torch.tensor([[[0.1, 0.2], [0.7, 0.0]]])
     told = points + torch.tensor([0.1, 0.0])
-    one = losses.pose(
+    one = losses.pose_loss(
         found(points=told, axis=axis), axis, points, axis_weight=1.0, point_weight=3.0
     )
     assert float(one) == pytest.approx(
@@ -244,7 +253,7 @@ def test_a_pose_needs_both_and_one_landmark_counts_whole():
     for part in ({"points": told, "axis": None}, {"points": None, "axis": axis}):
         assert (
             float(
-                losses.pose(
+                losses.pose_loss(
                     found(**part), axis, points, axis_weight=1.0, point_weight=3.0
                 )
             )
@@ -258,7 +267,7 @@ def test_windows_are_read_by_waves_under_a_hann_weight(size):
     Σw²; beyond Nyquist nothing.
     """
     frames = RNG.normal(size=(2, 1, size, size))
-    power, mean = windows.spectra(torch.from_numpy(frames))
+    power, mean = windows.window_spectra(torch.from_numpy(frames))
     step, margin = size // 8, (size - 8 * (size // 8)) // 2
     weight = np.sin(np.pi * (np.arange(2 * step) + 0.5) / (2 * step)) ** 2
     w = np.outer(weight, weight)

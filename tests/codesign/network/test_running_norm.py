@@ -6,7 +6,7 @@ import torch
 
 from codesign.network import architecture as arch
 from codesign.network.running import EPSILON, REACH, RunningNorm
-from codesign.network.supernet import Supernet, recalibrate
+from codesign.network.supernet import Supernet, recalibrate_batch_norm
 
 
 def test_a_batch_is_normalised_by_the_means_of_all_so_far():
@@ -71,12 +71,14 @@ def test_neither_evaluation_nor_frames_that_are_not_finite_move_the_means():
 
 def test_means_over_the_training_stay_when_the_statistics_of_an_architecture_are_measured():
     torch.manual_seed(0)
-    net = Supernet(arch.Space()).train()
+    net = Supernet(arch.SearchSpace()).train()
     frames = torch.randn(2, 1, 64, 64, generator=torch.Generator().manual_seed(1))
-    net(frames, arch.smallest(net.space))
+    net(frames, arch.smallest_architecture(net.space))
     before = {k: v.clone() for k, v in net.blur.norm.state_dict().items()}
     stem = net.stem.norm.mean.clone()
-    recalibrate(net, arch.smallest(net.space), [2 * frames, frames])
+    recalibrate_batch_norm(
+        net, arch.smallest_architecture(net.space), [2 * frames, frames]
+    )
     assert int(before["batches"]) == 1
     assert all(torch.equal(before[k], v) for k, v in net.blur.norm.state_dict().items())
     assert not torch.equal(stem, net.stem.norm.mean)

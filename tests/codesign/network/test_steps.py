@@ -61,7 +61,7 @@ def _by_hand(frame, row, column):
 @pytest.mark.parametrize(("row", "column"), [(0, 6), (3, 1)])
 def test_steps_of_a_window_are_those_between_its_pixels(row, column):
     frame = np.random.default_rng(7).normal(size=(64, 64)) + 0.03 * np.arange(64)
-    got = windows.steps(torch.from_numpy(frame)[None, None])
+    got = windows.gradient_statistics(torch.from_numpy(frame)[None, None])
     assert got.shape == (1, windows.STEP_FEATURES, 7, 7)
     found = got[0, :, row, column].numpy().reshape(3, 14)
     assert found == pytest.approx(
@@ -75,7 +75,9 @@ def test_steps_of_white_frames_have_the_variance_of_a_pixel():
     """
     frames = torch.randn(6, 1, 64, 64, generator=torch.Generator().manual_seed(3))
     mean, spread, _ = (
-        windows.steps(frames).reshape(6, 3, 14, 7, 7)[..., 1:6, 1:6].mean((0, 3, 4))
+        windows.gradient_statistics(frames)
+        .reshape(6, 3, 14, 7, 7)[..., 1:6, 1:6]
+        .mean((0, 3, 4))
     )
     sample = np.random.default_rng(1).normal(size=400_000) ** 2
     want = np.log(1 + sample / 0.0025)
@@ -100,7 +102,7 @@ def test_blur_takes_the_steepest_step_of_an_edge_and_leaves_the_mean_power_nearl
     steepest = []
     for width in (1, 2, 4):
         edge = (2 * (place / width).clamp(0, 1)).expand(64, 64)[None, None]
-        told = windows.steps(edge)[0].reshape(3, 14, 7, 7)
+        told = windows.gradient_statistics(edge)[0].reshape(3, 14, 7, 7)
         steepest.append(float(told[2, 0, 3, 3]))
     for narrow, wide in itertools.pairwise(
         steepest
@@ -114,9 +116,9 @@ def test_a_slope_has_the_same_steps_on_any_pixels(size):
     along x, none along y.
     """
     line = 5 * (torch.arange(size, dtype=torch.float64) + 0.5) / size
-    told = windows.steps(line.expand(1, 1, size, size))[0].reshape(3, 14, 7, 7)[
-        0, :, 3, 3
-    ]
+    told = windows.gradient_statistics(line.expand(1, 1, size, size))[0].reshape(
+        3, 14, 7, 7
+    )[0, :, 3, 3]
     slope = 5 / 64
     assert float(told[0]) == pytest.approx(
         math.log(1 + slope**2 / 2 / 0.0025), abs=2e-3
@@ -132,7 +134,7 @@ def test_steps_move_with_the_frame_as_finite_differences_say():
         1, 1, 24, 24, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
     )
     assert torch.autograd.gradcheck(
-        lambda x: windows.steps(x)[..., 2:4, 2:4],
+        lambda x: windows.gradient_statistics(x)[..., 2:4, 2:4],
         frame.requires_grad_(),
         fast_mode=True,
     )
@@ -140,7 +142,7 @@ def test_steps_move_with_the_frame_as_finite_differences_say():
 
 def test_a_blank_frame_has_slopes():
     frame = torch.zeros(1, 1, 64, 64, requires_grad=True)
-    windows.steps(frame).sum().backward()
+    windows.gradient_statistics(frame).sum().backward()
     assert bool(torch.isfinite(frame.grad).all())
 
 
@@ -156,7 +158,7 @@ def test_steps_that_are_alike_all_over_are_not_spread():
     no spread but a floor.
     """
     ramp = (torch.linspace(-2.3, 1.9, 128)[None] + torch.zeros(128, 1))[None, None]
-    found = windows.steps(ramp)
+    found = windows.gradient_statistics(ramp)
     kinds = found.shape[1] // windows.TOLD
     mean, spread = found[0, :kinds, 2:-2, 2:-2], found[0, kinds : 2 * kinds, 2:-2, 2:-2]
     assert float(mean.max()) > 0.05

@@ -8,9 +8,9 @@ import torch
 
 from codesign.network import architecture as arch
 from codesign.network.subnet import Subnet
-from codesign.network.supernet import Supernet, modules_of, recalibrate
+from codesign.network.supernet import Supernet, modules_of, recalibrate_batch_norm
 
-SPACE = arch.Space()
+SPACE = arch.SearchSpace()
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def net():
     torch.manual_seed(3)
     made = Supernet(SPACE)
     frames = torch.randn(2, 1, 64, 64, generator=torch.Generator().manual_seed(1))
-    recalibrate(made, arch.smallest(SPACE), [frames])
+    recalibrate_batch_norm(made, arch.smallest_architecture(SPACE), [frames])
     return made
 
 
@@ -40,15 +40,15 @@ def kept(conv, cut, outputs, inputs, kernel):
 @pytest.mark.parametrize("seed", [3, 7, None])
 def test_first_channels_and_the_middle_of_kernels_stay(net, seed):
     chosen = (
-        arch.smallest(SPACE)
+        arch.smallest_architecture(SPACE)
         if seed is None
-        else arch.sample(SPACE, np.random.default_rng(seed))
+        else arch.sample_architecture(SPACE, np.random.default_rng(seed))
     )
     cut = Subnet(net, chosen)
     assert not cut.training
     assert cut.architecture == chosen
     kept(net.stem, cut.net.stem, arch.stem_channels(SPACE, chosen), 1, 3)
-    rows = arch.blocks(SPACE, chosen)
+    rows = arch.active_blocks(SPACE, chosen)
     for stage, trimmed, row in zip(net.stages, cut.net.stages, rows, strict=True):
         assert len(list(modules_of(trimmed))) == len(row)
         for module, its, block in zip(
@@ -82,7 +82,7 @@ def test_first_channels_and_the_middle_of_kernels_stay(net, seed):
 
 
 def test_answers_are_those_of_the_whole_and_the_whole_stays_as_it_was(net):
-    chosen = arch.smallest(SPACE)
+    chosen = arch.smallest_architecture(SPACE)
     before = {name: value.clone() for name, value in net.state_dict().items()}
     cut = Subnet(net, chosen)
     frames = torch.randn(3, 1, 64, 64, generator=torch.Generator().manual_seed(8))

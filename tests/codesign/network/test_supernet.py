@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from codesign.network import architecture as arch
 from codesign.network.subnet import Subnet
-from codesign.network.supernet import Supernet, recalibrate, soft_argmax
-from metalens.ground.errors import ConfigError, TrainingError
+from codesign.network.supernet import Supernet, recalibrate_batch_norm, soft_argmax
+from metalens.core.errors import ConfigError, TrainingError
 
-SPACE = arch.Space()
+SPACE = arch.SearchSpace()
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def _frames(count=2, size=64):
 def test_every_sampled_architecture_runs_and_gives_all_outputs(net):
     generator = np.random.default_rng(0)
     for _ in range(6):
-        found = net.train()(_frames(), arch.sample(SPACE, generator))
+        found = net.train()(_frames(), arch.sample_architecture(SPACE, generator))
         assert found.slip.shape == (2, 3)
         assert found.centre.shape == (2, 2)
         for value in (found.mask_logits, found.centre, found.slip):
@@ -40,8 +40,8 @@ def test_every_sampled_architecture_runs_and_gives_all_outputs(net):
 
 
 def test_a_subnet_equals_its_slice_of_the_supernet(net):
-    chosen = arch.sample(SPACE, np.random.default_rng(3))
-    recalibrate(net, chosen, [_frames(), _frames(4)])
+    chosen = arch.sample_architecture(SPACE, np.random.default_rng(3))
+    recalibrate_batch_norm(net, chosen, [_frames(), _frames(4)])
     with torch.no_grad():
         whole, cut = net(_frames(), chosen), Subnet(net, chosen)(_frames())
     for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
@@ -57,8 +57,8 @@ def test_a_subnet_equals_its_slice_of_the_supernet(net):
     "ignore:.*torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning"
 )
 def test_torchscript_export_gives_equal_outputs(net):
-    chosen = arch.smallest(SPACE)
-    recalibrate(net, chosen, [_frames(size=96)])
+    chosen = arch.smallest_architecture(SPACE)
+    recalibrate_batch_norm(net, chosen, [_frames(size=96)])
     cut = Subnet(net, chosen)
     with torch.no_grad():
         traced = torch.jit.trace(cut, _frames(size=96))
@@ -67,25 +67,25 @@ def test_torchscript_export_gives_equal_outputs(net):
 
 
 def test_recalibration_gives_the_mean_of_the_batches_whatever_came_before(net):
-    chosen = arch.largest(SPACE)
+    chosen = arch.largest_architecture(SPACE)
     batches = [_frames(4), 2 * _frames(4) + 1]
-    recalibrate(net, chosen, batches)
+    recalibrate_batch_norm(net, chosen, batches)
     first = net.stem.norm.mean.clone()
-    recalibrate(net, arch.smallest(SPACE), [_frames()])
-    recalibrate(net, chosen, batches[::-1])
+    recalibrate_batch_norm(net, arch.smallest_architecture(SPACE), [_frames()])
+    recalibrate_batch_norm(net, chosen, batches[::-1])
     assert torch.allclose(net.stem.norm.mean, first, atol=1e-6)
 
 
 def test_recalibration_without_frames_is_refused(net):
     with pytest.raises(TrainingError, match="at least one batch"):
-        recalibrate(net, arch.smallest(SPACE), [])
+        recalibrate_batch_norm(net, arch.smallest_architecture(SPACE), [])
 
 
 def test_training_one_slice_leaves_the_rest_without_gradient(net):
     net.zero_grad()
-    net.train()(_frames(), arch.smallest(SPACE)).slip.sum().backward()
+    net.train()(_frames(), arch.smallest_architecture(SPACE)).slip.sum().backward()
     block = net.stages[0][0]
-    hidden = arch.blocks(SPACE, arch.smallest(SPACE))[0][0].hidden
+    hidden = arch.active_blocks(SPACE, arch.smallest_architecture(SPACE))[0][0].hidden
     assert float(block.expand.weight.grad[hidden:].abs().max()) == 0
     assert float(block.expand.weight.grad[:hidden].abs().max()) > 0
     rim = block.depthwise.weight.grad.clone()
@@ -108,18 +108,26 @@ def test_soft_argmax_finds_the_centre_of_a_disc_and_survives_an_empty_mask():
 @given(st.integers(0, 10_000))
 def test_mutation_stays_in_the_space_and_changes_the_network(seed):
     generator = np.random.default_rng(seed)
-    parent = arch.sample(SPACE, generator)
-    child = arch.check(SPACE, arch.mutate(SPACE, parent, generator))
-    assert arch.active(SPACE, child) != arch.active(SPACE, parent)
-    chain = itertools.chain.from_iterable(arch.blocks(SPACE, child))
+    parent = arch.sample_architecture(SPACE, generator)
+    child = arch.check_architecture(
+        SPACE, arch.mutate_architecture(SPACE, parent, generator)
+    )
+    assert arch.canonical_architecture(SPACE, child) != arch.canonical_architecture(
+        SPACE, parent
+    )
+    chain = itertools.chain.from_iterable(arch.active_blocks(SPACE, child))
     assert all(a.outputs == b.inputs for a, b in itertools.pairwise(chain))
 
 
 def test_a_foreign_architecture_is_refused_by_name():
     odd = dataclasses.replace(
-        arch.smallest(SPACE), kernels=(4, *arch.smallest(SPACE).kernels[1:])
+        arch.smallest_architecture(SPACE),
+        kernels=(4, *arch.smallest_architecture(SPACE).kernels[1:]),
     )
     with pytest.raises(ConfigError, match=r"kernels\[0\] is 4"):
-        arch.check(SPACE, odd)
+        arch.check_architecture(SPACE, odd)
     with pytest.raises(ConfigError, match="resolution is 2"):
-        arch.check(SPACE, dataclasses.replace(arch.smallest(SPACE), resolution=2.0))
+        arch.check_architecture(
+            SPACE,
+            dataclasses.replace(arch.smallest_architecture(SPACE), resolution=2.0),
+        )

@@ -9,7 +9,11 @@ import pytest
 import torch
 
 from codesign.network import blur, cost, supernet, windows
-from codesign.network.architecture import Block, divisible, smallest
+from codesign.network.architecture import (
+    BlockSpec,
+    round_channels,
+    smallest_architecture,
+)
 from codesign.network.cost import (
     MASK_CHANNELS,
     POINT_FEATURES,
@@ -17,7 +21,7 @@ from codesign.network.cost import (
     SLIP_GRID,
     lateral_strides,
 )
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 
 
 def test_a_centre_counts_probabilities_above_a_twentieth_by_what_they_exceed_it():
@@ -42,7 +46,7 @@ def test_a_landmark_is_the_centre_of_its_map_and_tells_how_wide_it_is():
     maps = torch.full((1, 2, 4, 10), -1e3, dtype=torch.float64)
     maps[0, 0, 1, 7], maps[0, 0, 3, 2] = np.log(3.0), 0.0
     maps[0, 1] = 0.3
-    middle, width = supernet.places(maps)
+    middle, width = supernet.soft_argmax_maps(maps)
     x, y = (
         0.75 * 0.25 + 0.25 * -0.25,
         0.75 * -0.125 + 0.25 * 0.375,
@@ -73,17 +77,17 @@ def test_the_axis_is_told_without_depths_and_the_slip_with_them_both_from_landma
 
 def test_frames_are_averaged_by_whole_factors_and_then_drawn_between():
     frames = torch.from_numpy(np.random.default_rng(5).uniform(1, 9, (1, 1, 6, 8)))
-    half = supernet.scaled(frames, 0.5)
+    half = supernet.resize_frames(frames, 0.5)
     assert half[0, 0].numpy() == pytest.approx(
         frames[0, 0].reshape(3, 2, 4, 2).mean((1, 3)).numpy(), rel=1e-12
     )
-    quarter = windows.resampled(
+    quarter = windows.resample_image(
         frames, (6, 2)
     )  # fours: drawn between two of them alone, it would be another
     assert quarter[0, 0].numpy() == pytest.approx(
         frames[0, 0].reshape(6, 2, 4).mean(2).numpy(), rel=1e-12
     )
-    odd = windows.resampled(
+    odd = windows.resample_image(
         frames, (4, 3)
     )  # 8 to 4 by pairs, then 4 to 3; 6 to 4 as they are
     pooled = frames[0, 0].reshape(6, 4, 2).mean(2).numpy()
@@ -100,7 +104,7 @@ def test_frames_are_averaged_by_whole_factors_and_then_drawn_between():
 
 
 def test_a_cost_counts_the_pixels_of_every_stride_rounded_up():
-    made = cost.Cost({2: 7, 8: 11}, 130)
+    made = cost.MacPolynomial({2: 7, 8: 11}, 130)
     for size in (16, 17, 33):
         want = 7 * int(np.ceil(size / 2)) ** 2 + 11 * int(np.ceil(size / 8)) ** 2 + 130
         assert int(made.at(size)) == want
@@ -114,9 +118,9 @@ def test_a_backbone_costs_its_stem_and_its_blocks_at_their_own_strides():
     """Stem 1 to 6 by 5 x 5 at stride 2; a block without expansion; one with, of stride
     2 and a squeeze of 3.
     """
-    fields = Block.__dataclass_fields__
+    fields = BlockSpec.__dataclass_fields__
     about = {name: 0 for name in fields}
-    first = Block(
+    first = BlockSpec(
         **(
             about
             | {
@@ -129,7 +133,7 @@ def test_a_backbone_costs_its_stem_and_its_blocks_at_their_own_strides():
             }
         )
     )
-    second = Block(
+    second = BlockSpec(
         **(
             about
             | {
@@ -142,7 +146,7 @@ def test_a_backbone_costs_its_stem_and_its_blocks_at_their_own_strides():
             }
         )
     )
-    made = cost.backbone(6, [first, second], stem_kernel=5)
+    made = cost.backbone_cost(6, [first, second], stem_kernel=5)
     assert made.per_pixel == {2: 6 * 25 + 6 * (9 + 10) + 10 * 24, 4: 24 * (25 + 14)}
     assert made.constant == 2 * 24 * 3
 
@@ -213,7 +217,7 @@ def test_a_block_is_its_first_channels_and_the_middle_of_its_kernel(stride, outp
     """7 of 12 hidden channels, 3 of 5 of the kernel, 2 of 4 of the squeeze; added to
     what came in where sizes agree.
     """
-    most = Block(
+    most = BlockSpec(
         inputs=6,
         hidden=12,
         outputs=6,
@@ -356,12 +360,13 @@ def test_slip_along_the_axis_is_that_of_the_features_and_that_of_the_depths():
     net.eval()
     with torch.no_grad():
         made = net(
-            torch.randn(2, 1, 64, 64), replace(smallest(net.space), resolution=1.0)
+            torch.randn(2, 1, 64, 64),
+            replace(smallest_architecture(net.space), resolution=1.0),
         )
     (features,), (logits, maps, decoded) = seen["perception"]
     (_, given), (depth, told, axial) = seen["blur"]
     (last, depths, points), (slip, spread, axis) = seen["calibration"]
-    middle, width = supernet.places(maps)
+    middle, width = supernet.soft_argmax_maps(maps)
     assert torch.equal(points, torch.cat([middle.flatten(1), width], 1))
     assert torch.equal(made.points, middle)
     assert made.axis is axis
@@ -397,7 +402,7 @@ def test_recalibration_forgets_what_was_measured_before():
     batches = [torch.randn(4, 2, 3, 5, generator=draw) * 3 + 1 for _ in range(2)]
     net.norm.mean.fill_(7.0)
     net.norm.variance.fill_(0.3)
-    supernet.recalibrate(net, None, iter(batches))
+    supernet.recalibrate_batch_norm(net, None, iter(batches))
     mean = torch.stack([one.mean((0, 2, 3)) for one in batches]).mean(0)
     variance = torch.stack([one.var((0, 2, 3)) for one in batches]).mean(0)
     assert torch.allclose(net.norm.mean, torch.cat([mean, torch.zeros(1)]))
@@ -407,7 +412,7 @@ def test_recalibration_forgets_what_was_measured_before():
     assert not net.norm.measuring
     assert not net.training
     with pytest.raises(TrainingError, match="found none"):
-        supernet.recalibrate(net, None, iter([]))
+        supernet.recalibrate_batch_norm(net, None, iter([]))
 
 
 @pytest.mark.parametrize(
@@ -427,4 +432,4 @@ def test_recalibration_forgets_what_was_measured_before():
 def test_channels_go_to_the_nearest_multiple_of_eight_or_up_where_a_tenth_would_be_lost(
     channels, found
 ):
-    assert divisible(channels) == found
+    assert round_channels(channels) == found

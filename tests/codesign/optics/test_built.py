@@ -9,15 +9,17 @@ import pytest
 import torch
 
 from characterize.model import made
-from characterize.model.parameters import PLACE, vector
+from characterize.model.parameters import PLACE, parameter_vector
 from codesign.optics import built
 from codesign.optics import stack as optics
-from codesign.optics.stack import Stack
+from codesign.optics.stack import PixelPsfStack
 from metalens import psf
 from metalens.fabrication import sensitivity
 from tests.codesign import made_lens as m
 
-X = vector(m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e": 9.0})
+X = parameter_vector(
+    m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e": 9.0}
+)
 
 
 def _engine(x, settings):
@@ -25,7 +27,7 @@ def _engine(x, settings):
     low-passed to their grid.
     """
     lens, known = m.small(), built.of_lens(x)
-    t = made.pillars(lens, sensitivity(lens), known)
+    t = made.as_built_transmission(lens, sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85, depths_um=settings.depths_um.numpy(),
@@ -40,13 +42,13 @@ def _engine(x, settings):
     waves = np.cos(2 * np.pi * m_ / window * (place[:, None] - fine)[..., None])
     rows = settings.sample_um / window * (1 + 2 * (waves * kept).sum(-1))
     light = found.energy_um2 / (float((lens.diameters.diameter_um > 0).sum()) * 0.16)
-    return Stack(
+    return PixelPsfStack(
         torch.as_tensor(rows @ (found.intensity * light[:, None, None]) @ rows.T),
         settings.depths_um,
     )
 
 
-@pytest.mark.parametrize("x", [vector(), X], ids=["design", "made"])
+@pytest.mark.parametrize("x", [parameter_vector(), X], ids=["design", "made"])
 def test_psfs_agree_with_the_sum_over_every_pillar(x):
     got, want = built.MadeLens(m.small(), m.OPTICS).stack(x), _engine(x, m.OPTICS)
     assert (
@@ -66,7 +68,7 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     it.
     """
     known = built.of_lens(X)
-    want = made.pillars(m.small(), sensitivity(m.small()), known)
+    want = made.as_built_transmission(m.small(), sensitivity(m.small()), known)
     got = (
         built.MadeLens(m.small(), m.OPTICS)
         .stack(X)
@@ -85,7 +87,7 @@ def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
     settings = dataclasses.replace(m.OPTICS, window_samples=15)
     light = (
         built.MadeLens(m.small(), settings)
-        .stack(vector({"bias_x_nm": 10.0}))
+        .stack(parameter_vector({"bias_x_nm": 10.0}))
         .intensity.double()
     )
     axis = (torch.arange(15, dtype=torch.float64) - 7) * 3.0
@@ -99,7 +101,7 @@ def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
 
 
 def test_only_what_the_lens_keeps_enters():
-    bench = vector(
+    bench = parameter_vector(
         {
             "stage_zero_um": 300.0,
             "wavelength_nm": 2.0,
@@ -112,8 +114,12 @@ def test_only_what_the_lens_keeps_enters():
 
 
 def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
-    draws = np.array(list(built.posterior(m.asbuilt(sigma=0.5), 400, seed=3)))
-    again = np.array(list(built.posterior(m.asbuilt(sigma=0.5), 400, seed=3)))
+    draws = np.array(
+        list(built.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
+    )
+    again = np.array(
+        list(built.posterior_parameters(m.asbuilt(sigma=0.5), 400, seed=3))
+    )
     assert np.array_equal(draws, again)
     bias = draws[:, PLACE["bias_nm"]]
     assert abs(bias.mean() - 6.0) < 4 * 0.5 / 20
@@ -123,7 +129,7 @@ def test_draws_of_the_posterior_have_its_covariance_and_come_from_their_seed():
 def test_the_design_matches_the_smooth_lens_of_training():
     """Pillars against the phase they were made for: two ways to the same samples."""
     got = built.MadeLens(m.small(), m.OPTICS).stack()
-    want = optics.stack(m.OPTICS, torch.zeros(0))
+    want = optics.lens_psf_stack(m.OPTICS, torch.zeros(0))
     assert (
         built.psf_error(got, want) < 0.25
     )  # the grids of both windows cut the band at different harmonics

@@ -10,8 +10,8 @@ import pytest
 import torch
 from scipy.signal import correlate
 
-from characterize.model import state
-from characterize.model.parameters import NAMES, vector
+from characterize.model import process_state_of
+from characterize.model.parameters import NAMES, parameter_vector
 from codesign.optics import built
 from metalens.fabrication import Sensitivity, transmission
 from metalens.image import Pupil, amplitude, coordinates
@@ -87,7 +87,7 @@ def test_a_lens_keeps_what_is_made_and_leaves_its_bench():
     kept = built.of_lens(x)
     for name, before, after in zip(NAMES, x, kept, strict=True):
         assert after == (
-            before if name in built.OF_LENS else vector()[NAMES.index(name)]
+            before if name in built.OF_LENS else parameter_vector()[NAMES.index(name)]
         )
     assert "distance_um" in built.OF_LENS
 
@@ -128,7 +128,7 @@ def test_nodes_hold_the_window_twice_and_sixty_four_at_least(sample_um, nodes):
 def test_a_wave_of_another_distance_is_the_design_s_defocused():
     """exp(ik (√(r² + d'²) - d' - √(r² + d²) + d)) within the rim, nothing beyond."""
     lens = built.MadeLens(m.small(), m.OPTICS)
-    plain, moved = lens.wave(), lens.wave(vector({"distance_um": 7.0}))
+    plain, moved = lens.wave(), lens.wave(parameter_vector({"distance_um": 7.0}))
     x, y = (c.numpy() for c in coordinates(lens._pupil(300.0)))
     r = np.hypot(x, y)
     inside = np.abs(plain) > 0
@@ -168,8 +168,8 @@ def test_cells_hold_the_pillars_as_made_by_the_response_that_is_given():
         Sensitivity(np.array([[-0.2 + 9j, 50j], [3j, 12j], [1.5j, 6j]]), 0.17),
     )
     lens = built.MadeLens(design, m.OPTICS, response=response)
-    known = state(
-        vector(
+    known = process_state_of(
+        parameter_vector(
             {"bias_nm": 4.0, "bias_x_nm": 3.0, "bias_y_nm": -17.0, "height_nm": -8.0}
         )
     )
@@ -214,7 +214,7 @@ def test_the_lens_plane_lies_on_its_cells_and_bends_as_the_lens_was_bent():
     """The same evenly growing field, now at rays; coma along x of 0.3 rad rms: 0.3 √8
     (3 r³ - 2 r) cos.
     """
-    lens, known = oblong(), vector({"coma_x_rad": 0.3})
+    lens, known = oblong(), parameter_vector({"coma_x_rad": 0.3})
     cells = (3 + 0.2 * CELL_X - 0.1 * CELL_Y) + 1j * (2 - 0.3 * CELL_X + 0.7 * CELL_Y)
     rim = lens.design.diameters.radius_um
     assert rim == pytest.approx(0.4 * math.hypot(25.0, 38.5))
@@ -224,7 +224,7 @@ def test_the_lens_plane_lies_on_its_cells_and_bends_as_the_lens_was_bent():
     )
     u, v = x.numpy() / rim, y.numpy() / rim
     want = (3 + 0.2 * x - 0.1 * y) + 1j * (2 - 0.3 * x + 0.7 * y)
-    flat = lens._plane(vector(), cells)
+    flat = lens._plane(parameter_vector(), cells)
     assert flat.added_rad is None
     assert flat.radius_um == pytest.approx(rim + 0.2)
     assert flat.factor(x, y, 0.85, 0.0).numpy() == pytest.approx(want.numpy(), abs=2e-6)
@@ -293,7 +293,7 @@ def test_psfs_are_harmonics_of_the_aperture_with_itself():
 
 def test_without_parameters_a_lens_is_the_design():
     lens = built.MadeLens(m.small(), m.OPTICS)
-    known = vector({"bias_nm": 9.0, "distance_um": 5.0, "spherical_rad": 0.3})
+    known = parameter_vector({"bias_nm": 9.0, "distance_um": 5.0, "spherical_rad": 0.3})
     plain = lens.stack().intensity
-    assert torch.equal(plain, lens.stack(vector()).intensity)
+    assert torch.equal(plain, lens.stack(parameter_vector()).intensity)
     assert built.psf_error(lens.stack(known), lens.stack()) > 0.01

@@ -12,7 +12,7 @@ import torch
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import LensError, LensErrors
-from metalens.cell import Index, Light
+from metalens.cell import Incidence, Index
 from metalens.pillars import DEFAULT_CELL, engines
 
 SETTINGS = optics.OpticsConfig()
@@ -59,7 +59,7 @@ def test_tilt_and_astigmatism_are_waves_at_the_rim():
 
 def test_haze_takes_the_share_of_marechal_and_spreads_it_over_the_shadow():
     light = torch.rand(2, 5, 5, dtype=torch.float64)
-    got = optics.hazy(SETTINGS, light, 0.31)
+    got = optics.scatter_loss(SETTINGS, light, 0.31)
     kept = math.exp(-0.31)
     haze = (
         (1 - kept)
@@ -184,8 +184,8 @@ def test_the_phases_that_training_takes_are_those_of_the_solver():
     at, both ends among them.
     """
     low, high = SETTINGS.proxy.domain_um
-    solve = engines.smooth(
-        DEFAULT_CELL, Light(0.85), (low, high), tolerance=1e-3, engine="modal"
+    solve = engines.solver_at_fixed_discretization(
+        DEFAULT_CELL, Incidence(0.85), (low, high), tolerance=1e-3, engine="modal"
     )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
     told = np.exp(1j * np.asarray(SETTINGS.proxy.phase_rad(diameter, 0.85)))

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from codesign.optics import families, stack
-from codesign.optics.families import Start
+from codesign.optics.families import StartingPhase
 from codesign.optics.stack import OpticsConfig
+from metalens.core.errors import ConfigError
 from metalens.design import Focus, profiles
-from metalens.ground.errors import ConfigError
 
 FOCUS = Focus(0.85, 2000.0, 30_000.0)
 PLAIN = OpticsConfig(
@@ -27,7 +27,7 @@ def test_two_parts_make_two_spots_where_they_point():
     and nowhere along y.
     """
     psf = (
-        stack.stack(replace(PLAIN, parts=2, apart_um=48.0), torch.zeros(0))
+        stack.lens_psf_stack(replace(PLAIN, parts=2, apart_um=48.0), torch.zeros(0))
         .intensity[0]
         .double()
     )
@@ -46,7 +46,7 @@ def test_two_parts_make_two_spots_where_they_point():
 
 
 def test_three_parts_point_a_third_of_a_turn_apart():
-    start = Start(FOCUS, 250.0, parts=3, apart_um=30.0)
+    start = StartingPhase(FOCUS, 250.0, parts=3, apart_um=30.0)
     k = 2 * math.pi / 0.85
     for turn in (0.0, 2 * math.pi / 3, 4 * math.pi / 3):
         x, y = (
@@ -61,7 +61,7 @@ def test_three_parts_point_a_third_of_a_turn_apart():
 
 
 def test_each_ring_is_the_hyperbolic_lens_of_its_own_focus():
-    start = Start(FOCUS, 250.0, foci_um=(20_000.0, 60_000.0))
+    start = StartingPhase(FOCUS, 250.0, foci_um=(20_000.0, 60_000.0))
     for radius, focus in (
         (100.0, 20_000.0),
         (170.0, 20_000.0),
@@ -74,7 +74,7 @@ def test_each_ring_is_the_hyperbolic_lens_of_its_own_focus():
         )
         both = replace(FOCUS, source_distance_um=focus), FOCUS
         own, common = (
-            profiles.hyperbolic(np.array([x]), np.array([y]), f) for f in both
+            profiles.hyperbolic_phase(np.array([x]), np.array([y]), f) for f in both
         )
         assert float(found) == pytest.approx(float((own - common).ravel()[0]), abs=1e-6)
 
@@ -82,14 +82,14 @@ def test_each_ring_is_the_hyperbolic_lens_of_its_own_focus():
 def test_radial_terms_know_no_azimuth_and_free_ones_do():
     x, y = np.array([0.6, -0.28, 0.0]), np.array([0.0, 0.53, -0.6])
     places = torch.from_numpy(x), torch.from_numpy(y)
-    radial = families.terms(*places, 3, "radial")
+    radial = families.phase_terms(*places, 3, "radial")
     for power, term in zip((2, 4, 6), radial, strict=True):
         assert term.numpy() == pytest.approx(np.hypot(x, y) ** power)
 
 
 def test_free_terms_are_rings_and_waves_in_their_order():
     x, y = np.array([0.6, -0.28, 0.0, 0.0, -1.1]), np.array([0.0, 0.53, -0.6, 0.0, 0.4])
-    free = families.terms(torch.from_numpy(x), torch.from_numpy(y), 23, "free")
+    free = families.phase_terms(torch.from_numpy(x), torch.from_numpy(y), 23, "free")
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
     orders = [(n, m) for n in range(2, 7) for m in range(-n, n + 1, 2)]
     assert len(free) == 23 < len(orders)
@@ -98,7 +98,7 @@ def test_free_terms_are_rings_and_waves_in_their_order():
         assert term.numpy() == pytest.approx(
             want, abs=1e-13
         )  # rounding of a dozen products below 3
-    across = families.terms(
+    across = families.phase_terms(
         torch.from_numpy(x), torch.from_numpy(y)[:, None], 5, "free"
     )  # of a row and a column
     assert all(term.shape == (5, 5) for term in across)
@@ -119,9 +119,9 @@ def test_pillars_and_training_see_one_phase(change):
         torch.from_numpy(np.broadcast_to(a, (2, 3)).copy()) for a in (x, y[:, None])
     ]
     pillars = stack.phase_of(settings, moved.numpy())(x, y)
-    training = stack.phase_at(settings, moved, *grid).numpy() + profiles.hyperbolic(
-        x, y[:, None], settings.focus
-    )
+    training = stack.phase_at(
+        settings, moved, *grid
+    ).numpy() + profiles.hyperbolic_phase(x, y[:, None], settings.focus)
     apart = np.angle(np.exp(1j * (pillars - training)))
     assert np.abs(apart).max() < 1e-8  # thousands of radians in float64
 

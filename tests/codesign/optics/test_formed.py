@@ -14,11 +14,11 @@ from codesign.optics import formed, stack
 from codesign.optics.lens_errors import LensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig
 from metalens.cell import Film, Index
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.field import normalised, textured_frames
 from metalens.field.forming import with_psfs
 from metalens.field.plan import spectral
 from metalens.field.slopes import drawn, term
-from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, UniformImager
 from metalens.lens import Layers, Stop
 
@@ -34,7 +34,7 @@ FRAME, MARGIN = 32, 5
 
 @pytest.fixture(scope="module")
 def whole():
-    return formed.imager(SMALL, BENT, FRAME, margin=MARGIN)
+    return formed.make_imager(SMALL, BENT, FRAME, margin=MARGIN)
 
 
 def test_on_the_axis_it_holds_the_psfs_of_the_other_engine(whole):
@@ -46,7 +46,7 @@ def test_on_the_axis_it_holds_the_psfs_of_the_other_engine(whole):
     at = replace(SMALL, image="uniform")
     for k in (0, len(whole.plan.depths_um) // 2):
         depth = float(whole.plan.depths_um[k]) * 1e-3
-        one = stack.stack(
+        one = stack.lens_psf_stack(
             replace(at, depths_mm=(depth, depth * 1.0001), depth_count=2), BENT
         ).intensity[0]
         f = np.fft.fftfreq(SMALL.window_samples)
@@ -82,8 +82,10 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
         psfs, _ = normalised(light.reshape(whole.stack.shape), optics, whole.plan)
         return (with_psfs(whole, psfs, whole.energy)(frames) * weight).sum()
 
-    ready = formed.live(SMALL, whole)
-    (flat.irradiance(frames, ready.ready, margin=MARGIN) * weight).sum().backward()
+    ready = formed.make_differentiable_imager(SMALL, whole)
+    (
+        flat.sensor_irradiance(frames, ready.ready, margin=MARGIN) * weight
+    ).sum().backward()
     moving = BENT.clone().requires_grad_()
     optics = formed.optics_of(SMALL, moving)
     points = len(whole.plan.y_um) * len(whole.plan.x_um)
@@ -112,7 +114,7 @@ def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_
     whole,
 ):
     pairs = drawn(whole.plan, 3, torch.Generator().manual_seed(4))
-    ready = formed.live(SMALL, whole, pairs)
+    ready = formed.make_differentiable_imager(SMALL, whole, pairs)
     assert ready.ready.asked == set(pairs[0].tolist())
     frames = _frames(whole)
     seen = ready.ready(frames)
@@ -128,12 +130,12 @@ def _frames(made):
 
 def test_flat_frames_take_the_true_image_as_one_sheet(whole):
     draw = np.random.default_rng(3)
-    frames = flat.Flat(
+    frames = flat.SingleSurfaceFrames(
         draw.integers(10, 250, (2, FRAME, FRAME), dtype=np.uint8),
         np.full((2, FRAME, FRAME), 20_000, np.uint16), np.array([0.9, 1.1], np.float32),
     )  # fmt: skip
     assert float(flat.depth_um(frames)[0, 0, 0]) == pytest.approx(18_000)
-    got = flat.irradiance(frames, whole, margin=MARGIN)
+    got = flat.sensor_irradiance(frames, whole, margin=MARGIN)
     light = torch.from_numpy(frames.light / 255.0).float()
     cover = torch.ones(2, 1, FRAME, FRAME)
     depth = (
@@ -156,10 +158,10 @@ def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
     assert formed.source_of(wide).fwhm_nm == pytest.approx(24.0)  # 3-4-5: 30 * 40 / 50
     assert wide.passed == pytest.approx(0.8)
     assert formed.source_of(SMALL) is None
-    whole = formed.imager(
+    whole = formed.make_imager(
         replace(wide, polynomials=0, image_tolerance=0.4), torch.zeros(0), 20, margin=5
     )
-    bare = formed.imager(
+    bare = formed.make_imager(
         replace(wide, polynomials=0, image_tolerance=0.4, fwhm_nm=24.0, filter_nm=0.0),
         torch.zeros(0),
         20,
@@ -186,10 +188,10 @@ def test_impossible_sources_are_refused(change, message):
 
 
 def test_psfs_of_one_chief_ray_cannot_stand_for_the_field():
-    made = stack.stack(replace(SMALL, image="uniform"), BENT)
+    made = stack.lens_psf_stack(replace(SMALL, image="uniform"), BENT)
     with pytest.raises(TrainingError, match="cannot stand for the field"):
-        formed.imager(SMALL, BENT, FRAME, margin=MARGIN, made=made)
-    one = formed.imager(
+        formed.make_imager(SMALL, BENT, FRAME, margin=MARGIN, made=made)
+    one = formed.make_imager(
         replace(SMALL, image="uniform"), BENT, FRAME, margin=MARGIN, made=made
     )
     assert isinstance(one, UniformImager)
@@ -211,8 +213,8 @@ def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole
 def test_made_lenses_differ_and_lose_light_to_haze():
     loose = replace(SMALL, spread=LensErrors(focus_um=20.0, height_nm=30.0))
     error = loose.spread.draw(torch.Generator().manual_seed(3))
-    made = formed.imager(loose, BENT, 20, margin=5, error=error)
-    plain = formed.imager(loose, BENT, 20, margin=5)
+    made = formed.make_imager(loose, BENT, 20, margin=5, error=error)
+    plain = formed.make_imager(loose, BENT, 20, margin=5)
     assert torch.allclose(made.stack.sum((-2, -1)), torch.ones(()), atol=1e-4)
     kept = math.exp(-variance_rad2(error.state()))
     shadow = (11 * 12.0) ** 2 / (
@@ -234,7 +236,9 @@ def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
         for s in (None, Stop(75.0, 300.0))
     )
     none = torch.zeros(0)
-    lit = [stack.stack(s, none).intensity.sum((1, 2)) for s in (open_, stopped)]
+    lit = [
+        stack.lens_psf_stack(s, none).intensity.sum((1, 2)) for s in (open_, stopped)
+    ]
     near = (
         1 - 300 / 1.45 / (float(stopped.depths_um[0]) - 300 + 300 / 1.45)
     ) ** -2  # the shadow is wider than the hole
@@ -244,7 +248,7 @@ def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
     through = [formed.optics_of(s, none) for s in (open_, stopped)]
     assert [plane.layers.stop for plane in through] == [None, Stop(75.0, 300.0)]
     assert through[0].wave.focus.layers.front == glass
-    image = formed.imager(stopped, none, FRAME, margin=MARGIN)
+    image = formed.make_imager(stopped, none, FRAME, margin=MARGIN)
     middle = image.energy[len(image.plan.y_um) // 2, len(image.plan.x_um) // 2]
     assert (
         float(middle.min()) > 0.85

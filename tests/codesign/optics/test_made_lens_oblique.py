@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from characterize.model import made
-from characterize.model.parameters import PLACE, vector
+from characterize.model.parameters import PLACE, parameter_vector
 from codesign.optics import built
-from codesign.optics.stack import Stack
+from codesign.optics.stack import PixelPsfStack
 from metalens import psf
 from metalens.fabrication import sensitivity
 from tests.codesign import made_lens as m
 
-X = vector(m.TRUE)
+X = parameter_vector(m.TRUE)
 
 
 @pytest.mark.parametrize("angle_deg", [9.0, -14.0])
@@ -25,7 +25,7 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     """
     settings = dataclasses.replace(m.OPTICS, angle_deg=angle_deg)
     lens, known = m.small(), built.of_lens(X)
-    t = made.pillars(lens, sensitivity(lens), known)
+    t = made.as_built_transmission(lens, sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85,
@@ -42,7 +42,7 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     waves = np.cos(2 * np.pi * order / window * (place[:, None] - fine)[..., None])
     rows = settings.sample_um / window * (1 + 2 * (waves * kept).sum(-1))
     light = np.asarray(found.intensity).reshape(3, samples, samples)
-    want = Stack(torch.as_tensor(rows @ light @ rows.T), settings.depths_um)
+    want = PixelPsfStack(torch.as_tensor(rows @ light @ rows.T), settings.depths_um)
     got = built.MadeLens(lens, settings).stack(X)
     assert built.psf_error(got, want) < 0.03
     on_axis = built.MadeLens(lens, m.OPTICS).stack(X)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from codesign.optics import numerics
-from codesign.optics.numerics import Aperture, Window
+from codesign.optics.numerics import ImageWindow, TabulatedLens
 from metalens.image.scene import PsfBasis
 from metalens.lens import DiameterMap
 from metalens.psf import Source, spectrum
@@ -41,7 +41,7 @@ def table_of(aperture):
 
 
 def test_every_pillar_finds_its_diameter_in_the_table():
-    aperture = Aperture(LENS)
+    aperture = TabulatedLens(LENS)
     assert aperture.diameter_um[[0, -1]] == pytest.approx([0.12 - 0.012, 0.3 + 0.012])
     assert aperture.step_um == pytest.approx((0.18 + 0.024) / 8191)
     there = DIAMETER > 0
@@ -60,13 +60,13 @@ def test_every_pillar_finds_its_diameter_in_the_table():
             "diameters": DiameterMap(np.where(DIAMETER == 0.3, 0.395, DIAMETER), 0.4),
         }
     )
-    assert Aperture(wide).diameter_um[-1] == pytest.approx(
+    assert TabulatedLens(wide).diameter_um[-1] == pytest.approx(
         0.999 * 0.4
     )  # no wider than the pitch
 
 
 def test_maps_take_phase_and_level_of_the_changed_diameter():
-    aperture = Aperture(LENS)
+    aperture = TabulatedLens(LENS)
     phase, level = aperture.maps(table_of(aperture))
     there = DIAMETER > 0
     assert level.numpy()[there] == pytest.approx(0.3 + DIAMETER[there], abs=2e-5)
@@ -80,7 +80,7 @@ def test_maps_take_phase_and_level_of_the_changed_diameter():
 
 
 def test_a_table_of_rounded_diameters_stands_in_steps():
-    aperture = Aperture(LENS)
+    aperture = TabulatedLens(LENS)
     made = aperture.rounded(table_of(aperture), 0.01)
     want = np.clip(
         np.rint(aperture.diameter_um / 0.01) * 0.01, *aperture.diameter_um[[0, -1]]
@@ -90,7 +90,7 @@ def test_a_table_of_rounded_diameters_stands_in_steps():
 
 
 def test_the_designed_table_is_the_proxys_and_holds_at_its_ends():
-    aperture = Aperture(LENS)
+    aperture = TabulatedLens(LENS)
     inside = np.clip(aperture.diameter_um, 0.1, 0.27)
     assert aperture.designed() == pytest.approx(
         (0.9 - inside) * np.exp(7.2j * inside), rel=1e-12
@@ -101,29 +101,29 @@ def test_light_is_turned_by_both_sides():
     """From 900 um in front to 70 um behind: the sines add up; nothing in front of a
     collimated beam.
     """
-    sine = Aperture(LENS).turn_sine()
+    sine = TabulatedLens(LENS).turn_sine()
     r = 0.4 * math.hypot(1.5, 1.0)  # the corner of 3 x 4 sites
     assert sine[0, 0] == pytest.approx(
         r / math.hypot(r, 70) + r / math.hypot(r, 900), rel=1e-9
     )
     far = SimpleNamespace(**{**vars(LENS), "source_distance_um": math.inf})
-    assert Aperture(far).turn_sine()[0, 0] == pytest.approx(
+    assert TabulatedLens(far).turn_sine()[0, 0] == pytest.approx(
         r / math.hypot(r, 70), rel=1e-9
     )
 
 
 def test_depths_are_even_in_their_inverse():
-    depths = Window(15e3, 40e3).depths_um(6)
+    depths = ImageWindow(15e3, 40e3).depths_um(6)
     assert depths[[0, -1]] == pytest.approx([15e3, 40e3])
     assert np.diff(1 / depths) == pytest.approx(np.full(5, (1 / 40e3 - 1 / 15e3) / 5))
 
 
 def test_a_line_is_few_wavelengths_of_the_diode():
-    one = numerics.line(LENS, 0.0, 5)
+    one = numerics.spectral_line_nodes(LENS, 0.0, 5)
     assert (one.wavelengths_um.tolist(), one.weights.tolist()) == ([0.8], [1.0])
-    assert numerics.line(LENS, 30.0, 1).wavelengths_um.tolist() == [0.8]
-    three = numerics.line(LENS, 30.0, 3)
-    um, share = spectrum.weight(Source(800.0, 30.0))
+    assert numerics.spectral_line_nodes(LENS, 30.0, 1).wavelengths_um.tolist() == [0.8]
+    three = numerics.spectral_line_nodes(LENS, 30.0, 3)
+    um, share = spectrum.spectral_weight(Source(800.0, 30.0))
     for power in range(6):  # Gauss: moments to 2 n - 1
         assert three.weights @ (three.wavelengths_um - 0.8) ** power == pytest.approx(
             share @ (um - 0.8) ** power, abs=1e-12
@@ -143,7 +143,7 @@ def test_bases_that_differ_by_a_picture_differ_by_its_length():
         weights = torch.tensor([near, far], dtype=torch.float64).reshape(1, 1, 2, 2)
         return PsfBasis(kernels, weights, depths, 0.0, 0.0)
 
-    window = Window(15e3, 40e3)
+    window = ImageWindow(15e3, 40e3)
     found = numerics.psf_difference(
         made((0.8, 0.6), (0.8, 0.6)), made((1.0, 0.0), (1.0, 0.0)), window
     )

@@ -13,7 +13,7 @@ from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import LensError, LensErrors
 from codesign.optics.stack import OpticsConfig
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.image.pupil import coordinates, psf
 from metalens.psf import psf_stack
 
@@ -71,7 +71,7 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
         samples=wide.window_samples * wide.fine,
     )
     want = _on_samples(fine.double(), wide)
-    got = optics.stack(wide, coefficients).intensity
+    got = optics.lens_psf_stack(wide, coefficients).intensity
     assert (
         float((got - want).norm() / want.norm()) < 1e-3
     )  # light outside the window of the reference
@@ -83,7 +83,7 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
 def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     settings = replace(SMALL, zones=zones, angle_deg=angle_deg)
     coefficients = _coefficients()
-    quick = optics.stack(settings, coefficients).intensity
+    quick = optics.lens_psf_stack(settings, coefficients).intensity
     n, pitch = 500, 0.4
     x = (np.arange(n) - (n - 1) / 2) * pitch
     inside = (x[:, None] ** 2 + x**2 <= 100.0**2).astype(float)
@@ -128,7 +128,7 @@ def test_gradient_agrees_with_a_finite_difference(angle_deg):
     settings = replace(SMALL, angle_deg=angle_deg)
     coefficients = _coefficients().requires_grad_()
     weight = torch.randn(3, 17, 17, generator=torch.Generator().manual_seed(5))
-    value = (optics.stack(settings, coefficients).intensity * weight).sum()
+    value = (optics.lens_psf_stack(settings, coefficients).intensity * weight).sum()
     (gradient,) = torch.autograd.grad(value, coefficients)
     direction = torch.randn(
         12, generator=torch.Generator().manual_seed(6), dtype=torch.float64
@@ -137,7 +137,7 @@ def test_gradient_agrees_with_a_finite_difference(angle_deg):
     ahead, behind = (
         float(
             (
-                optics.stack(
+                optics.lens_psf_stack(
                     settings, coefficients.detach() + s * direction
                 ).intensity.double()
                 * weight
@@ -159,10 +159,10 @@ def test_a_shifted_sensor_is_a_shifted_focus():
     shifted = 2.0
     vergence = 1 / 20_000.0 + shifted / 400.0**2
     error = LensError({"focus_um": shifted})
-    with_error = optics.stack(SMALL, torch.zeros(12), error=error).intensity
+    with_error = optics.lens_psf_stack(SMALL, torch.zeros(12), error=error).intensity
     peaks = [
         float(
-            optics.stack(replace(SMALL, focus_mm=1e-3 / v), torch.zeros(12))
+            optics.lens_psf_stack(replace(SMALL, focus_mm=1e-3 / v), torch.zeros(12))
             .intensity[0]
             .max()
         )
@@ -175,8 +175,8 @@ def test_a_shifted_sensor_is_a_shifted_focus():
 
 
 def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():
-    plain = optics.stack(SMALL, torch.zeros(12)).intensity[1]
-    bent = optics.stack(
+    plain = optics.lens_psf_stack(SMALL, torch.zeros(12)).intensity[1]
+    bent = optics.lens_psf_stack(
         SMALL,
         torch.zeros(12),
         error=LensError({"tilt_waves": 0.3, "astigmatism_waves": 0.3}),
@@ -190,7 +190,7 @@ def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():
 
 def test_lost_optics_and_impossible_settings_are_refused():
     with pytest.raises(TrainingError, match="learning rate of the optics"):
-        optics.stack(SMALL, torch.full((12,), float("nan")))
+        optics.lens_psf_stack(SMALL, torch.full((12,), float("nan")))
     with pytest.raises(ConfigError, match="depths_mm"):
         replace(SMALL, depths_mm=(20.0, 10.0))
     with pytest.raises(ConfigError, match="odd number"):
@@ -232,8 +232,8 @@ def test_lens_errors_have_the_covariance_that_was_asked_for():
 
 
 def test_a_bias_of_the_diameters_sends_light_straight_on():
-    plain = optics.stack(SMALL, torch.zeros(12)).intensity
-    hazy = optics.stack(
+    plain = optics.lens_psf_stack(SMALL, torch.zeros(12)).intensity
+    hazy = optics.lens_psf_stack(
         SMALL, torch.zeros(12), error=LensError({"bias_nm": 20.0})
     ).intensity
     lost = 1 - math.exp(-7.797e-4 * 400)  # rad²/nm², of the default cell: below

@@ -12,7 +12,7 @@ import torch
 from codesign.optics import families, lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import LensError
-from codesign.optics.stack import OpticsConfig, Stack
+from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from metalens.design import profiles
 from metalens.image import coordinates
 
@@ -82,7 +82,9 @@ def test_start_and_focus_carry_lengths_in_micrometres():
 def test_kernels_are_of_psfs_of_sum_one():
     light = torch.rand(3, 5, 5, dtype=torch.float64) + 0.1
     light = light * torch.tensor([0.3, 1.0, 2.7])[:, None, None]
-    made = Stack(light, torch.tensor([1e4, 2e4, 3e4], dtype=torch.float64)).basis(1e-9)
+    made = PixelPsfStack(
+        light, torch.tensor([1e4, 2e4, 3e4], dtype=torch.float64)
+    ).basis(1e-9)
     back = torch.einsum(
         "dr,ryx->dyx",
         torch.as_tensor(made.weights)[0, 0].double(),
@@ -97,7 +99,7 @@ def test_light_of_the_stack_is_that_of_the_pupil_by_plain_sums():
     over whole samples, by sums over
     all frequencies that a sample's grid can show; the share of the light of the
     aperture."""
-    made = optics.stack(OWN, torch.zeros(0)).intensity.double().numpy()
+    made = optics.lens_psf_stack(OWN, torch.zeros(0)).intensity.double().numpy()
     want = summed(OWN, 0.0)
     scale = want.sum() / made[4].sum()
     assert made[4] == pytest.approx(want / scale, abs=2e-3 * made[4].max())
@@ -156,7 +158,9 @@ def test_a_window_holds_what_a_round_aperture_sends_to_its_samples(
         aperture_mm=aperture_mm, sensor_distance_mm=distance_mm, focus_mm=20.0, depths_mm=(20.0, 40.0), depth_count=2,
         sample_um=sample_um, window_samples=samples, polynomials=0,
     )  # fmt: skip
-    light = float(optics.stack(settings, torch.zeros(0)).intensity[0].double().sum())
+    light = float(
+        optics.lens_psf_stack(settings, torch.zeros(0)).intensity[0].double().sum()
+    )
     node, weight = np.polynomial.legendre.leggauss(200)
     f, weight = (node + 1) / (4 * sample_um), weight / (4 * sample_um)
     place = (np.arange(samples) - (samples - 1) / 2) * sample_um
@@ -187,14 +191,14 @@ def by_hand(x, y, *, wrong=False):
     """
     nodes = [c.numpy() / 350 for c in coordinates(BENT.pupil)]
     inside = np.hypot(*nodes) <= 1
-    raw = np.stack(families.terms(*map(torch.from_numpy, nodes), 4, "free"))[
+    raw = np.stack(families.phase_terms(*map(torch.from_numpy, nodes), 4, "free"))[
         :, inside
     ].T
     mix = np.linalg.inv(np.linalg.qr(raw)[1]) * math.sqrt(len(raw))
     assert (raw @ mix).T @ (raw @ mix) / len(raw) == pytest.approx(np.eye(4), abs=1e-9)
     total = np.tensordot(
         mix @ RAD.numpy(),
-        np.stack(families.terms(*map(torch.from_numpy, (x, y)), 4, "free")),
+        np.stack(families.phase_terms(*map(torch.from_numpy, (x, y)), 4, "free")),
         1,
     )
     ring = np.ceil(2 * (x**2 + y**2)).clip(1, 2)
@@ -218,13 +222,13 @@ def test_the_phase_at_pillars_is_that_of_the_polynomials_over_the_radius():
     made = optics.phase_at(BENT, RAD, *places, error=WRONG).numpy()
     assert made == pytest.approx(by_hand(across, down, wrong=True), rel=1e-9)
     whole = optics.phase_of(BENT, RAD.numpy())(350 * x, 350 * y)
-    assert whole - profiles.hyperbolic(
+    assert whole - profiles.hyperbolic_phase(
         350 * x, 350 * y[:, None], BENT.focus
     ) == pytest.approx(by_hand(across, down), rel=1e-9)
     plain = replace(BENT, polynomials=0, zones=0)
     assert not optics.phase_at(plain, RAD[:0], *places).any()
     assert optics.phase_of(plain, np.zeros(0))(350 * x, 350 * y) == pytest.approx(
-        profiles.hyperbolic(350 * x, 350 * y[:, None], BENT.focus)
+        profiles.hyperbolic_phase(350 * x, 350 * y[:, None], BENT.focus)
     )
 
 
@@ -237,9 +241,9 @@ def test_a_lens_made_wrong_has_the_light_of_its_bent_phase_and_the_haze_of_its_p
     kept = math.exp(-lens_errors.variance_rad2(WRONG.state()))
     assert kept < 0.99
     want = kept * summed(BENT, phase) + (1 - kept) * 49 / (math.pi * 350**2)
-    made = optics.stack(BENT, RAD, error=WRONG).intensity[4].double().numpy()
+    made = optics.lens_psf_stack(BENT, RAD, error=WRONG).intensity[4].double().numpy()
     assert made == pytest.approx(want, abs=2e-3 * want.max())
-    right = optics.stack(BENT, RAD).intensity[4].double().numpy()
+    right = optics.lens_psf_stack(BENT, RAD).intensity[4].double().numpy()
     assert np.abs(right - made).max() > 0.05 * want.max()
 
 

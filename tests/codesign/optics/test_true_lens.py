@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from codesign.optics import true_lens
-from codesign.optics.true_lens import Device, PillarCells
+from codesign.optics.true_lens import ImagingDevice, PillarCells
 from metalens.cell import Cell
 from metalens.design import Focus, profiles
 from metalens.field import Grid, SmoothWave, imager
@@ -72,7 +72,7 @@ def test_pillars_of_the_ideal_phase_and_a_ramp_are_the_ramp(monkeypatch, rows):
     )
     ideal = SmoothWave(FOCUS, 7.2).carrier_rad(x, y[:, None])
     phase = torch.remainder(ideal + 0.013 * x - 0.02 * y[:, None], 2 * math.pi).float()
-    made = true_lens.gathered(
+    made = true_lens.gather_lens_plane(
         lens(phase, None), phase, torch.full((36, 30), 0.7), window_um=20.0
     )
     assert (made.radius_um, made.half_um) == (7.2, pytest.approx((6.0, 7.2)))
@@ -124,7 +124,9 @@ def test_what_cells_leave_out_is_told_of_given_pillars_as_of_a_lens_file(count):
     window asks for, not 2.5 um.
     """
     x = (np.arange(count) - (count - 1) / 2) * 0.4
-    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], FOCUS) + 1.0, 2 * math.pi)
+    wanted = np.remainder(
+        profiles.hyperbolic_phase(x, x[:, None], FOCUS) + 1.0, 2 * math.pi
+    )
     size = np.where(
         np.hypot(x, x[:, None]) < 9.7, 0.12 + 0.2 * np.round(wanted / 6.2832 * 8) / 8, 0
     )
@@ -150,7 +152,7 @@ def test_what_cells_leave_out_is_told_of_given_pillars_as_of_a_lens_file(count):
         torch.from_numpy(part).float()
         for part in (made.phase_rad(), made.transmission())
     )
-    wave = true_lens.gathered(made, *maps, window_um=21 * 4.8)
+    wave = true_lens.gather_lens_plane(made, *maps, window_um=21 * 4.8)
     want = imager(made, grid, tolerance=0.2).parts["pillars"]
     assert want > 1e-3
     found = imager(wave, grid, distance_um=210.0, tolerance=0.2).parts["pillars"]
@@ -169,7 +171,7 @@ def test_one_psf_is_that_of_the_middle_and_even_light_that_of_the_mean(monkeypat
         stack=torch.rand(3, 5, 2, 4, 4, generator=DRAW),
         energy=torch.rand(3, 5, generator=DRAW),
     )
-    made = Device(None, None, 210.0, whole, 0.03)
+    made = ImagingDevice(None, None, 210.0, whole, 0.03)
     one, even = made.one_psf(), made.evenly_lit()
     assert torch.equal(one.energy, whole.energy)
     assert torch.equal(even.stack, whole.stack)

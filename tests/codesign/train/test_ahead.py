@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.train import ahead
-from codesign.train.ahead import Ahead
+from codesign.train.ahead import Prefetcher
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_the_next_step_is_begun_and_none_beyond_the_end(threads):
             began.set()
         return step**2
 
-    with Ahead(work, end=7) as going:
+    with Prefetcher(work, end=7) as going:
         assert going.take(5) == 25
         assert began.wait(10)  # nobody asked for 6 yet
         with going.beside():
@@ -43,13 +43,13 @@ def test_the_next_step_is_begun_and_none_beyond_the_end(threads):
 
 def test_one_thread_of_torch_stays_one_thread(threads):
     threads(1)
-    with Ahead(lambda step: threading.current_thread(), end=9) as going:
+    with Prefetcher(lambda step: threading.current_thread(), end=9) as going:
         assert going.take(2) is threading.main_thread()
 
 
 def test_without_workers_a_step_has_all_threads_and_does_its_own_work(threads):
     threads(2)
-    with Ahead(
+    with Prefetcher(
         lambda step: (step, threading.current_thread(), torch.get_num_threads()),
         end=9,
         workers=0,
@@ -61,7 +61,7 @@ def test_without_workers_a_step_has_all_threads_and_does_its_own_work(threads):
 
 def test_what_goes_wrong_beside_the_step_is_raised_in_it(threads):
     threads(2)
-    with Ahead(lambda step: 1 // (step - 4), end=9) as going:
+    with Prefetcher(lambda step: 1 // (step - 4), end=9) as going:
         assert going.take(3) == -1
         with pytest.raises(ZeroDivisionError):
             going.take(4)
@@ -81,7 +81,7 @@ def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
             both.wait(10)
         return step**2
 
-    with Ahead(work, end=6, workers=2) as going:
+    with Prefetcher(work, end=6, workers=2) as going:
         assert [going.take(step) for step in range(3, 6)] == [9, 16, 25]
         with going.beside():
             assert torch.get_num_threads() == 2
@@ -91,12 +91,12 @@ def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
 def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(
     monkeypatch,
 ):
-    monkeypatch.setattr(ahead, "cores", lambda: 12)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 12)
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
-    assert ahead.renderers(torch.device("cpu")) == 0
-    assert ahead.renderers(torch.device("cuda")) == 6
+    assert ahead.renderer_threads(torch.device("cpu")) == 0
+    assert ahead.renderer_threads(torch.device("cuda")) == 6
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
-    assert ahead.renderers(torch.device("cuda")) == 1
+    assert ahead.renderer_threads(torch.device("cuda")) == 1
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    monkeypatch.setattr(ahead, "cores", lambda: 44)
-    assert ahead.renderers(torch.device("cuda")) == 8  # not 11
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 44)
+    assert ahead.renderer_threads(torch.device("cuda")) == 8  # not 11

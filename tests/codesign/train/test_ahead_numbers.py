@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.train import ahead
-from codesign.train.ahead import Ahead
+from codesign.train.ahead import Prefetcher
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def test_the_work_takes_its_threads_from_the_step_and_leaves_one(
     threads, count, workers, beside
 ):
     threads(count)
-    with Ahead(
+    with Prefetcher(
         lambda step: threading.current_thread().name, end=9, workers=workers
     ) as going:
         assert going.take(3).startswith("ahead") == (workers > 0)
@@ -42,7 +42,7 @@ def test_as_many_steps_are_begun_as_there_are_workers_and_none_from_the_end_on(
 ):
     """A step beyond the end that is asked for is done all the same."""
     threads(4)
-    with Ahead(lambda step: 10 * step, end=end, workers=2) as going:
+    with Prefetcher(lambda step: 10 * step, end=end, workers=2) as going:
         assert going.take(5) == 50
         assert sorted(going._begun) == begun
 
@@ -54,13 +54,13 @@ def test_as_many_steps_are_begun_as_there_are_workers_and_none_from_the_end_on(
 def test_one_thread_at_least_and_eight_at_most_render_for_a_process(
     monkeypatch, cores, processes, count
 ):
-    monkeypatch.setattr(ahead, "cores", lambda: cores)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: cores)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
-    assert ahead.renderers(torch.device("cuda")) == count
+    assert ahead.renderer_threads(torch.device("cuda")) == count
 
 
 def test_a_process_alone_is_one(monkeypatch):
-    monkeypatch.setattr(ahead, "cores", lambda: 10)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 10)
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
-    assert ahead.renderers(torch.device("cuda")) == 5
-    assert ahead.renderers(torch.device("cpu")) == 0
+    assert ahead.renderer_threads(torch.device("cuda")) == 5
+    assert ahead.renderer_threads(torch.device("cpu")) == 0

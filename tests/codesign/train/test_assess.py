@@ -7,7 +7,7 @@ import torch
 
 from codesign.network import Prediction
 from codesign.train import assess
-from codesign.train.assess import Assessment, Seen
+from codesign.train.assess import SensorFrames, TaskErrors
 
 
 class Typed(torch.nn.Module):
@@ -24,11 +24,11 @@ class Typed(torch.nn.Module):
 
 
 def test_architectures_are_chosen_by_the_mean_of_three_axes():
-    assert Assessment(0.9, 0.3, 0.7).slip_mm == pytest.approx((0.9 + 0.3 + 0.3) / 3)
+    assert TaskErrors(0.9, 0.3, 0.7).slip_mm == pytest.approx((0.9 + 0.3 + 0.3) / 3)
 
 
 def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
-    monkeypatch.setattr(assess, "recalibrate", lambda *words: None)
+    monkeypatch.setattr(assess, "recalibrate_batch_norm", lambda *words: None)
     truth = torch.tensor([[0.3, -0.2, 1.1], [-0.6, 0.4, 0.2], [0.1, 0.9, -1.5]])
     off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.8, 0.1]])
     scale = torch.tensor([0.5, 2.0, 4.0])
@@ -38,14 +38,14 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
         1.0,
     )  # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[1, 0], mask[1, 0] = 1.0, 1.0
-    seen = Seen(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
+    seen = SensorFrames(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
     net = Typed((truth + off) / scale, logits)
     inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
-    got = assess.assess(net, None, seen, inner, measured=[])
+    got = assess.assess_architecture(net, None, seen, inner, measured=[])
     assert got.axial_mm == pytest.approx((0.7 + 0.4 + 0.1) / 3)
     assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.8) / 6)
     assert got.iou == pytest.approx((1 / 3 + 1 + 1) / 3)  # two empty masks agree
-    assert [len(part) for part in assess.parts(seen)] == [2, 1]
+    assert [len(part) for part in assess.batched_frames(seen)] == [2, 1]
 
 
 def test_standard_deviations_come_in_millimetres(monkeypatch):
@@ -64,17 +64,17 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
                 found.mask_logits, found.centre, found.slip, depth[part], log_sd[part]
             )
 
-    seen = Seen(
+    seen = SensorFrames(
         torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
     )
     net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
-    got = assess.predict(
+    got = assess.predict_frames(
         net, None, seen, SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
     )
     assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
     assert torch.allclose(got.slip_mm, scale.expand(3, 3))
     assert torch.equal(got.depth, depth)
-    plain = assess.predict(
+    plain = assess.predict_frames(
         Typed(torch.ones(3, 3), -torch.ones(3, 5, 5)),
         None,
         seen,
@@ -91,11 +91,11 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
             axis = torch.tensor([[0.3, -0.4, 1.2]]).expand(len(frames), 3)
             return Prediction(found.mask_logits, found.centre, found.slip, axis=axis)
 
-    seen = Seen(
+    seen = SensorFrames(
         torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
     )
     told = [
-        assess.predict(
+        assess.predict_frames(
             Turned(torch.ones(3, 3), -torch.ones(3, 5, 5)),
             None,
             seen,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from codesign.train import checkpoint
 from metalens.commands import info
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def test_a_networks_file_is_the_same_at_every_writing(tmp_path):
         checkpoint.save_network(tmp_path / "n.safetensors", net)
         found.add((tmp_path / "n.safetensors").read_bytes())
     assert len(found) == 1
-    told = info.network(tmp_path / "n.safetensors")
+    told = info.safetensors_head(tmp_path / "n.safetensors")
     assert (told["kind"], told["version"], told["arrays"]["weight"]) == (
         "subnet",
         "1",

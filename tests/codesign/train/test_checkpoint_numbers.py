@@ -9,7 +9,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from codesign.train import checkpoint
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,23 @@ def test_another_kind_or_version_is_refused(tmp_path, kind, version):
 
 
 def test_a_setting_that_holds_an_equals_sign_is_compared_whole():
-    told = checkpoint.difference(
+    told = checkpoint.settings_difference(
         'steps = 10\nname = "a = b = c"\n', Settings(name="a = b = d")
     )
     assert told == 'name: "a = b = c" -> "a = b = d"'
     assert (
-        checkpoint.difference('steps = 10\nname = "a = b"\n', Settings(name="a = b"))
+        checkpoint.settings_difference(
+            'steps = 10\nname = "a = b"\n', Settings(name="a = b")
+        )
         == ""
     )
     assert (
-        checkpoint.difference('name = "x"\n', Settings(name="x")) == ""
+        checkpoint.settings_difference('name = "x"\n', Settings(name="x")) == ""
     )  # what is not known stands at its default
-    assert checkpoint.difference("width = 3\n", Settings()) == "width: 3 -> absent"
+    assert (
+        checkpoint.settings_difference("width = 3\n", Settings())
+        == "width: 3 -> absent"
+    )
 
 
 def test_a_file_that_says_nothing_is_of_no_kind(tmp_path):
@@ -82,9 +87,9 @@ class Nested:
 
 def test_settings_of_one_name_in_two_tables_are_two_and_defaults_that_are_made_are_defaults():
     now = Nested(sides=(5, 8), one=Part(6))
-    told = checkpoint.difference("steps = 3\n", now).splitlines()
+    told = checkpoint.settings_difference("steps = 3\n", now).splitlines()
     assert told == ["one.steps: 4 -> 6", "sides: [5, 7] -> [5, 8]"]
-    assert checkpoint.difference("steps = 3\n", Nested()) == ""
-    assert checkpoint.difference(
+    assert checkpoint.settings_difference("steps = 3\n", Nested()) == ""
+    assert checkpoint.settings_difference(
         "steps = 3\n[one]\nsteps = 6\n[other]\nsteps = 9\n", now
     ) == ("other.steps: 9 -> 4\nsides: [5, 7] -> [5, 8]")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches.flat import flattened
+from codesign.batches.flat import flatten_layers
 from codesign.batches.scenes import TEST, EyeScenes, SceneConfig
-from codesign.network.architecture import smallest
+from codesign.network.architecture import smallest_architecture
 from codesign.network.supernet import Prediction, Supernet
 from codesign.optics.stack import OpticsConfig
 from codesign.train import ambiguity, assess, inner
-from codesign.train.depth_test import Displaced, depth_response, displaced
+from codesign.train.depth_test import DisplacedFrames, depth_response, displace_frames
 from codesign.train.inner import InnerConfig, Trainer
-from metalens.ground.errors import TrainingError
+from metalens.core.errors import TrainingError
 from metalens.image.sensor import Sensor
 
 SCENES = EyeScenes(SceneConfig(pixels=64, margin=8), 18.0, 2000.0, 0, TEST)
@@ -32,13 +32,13 @@ OPTICS = OpticsConfig(
 
 @pytest.fixture(scope="module")
 def pairs():
-    return ambiguity.ambiguous(SCENES, 8, seed=4)
+    return ambiguity.ambiguous_pairs(SCENES, 8, seed=4)
 
 
 @pytest.fixture(scope="module")
 def trainer():
     config = InnerConfig(steps=1, batch=8)
-    made = inner.model(OPTICS, pitch_um=18.0, seed=0)
+    made = inner.make_model(OPTICS, pitch_um=18.0, seed=0)
     return Trainer(
         config, OPTICS, Sensor(18.0, 18.0, 1e5, 0.0, 2e5, 0.0, 16), SCENES, made
     )
@@ -74,7 +74,7 @@ def test_pairs_share_the_pupil_and_depth_has_nothing_to_do_with_the_picture(pair
     assert float((first - second).norm(dim=1).max()) <= 0.1
     slips = labels.slip_um
     assert float((slips[::2] - slips[1::2]).norm(dim=1).min()) > 100
-    many = ambiguity.ambiguous(
+    many = ambiguity.ambiguous_pairs(
         replace(SCENES, settings=replace(SCENES.settings, scale=0.3)), 24, seed=5
     ).states
     depth = 21e3 + many.slip_um[:, 2]
@@ -89,7 +89,7 @@ def test_batches_of_pairs_end_with_the_pairs(pairs):
 
 
 def test_displaced_frames_differ_in_depth_alone(pairs):
-    plain, moved = pairs.batch(0, 4), Displaced(pairs, 1000.0).batch(0, 4)
+    plain, moved = pairs.batch(0, 4), DisplacedFrames(pairs, 1000.0).batch(0, 4)
     assert torch.equal(plain.frames.radiance, moved.frames.radiance)
     assert torch.equal(plain.slip_mm, moved.slip_mm)
     torch.testing.assert_close(
@@ -97,8 +97,8 @@ def test_displaced_frames_differ_in_depth_alone(pairs):
         torch.full((4, 2, 80, 80), 1000.0),
     )
     scale = pairs.states.scale[:4]
-    flat = flattened(plain.frames, scale)
-    far = displaced(flat, 1000.0)
+    flat = flatten_layers(plain.frames, scale)
+    far = displace_frames(flat, 1000.0)
     change = (far.depth_um.astype(float) - flat.depth_um) * flat.scale[:, None, None]
     assert (
         np.abs(change - 1000.0).max() < 1.3
@@ -112,7 +112,7 @@ def test_the_response_to_psf_depth_tells_a_blurmeter_from_a_ruler(pairs, trainer
     found = {}
     for kind in (Blurmeter, Ruler):
         found[kind] = depth_response(
-            trainer, pairs, kind(), smallest(Supernet().space), batches=2
+            trainer, pairs, kind(), smallest_architecture(Supernet().space), batches=2
         )
     assert found[Blurmeter].frames == 16
     assert found[Blurmeter].mean > 5 * found[Blurmeter].standard_error > 0
@@ -122,9 +122,11 @@ def test_the_response_to_psf_depth_tells_a_blurmeter_from_a_ruler(pairs, trainer
 
 
 def _spread(trainer, pairs, net):
-    seen = assess.frames(trainer, pairs, 2)
+    seen = assess.sensor_frames(trainer, pairs, 2)
     return float(
-        assess.predict(net, smallest(net.space), seen, trainer.inner)
+        assess.predict_frames(
+            net, smallest_architecture(net.space), seen, trainer.inner
+        )
         .slip_mm[:, 2]
         .std()
     )

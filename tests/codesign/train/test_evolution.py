@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from codesign.network import architecture as arch
 from codesign.network import cost
 from codesign.train import evolution
-from codesign.train.evolution import Candidate, Plan
-from metalens.ground.errors import TrainingError
+from codesign.train.evolution import EvaluatedCandidate, EvolutionSettings
+from metalens.core.errors import TrainingError
 
-SPACE = arch.Space()
-TARGET = arch.sample(SPACE, np.random.default_rng(42))
-PLAN = Plan(population=12, tournament=4, rounds=200)
+SPACE = arch.SearchSpace()
+TARGET = arch.sample_architecture(SPACE, np.random.default_rng(42))
+PLAN = EvolutionSettings(population=12, tournament=4, rounds=200)
 
 
 def _distance(architecture):
@@ -34,12 +34,12 @@ def _distance(architecture):
 
 
 def _count(architecture):
-    return float(cost.network(SPACE, architecture).at(128))
+    return float(cost.network_cost(SPACE, architecture).at(128))
 
 
 def _run(plan=PLAN, budget=1e12, start=None, evaluate=_distance):
     return list(
-        evolution.evolve(
+        evolution.evolve_population(
             SPACE, plan, evaluate, _count, budget=budget, seed=1, start=start
         )
     )
@@ -47,62 +47,73 @@ def _run(plan=PLAN, budget=1e12, start=None, evaluate=_distance):
 
 def test_evolution_descends_a_known_landscape_below_random_search():
     generator = np.random.default_rng(7)
-    drawn = min(_distance(arch.sample(SPACE, generator)) for _ in range(PLAN.rounds))
-    found = evolution.best(_run()[-1].history).error
+    drawn = min(
+        _distance(arch.sample_architecture(SPACE, generator))
+        for _ in range(PLAN.rounds)
+    )
+    found = evolution.best_candidate(_run()[-1].history).error
     assert found < 0.7 * drawn
 
 
 def test_no_candidate_is_beyond_the_budget():
-    budget = 3 * _count(arch.smallest(SPACE))
+    budget = 3 * _count(arch.smallest_architecture(SPACE))
     assert (
-        max(c.macs for c in _run(budget=budget, plan=Plan(8, 2, 40))[-1].history)
+        max(
+            c.macs
+            for c in _run(budget=budget, plan=EvolutionSettings(8, 2, 40))[-1].history
+        )
         <= budget
     )
 
 
 def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
-    states = _run(plan=Plan(8, 3, 30))
-    middle = evolution.loads(evolution.dumps(states[12]), SPACE)
-    assert _run(plan=Plan(8, 3, 30), start=middle)[-1] == states[-1]
+    states = _run(plan=EvolutionSettings(8, 3, 30))
+    middle = evolution.state_from_json(evolution.state_to_json(states[12]), SPACE)
+    assert _run(plan=EvolutionSettings(8, 3, 30), start=middle)[-1] == states[-1]
 
 
 def test_candidates_born_together_do_not_know_of_each_other():
     """Four at once: the population of the first four births is the same as one at a
     time, and rounds are kept.
     """
-    one, four = _run(plan=Plan(8, 3, 30)), _run(plan=Plan(8, 3, 30, together=4))
+    one, four = (
+        _run(plan=EvolutionSettings(8, 3, 30)),
+        _run(plan=EvolutionSettings(8, 3, 30, together=4)),
+    )
     assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
     assert (
         four[1].history == one[7].history
     )  # the first population is drawn, whoever is judged when
-    middle = evolution.loads(evolution.dumps(four[3]), SPACE)
-    assert _run(plan=Plan(8, 3, 30, together=4), start=middle)[-1] == four[-1]
+    middle = evolution.state_from_json(evolution.state_to_json(four[3]), SPACE)
+    assert (
+        _run(plan=EvolutionSettings(8, 3, 30, together=4), start=middle)[-1] == four[-1]
+    )
     with pytest.raises(TrainingError, match="together = 0"):
-        Plan(together=0)
+        EvolutionSettings(together=0)
 
 
 def test_equal_networks_are_evaluated_once():
     seen = []
 
     def count_calls(architecture):
-        seen.append(arch.active(SPACE, architecture))
+        seen.append(arch.canonical_architecture(SPACE, architecture))
         return _distance(architecture)
 
-    _run(plan=Plan(8, 3, 60), evaluate=count_calls)
+    _run(plan=EvolutionSettings(8, 3, 60), evaluate=count_calls)
     assert len(seen) == len(set(seen))
 
 
 def test_the_oldest_die_even_when_they_are_the_best():
-    plan = Plan(8, 3, 40)
+    plan = EvolutionSettings(8, 3, 40)
     state = _run(plan=plan)[-1]
     assert state.alive(plan) == state.history[-8:]
 
 
 def test_a_network_that_diverged_is_never_the_best():
-    bad = Candidate(arch.smallest(SPACE), float("nan"), 1.0)
-    good = Candidate(arch.largest(SPACE), 5.0, 2.0)
-    assert evolution.best([bad, good]) == good
-    assert evolution.pareto([bad, good]) == (good,)
+    bad = EvaluatedCandidate(arch.smallest_architecture(SPACE), float("nan"), 1.0)
+    good = EvaluatedCandidate(arch.largest_architecture(SPACE), 5.0, 2.0)
+    assert evolution.best_candidate([bad, good]) == good
+    assert evolution.pareto_front([bad, good]) == (good,)
 
 
 def test_budget_below_the_smallest_network_is_refused():
@@ -112,8 +123,10 @@ def test_budget_below_the_smallest_network_is_refused():
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats(1, 10)), min_size=1, max_size=30))
 def test_pareto_set_is_what_no_other_beats(points):
-    candidates = [Candidate(arch.smallest(SPACE), e, m) for e, m in points]
-    front = evolution.pareto(candidates)
+    candidates = [
+        EvaluatedCandidate(arch.smallest_architecture(SPACE), e, m) for e, m in points
+    ]
+    front = evolution.pareto_front(candidates)
     for member in front:
         assert not any(
             (c.error < member.error and c.macs <= member.macs)
@@ -126,10 +139,12 @@ def test_pareto_set_is_what_no_other_beats(points):
 
 def test_foreign_state_is_refused():
     with pytest.raises(TrainingError, match="not the state"):
-        evolution.loads("{}", SPACE)
-    text = evolution.dumps(_run(plan=Plan(2, 1, 2))[-1]).replace('"width"', '"widht"')
+        evolution.state_from_json("{}", SPACE)
+    text = evolution.state_to_json(_run(plan=EvolutionSettings(2, 1, 2))[-1]).replace(
+        '"width"', '"widht"'
+    )
     with pytest.raises(TrainingError, match="did you mean 'width'"):
-        evolution.loads(text, SPACE)
+        evolution.state_from_json(text, SPACE)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.03, 0.1, 0.3, 0.9])
@@ -138,8 +153,8 @@ def test_the_largest_network_uses_its_budget(share):
     one pixel more may cost a third,
     where it adds a row to every late feature map.
     """
-    budget = share * _at_resolution(arch.largest(SPACE))
-    made, least = evolution.ends(SPACE, _at_resolution, budget)
+    budget = share * _at_resolution(arch.largest_architecture(SPACE))
+    made, least = evolution.largest_and_smallest(SPACE, _at_resolution, budget)
     assert 0.65 * budget < _at_resolution(made) <= budget
     assert (
         len(set(made.kernels))
@@ -149,15 +164,15 @@ def test_the_largest_network_uses_its_budget(share):
     )
     assert _at_resolution(least) <= budget
     assert least.resolution >= made.resolution
-    assert dataclasses.replace(least, resolution=SPACE.resolution[0]) == arch.smallest(
-        SPACE
-    )
+    assert dataclasses.replace(
+        least, resolution=SPACE.resolution[0]
+    ) == arch.smallest_architecture(SPACE)
 
 
 def test_a_whole_search_is_the_end_of_its_states_and_public():
     import codesign
 
-    plan = Plan(4, 2, 12)
+    plan = EvolutionSettings(4, 2, 12)
     assert (
         codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1)
         == _run(plan)[-1].history
@@ -165,11 +180,16 @@ def test_a_whole_search_is_the_end_of_its_states_and_public():
 
 
 def test_a_search_begins_with_the_networks_that_every_step_trains():
-    budget = 20 * _at_resolution(arch.smallest(SPACE))
+    budget = 20 * _at_resolution(arch.smallest_architecture(SPACE))
     found = evolution.search(
-        SPACE, Plan(2, 1, 2), _distance, _at_resolution, budget=budget, seed=1
+        SPACE,
+        EvolutionSettings(2, 1, 2),
+        _distance,
+        _at_resolution,
+        budget=budget,
+        seed=1,
     )
-    trained = evolution.sandwich(
+    trained = evolution.sample_sandwich(
         SPACE, _at_resolution, budget, np.random.default_rng(0), subnets=0
     )
     assert [c.architecture for c in found] == trained
@@ -180,31 +200,36 @@ def _at_resolution(architecture):
 
 
 def test_a_network_is_fitted_by_resolution_alone():
-    space, count, top = SPACE, _at_resolution, arch.largest(SPACE)
-    assert evolution.fitted(space, top, count, 2 * count(top)) == top
+    space, count, top = SPACE, _at_resolution, arch.largest_architecture(SPACE)
+    assert evolution.fit_resolution(space, top, count, 2 * count(top)) == top
     budget = 0.4 * count(top)
-    made = evolution.fitted(space, top, count, budget)
+    made = evolution.fit_resolution(space, top, count, budget)
     assert (
         0.95 * budget < count(made) <= budget
     )  # steps of a hundredth of the range, and of whole pixels
     assert dataclasses.replace(made, resolution=1.0) == top
-    least = evolution.fitted(space, top, count, 1.0)
+    least = evolution.fit_resolution(space, top, count, 1.0)
     assert least.resolution == pytest.approx(space.resolution[0])
 
 
 @pytest.mark.parametrize("share", [1e-3, 0.03, 0.2, 0.6, 2.0])
 def test_members_of_a_step_keep_the_budget_where_anything_does(share):
     space, count = SPACE, _at_resolution
-    budget = share * count(arch.largest(space))
-    members = evolution.sandwich(
+    budget = share * count(arch.largest_architecture(space))
+    members = evolution.sample_sandwich(
         space, count, budget, np.random.default_rng(1), subnets=6
     )
     assert len(members) == 8
-    if budget >= count(arch.smallest(space)):
+    if budget >= count(arch.smallest_architecture(space)):
         assert all(count(a) <= budget for a in members)
     else:
-        assert all(a == arch.smallest(space) for a in members)
+        assert all(a == arch.smallest_architecture(space) for a in members)
     if share == 2.0:
-        assert members[0] == arch.largest(space)
-    free = evolution.sandwich(space, count, 0.0, np.random.default_rng(1), subnets=6)
-    assert free[:2] == [arch.largest(space), arch.smallest(space)]
+        assert members[0] == arch.largest_architecture(space)
+    free = evolution.sample_sandwich(
+        space, count, 0.0, np.random.default_rng(1), subnets=6
+    )
+    assert free[:2] == [
+        arch.largest_architecture(space),
+        arch.smallest_architecture(space),
+    ]

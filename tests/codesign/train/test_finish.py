@@ -41,11 +41,13 @@ def test_half_widths_are_the_conformal_quantile_of_misses_in_their_own_units():
     answers = typed(
         [r * s * (-1) ** k for k, (r, s) in enumerate(zip(ratio, sd, strict=True))], sd
     )
-    assert finish.widths(answers, SEEN, share=0.6) == pytest.approx(1.1)
-    assert finish.widths(answers, SEEN, share=0.61) == pytest.approx(1.7)
-    assert finish.widths(answers, SEEN) == pytest.approx(3.2)  # 0.9 x 10: the last
-    assert finish.widths(answers, SEEN, share=0.99) == pytest.approx(3.2)
-    assert finish.widths(typed(ratio, None), SEEN) is None
+    assert finish.conformal_quantiles(answers, SEEN, share=0.6) == pytest.approx(1.1)
+    assert finish.conformal_quantiles(answers, SEEN, share=0.61) == pytest.approx(1.7)
+    assert finish.conformal_quantiles(answers, SEEN) == pytest.approx(
+        3.2
+    )  # 0.9 x 10: the last
+    assert finish.conformal_quantiles(answers, SEEN, share=0.99) == pytest.approx(3.2)
+    assert finish.conformal_quantiles(typed(ratio, None), SEEN) is None
 
 
 def test_half_widths_from_other_frames_cover_nine_in_ten():
@@ -58,21 +60,23 @@ def test_half_widths_from_other_frames_cover_nine_in_ten():
         sd = torch.rand(60, generator=generator, dtype=torch.float64) + 0.3
         miss = sd * torch.randn(60, generator=generator, dtype=torch.float64) ** 3
         seen = SimpleNamespace(slip_mm=torch.zeros(59, 3), vergence=None)
-        reach = finish.widths(typed(miss[1:].tolist(), sd[1:].tolist()), seen)
+        reach = finish.conformal_quantiles(
+            typed(miss[1:].tolist(), sd[1:].tolist()), seen
+        )
         covered.append(bool(abs(miss[0]) <= reach * sd[0]))
     assert sum(covered) / 400 == pytest.approx(0.9, abs=0.045)  # three of 1.5 %
 
 
 def test_coverage_counts_frames_within_their_own_interval():
     answers = typed([0.9, -0.3, 0.2, -4.0], [0.5, 0.1, 0.4, 2.0])
-    row = finish.told(
+    row = finish.uncertainty_summary(
         "dim_", answers, SimpleNamespace(slip_mm=torch.zeros(4, 3), vergence=None), 1.9
     )
     assert row == pytest.approx(
         {"dim_axial_coverage_90": 0.5, "dim_axial_interval_mm": 1.9 * 3.0 / 4}
     )
-    assert finish.told("", answers, SEEN, None) == {}
-    assert finish.told("", typed([0.1], None), SEEN, 1.9) == {}
+    assert finish.uncertainty_summary("", answers, SEEN, None) == {}
+    assert finish.uncertainty_summary("", typed([0.1], None), SEEN, 1.9) == {}
 
 
 def test_depths_of_windows_err_in_millimetres():
@@ -81,6 +85,6 @@ def test_depths_of_windows_err_in_millimetres():
     answers = SimpleNamespace(
         slip_sd_mm=None, depth=torch.stack([told, torch.full((2,), 9.0)], 1)
     )
-    row = finish.told("", answers, SimpleNamespace(vergence=truth), None)
+    row = finish.uncertainty_summary("", answers, SimpleNamespace(vergence=truth), None)
     want = (abs(1e3 / 49 - 1e3 / 45) + abs(1e3 / 37 - 1e3 / 43)) / 2
     assert row["window_depth_mm"] == pytest.approx(want, rel=1e-5)

@@ -52,7 +52,7 @@ def test_the_cost_of_a_pitch_is_that_of_its_pixels():
     found.backward()
     assert float(pitch.grad) == pytest.approx(-5 * 812 * 0.75 / 49, rel=1e-6)
     assert float(
-        cost.interpolated(lambda sizes: 3.0 * np.asarray(sizes), 40.25)
+        cost.interpolate_counts(lambda sizes: 3.0 * np.asarray(sizes), 40.25)
     ) == pytest.approx(120.75, rel=1e-9)
 
 

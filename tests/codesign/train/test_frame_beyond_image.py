@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.network import losses, smallest
+from codesign.network import losses, smallest_architecture
 from codesign.train import assess, inner, run
 from codesign.train.formation import frame_wide, read_out
 from metalens.image import Sensor
@@ -68,13 +68,13 @@ def test_a_mask_of_the_image_lies_where_the_pixels_show_it():
     pitch = torch.tensor(PITCH_UM, dtype=torch.float64)
     seen = read_out(light, SAMPLE_UM, pitch, sensor, generator=None, quiet=True)[0, 0]
     shown = _middle(seen - seen.min())
-    framed = _middle(losses.framed(light, wide)[0])
+    framed = _middle(losses.mask_in_frame(light, wide)[0])
     assert (
         float((framed - shown).abs().max()) * 23 < 0.03
     )  # pixels: the cubic overshoots at edges, which is cut off
     assert float((_middle(light[0]) - shown).abs().max()) * 23 > 0.3
-    assert losses.framed(light, 1.0) is light
-    assert float(losses.framed(light, wide).sum()) * wide**2 == pytest.approx(
+    assert losses.mask_in_frame(light, 1.0) is light
+    assert float(losses.mask_in_frame(light, wide).sum()) * wide**2 == pytest.approx(
         float(light.sum()), rel=1e-5
     )
 
@@ -93,11 +93,11 @@ def test_training_and_scores_hold_networks_to_the_frame(tmp_path, monkeypatch):
     pupil's place is the image's.
     """
     (tmp_path / "run.toml").write_text(RUN)
-    settings = run.load(tmp_path / "run.toml")
-    going = run.start(replace(settings, scenes=replace(settings.scenes, pool=0)))
+    settings = run.load_run_settings(tmp_path / "run.toml")
+    going = run.start_run(replace(settings, scenes=replace(settings.scenes, pool=0)))
     trainer, wide = going.trainer, 46 * 19.1 / (48 * 18.0)
     batch, told = trainer.scenes.batch(0, 2), []
-    task, pose = losses.task, losses.pose
+    task, pose = losses.task_loss, losses.pose_loss
 
     def task_of(answer, mask, *others, **weights):
         told.append(mask)
@@ -110,12 +110,12 @@ def test_training_and_scores_hold_networks_to_the_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(inner.losses, "task", task_of)
     monkeypatch.setattr(inner.losses, "pose", pose_of)
     list(trainer.run())
-    assert torch.equal(told[0], losses.framed(batch.mask, wide))
+    assert torch.equal(told[0], losses.mask_in_frame(batch.mask, wide))
     torch.testing.assert_close(told[1], batch.pose.points / wide)
-    seen = assess.frames(trainer, trainer.scenes, 1)
+    seen = assess.sensor_frames(trainer, trainer.scenes, 1)
     assert seen.wide == pytest.approx(wide, rel=1e-12)
-    assert torch.equal(seen.mask, losses.framed(batch.mask, wide))
-    net, member = trainer.model.net, smallest(settings.space)
-    plain = assess.predict(net, member, replace(seen, wide=1.0), trainer.inner)
-    scaled = assess.predict(net, member, seen, trainer.inner)
+    assert torch.equal(seen.mask, losses.mask_in_frame(batch.mask, wide))
+    net, member = trainer.model.net, smallest_architecture(settings.space)
+    plain = assess.predict_frames(net, member, replace(seen, wide=1.0), trainer.inner)
+    scaled = assess.predict_frames(net, member, seen, trainer.inner)
     torch.testing.assert_close(scaled.centre, wide * plain.centre)

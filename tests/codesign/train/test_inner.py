@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.network.architecture import Space, smallest
+from codesign.network.architecture import SearchSpace, smallest_architecture
 from codesign.optics.lens_errors import LensErrors
 from codesign.optics.stack import OpticsConfig
 from codesign.train import inner, moving
-from codesign.train.inner import Batch, InnerConfig, Schedule, Trainer
-from metalens.ground.errors import ConfigError, TrainingError
+from codesign.train.inner import FrameBatch, InnerConfig, LearningRateSchedule, Trainer
+from metalens.core.errors import ConfigError, TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
@@ -51,7 +51,7 @@ class Discs:
             .expand_as(radiance)
         )
         inside = slice(self.margin, -self.margin)
-        return Batch(
+        return FrameBatch(
             Frames(radiance, coverage, depth.contiguous()),
             pupil[:, inside, inside],
             slip,
@@ -60,7 +60,7 @@ class Discs:
 
 def _trainer(config=None, *, optics=OPTICS, architecture=None):
     config = config or InnerConfig(steps=6, batch=2, subnets=0)
-    made = inner.model(optics, pitch_um=10.0, seed=config.seed)
+    made = inner.make_model(optics, pitch_um=10.0, seed=config.seed)
     return Trainer(config, optics, SENSOR, Discs(), made, architecture=architecture)
 
 
@@ -81,8 +81,8 @@ MOVING = InnerConfig(
     steps=6,
     batch=2,
     subnets=1,
-    optics=Schedule(0.02, 0.0, 0.7),
-    pitch=Schedule(0.02, 0.0, 0.7),
+    optics=LearningRateSchedule(0.02, 0.0, 0.7),
+    pitch=LearningRateSchedule(0.02, 0.0, 0.7),
     budget_mmacs=1.3,
 )
 
@@ -135,14 +135,16 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
 
 
 def test_a_budget_drives_the_pitch_up():
-    space = Space(resolution=(0.6, 1.0))  # which leaves room for pixels up to 16 um
-    member = replace(smallest(space), resolution=1.0)
+    space = SearchSpace(
+        resolution=(0.6, 1.0)
+    )  # which leaves room for pixels up to 16 um
+    member = replace(smallest_architecture(space), resolution=1.0)
     start_um = (
         SIZE * OPTICS.sample_um / 40.5
     )  # 40 and 41 pixels differ in cost: between others the count is flat
     pitch_um = []
     for weight in (0.0, 100.0):
-        made = inner.model(OPTICS, pitch_um=start_um, seed=2, space=space)
+        made = inner.make_model(OPTICS, pitch_um=start_um, seed=2, space=space)
         config = replace(MOVING, budget_mmacs=0.7, budget_weight=weight)
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
         assert (
@@ -161,18 +163,22 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
     asks for ever finer pixels.
     """
     fast = replace(
-        MOVING, steps=40, pitch=Schedule(0.5), optics=Schedule(0.0), budget_mmacs=1e-3
+        MOVING,
+        steps=40,
+        pitch=LearningRateSchedule(0.5),
+        optics=LearningRateSchedule(0.0),
+        budget_mmacs=1e-3,
     )
-    space = Space(resolution=(0.6, 1.0))
+    space = SearchSpace(resolution=(0.6, 1.0))
     for budget, limit in (
         (1e-3, SIZE * OPTICS.sample_um * 0.6 / 16),
         (0.0, OPTICS.sample_um),
     ):
-        made = inner.model(OPTICS, pitch_um=10.0, seed=2, space=space)
+        made = inner.make_model(OPTICS, pitch_um=10.0, seed=2, space=space)
         if not budget:
             made.log_pitch.register_hook(lambda slope: torch.ones_like(slope))
         config = replace(fast, budget_mmacs=budget)
-        member = replace(smallest(space), resolution=1.0)
+        member = replace(smallest_architecture(space), resolution=1.0)
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
         records = list(trainer.run(until=20))
         assert records[-1].pitch_um == pytest.approx(limit, rel=1e-9)
@@ -182,8 +188,10 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
 
 
 def test_budgets_of_a_run_are_trained_in_turn():
-    made = inner.model(OPTICS, pitch_um=9.0, seed=0)
-    still = replace(MOVING, budget_mmacs=0.0, pitch=Schedule(0.0), subnets=0)
+    made = inner.make_model(OPTICS, pitch_um=9.0, seed=0)
+    still = replace(
+        MOVING, budget_mmacs=0.0, pitch=LearningRateSchedule(0.0), subnets=0
+    )
     trainer = Trainer(still, OPTICS, SENSOR, Discs(), made, budgets_mmacs=(3.0, 1.4))
     spent = [record.mmacs for record in trainer.run()]
     assert all(a > 1.2 * b for a, b in zip(spent[::2], spent[1::2], strict=True))
@@ -191,7 +199,7 @@ def test_budgets_of_a_run_are_trained_in_turn():
 
 
 def test_a_bad_gradient_is_skipped_and_counted():
-    trainer = _trainer(architecture=smallest(Space()))
+    trainer = _trainer(architecture=smallest_architecture(SearchSpace()))
     before = [w.clone() for w in _weights(trainer)]
     hook = trainer.model.net.stem.weight.register_hook(lambda g: g * float("nan"))
     record = next(trainer.run())
@@ -205,7 +213,8 @@ def test_a_bad_gradient_is_skipped_and_counted():
 
 def test_only_bad_gradients_end_the_run_with_the_cause():
     trainer = _trainer(
-        InnerConfig(steps=6, batch=2, patience=3), architecture=smallest(Space())
+        InnerConfig(steps=6, batch=2, patience=3),
+        architecture=smallest_architecture(SearchSpace()),
     )
     trainer.model.net.stem.weight.register_hook(lambda g: g * float("inf"))
     with pytest.raises(
@@ -231,19 +240,21 @@ def test_the_optics_loss_falls_along_its_own_gradient():
     from codesign.train import formation
 
     coefficients = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    start = formation.depth_loss(lens.stack(OPTICS, coefficients), OPTICS, energy=0.4)
+    start = formation.depth_loss(
+        lens.lens_psf_stack(OPTICS, coefficients), OPTICS, energy=0.4
+    )
     (slope,) = torch.autograd.grad(start, coefficients)
     assert float(slope.norm()) > 0
     step = (0.05 / float(slope.norm())) * slope
     after = formation.depth_loss(
-        lens.stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4
+        lens.lens_psf_stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4
     )
     assert float(after) < float(start.detach())
 
 
 def test_impossible_schedules_are_refused():
     with pytest.raises(ConfigError, match="0 <= start < end"):
-        Schedule(0.1, 0.8, 0.2)
+        LearningRateSchedule(0.1, 0.8, 0.2)
     with pytest.raises(ConfigError, match="need 1 or more"):
         InnerConfig(steps=0)
     with pytest.raises(ConfigError, match="slip_scale_mm"):
@@ -267,12 +278,21 @@ class Hard(Discs):
 @pytest.mark.parametrize("kind", ["blink", "border"])
 def test_batches_of_blinks_and_pupils_at_the_border_train_on(kind):
     config = InnerConfig(
-        steps=2, batch=2, subnets=0, optics=Schedule(0.02, 0.0, 1.0), patience=1
+        steps=2,
+        batch=2,
+        subnets=0,
+        optics=LearningRateSchedule(0.02, 0.0, 1.0),
+        patience=1,
     )
-    made = inner.model(OPTICS, pitch_um=9.0, seed=0)
+    made = inner.make_model(OPTICS, pitch_um=9.0, seed=0)
     records = list(
         Trainer(
-            config, OPTICS, SENSOR, Hard(kind), made, architecture=smallest(Space())
+            config,
+            OPTICS,
+            SENSOR,
+            Hard(kind),
+            made,
+            architecture=smallest_architecture(SearchSpace()),
         ).run()
     )
     assert records[-1].skipped == 0
@@ -285,7 +305,9 @@ def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
     by 0.37 / sqrt(0.33), 0.64 of
     the rate, an element; in turned axes, whose sums of squares are the same, that holds
     of the root mean square."""
-    trainer = _trainer(InnerConfig(steps=6, batch=2), architecture=smallest(Space()))
+    trainer = _trainer(
+        InnerConfig(steps=6, batch=2), architecture=smallest_architecture(SearchSpace())
+    )
     list(trainer.run(until=2))
     before = [p.detach().clone() for p in trainer.model.net.parameters()]
     plain = trainer.scenes.batch

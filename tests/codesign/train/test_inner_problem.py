@@ -9,8 +9,8 @@ import torch
 
 from codesign.adapt import train as retraining
 from codesign.gaze import bench
-from codesign.gaze.readings import Readings
-from codesign.network.architecture import smallest
+from codesign.gaze.readings import NetworkReadings
+from codesign.network.architecture import smallest_architecture
 from codesign.train import run as runs
 from codesign.train import specialise
 from metalens import lens
@@ -26,16 +26,16 @@ MOVING = (
 
 def _settings(tmp_path):
     (tmp_path / "run.toml").write_text(MOVING)
-    return runs.load(tmp_path / "run.toml")
+    return runs.load_run_settings(tmp_path / "run.toml")
 
 
 def test_the_inner_problem_moves_lens_pitch_and_weights_and_leaves_the_supernet(
     tmp_path,
 ):
-    going = runs.start(_settings(tmp_path))
+    going = runs.start_run(_settings(tmp_path))
     net = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
-    only = smallest(going.settings.space)
-    one, again = (specialise.specialise(going, only, 2.0) for _ in range(2))
+    only = smallest_architecture(going.settings.space)
+    one, again = (specialise.specialise_candidate(going, only, 2.0) for _ in range(2))
     assert float(one.model.coefficients_rad.detach().norm()) > 1e-3
     assert float(one.model.pitch_um.detach()) != pytest.approx(3.0, abs=1e-6)
     assert torch.equal(one.model.coefficients_rad, again.model.coefficients_rad)
@@ -43,19 +43,19 @@ def test_the_inner_problem_moves_lens_pitch_and_weights_and_leaves_the_supernet(
     assert not going.trainer.model.coefficients_rad.any()
     for name, value in going.trainer.model.net.state_dict().items():
         assert torch.equal(value, net[name]), name
-    other = specialise.specialise(going, only, 1.9)
+    other = specialise.specialise_candidate(going, only, 1.9)
     assert not torch.equal(one.model.coefficients_rad, other.model.coefficients_rad)
 
 
 def test_own_pitch_keeps_the_budget(tmp_path):
     """A pitch that would go finer ends where the candidate's count meets the budget."""
     settings = _settings(tmp_path)
-    going = runs.start(
+    going = runs.start_run(
         replace(settings, search=replace(settings.search, inner_steps=8))
     )
-    only = smallest(settings.space)
+    only = smallest_architecture(settings.space)
     budget = 1.02 * going.macs(only) / 1e6
-    made = specialise.specialise(going, only, budget)
+    made = specialise.specialise_candidate(going, only, budget)
     pitch = float(made.model.pitch_um.detach())
     assert going.counted(only, pitch) <= budget * 1e6
 
@@ -64,13 +64,13 @@ def test_a_run_keeps_a_lens_for_every_budget_and_reads_it_back(tmp_path):
     (tmp_path / "run.toml").write_text(MOVING)
     out = tmp_path / "out"
     assert main(["codesign", str(tmp_path / "run.toml"), "-o", str(out)]) == 0
-    source = retraining.load(out)
+    source = retraining.load_finished_run(out)
     model = source.run.trainer.model
     assert source.row["pitch_um"] == pytest.approx(float(model.pitch_um.detach()))
     assert 0 < source.row["gaze_deg"] < 90
     shared, own = (lens.load(out / f"{name}.h5") for name in ("lens", "lens_2"))
     assert not np.array_equal(shared.diameters.diameter_um, own.diameters.diameter_um)
-    raw = runs.resume(out / "checkpoint.safetensors", source.settings)
+    raw = runs.resume_run(out / "checkpoint.safetensors", source.settings)
     assert not torch.equal(model.coefficients_rad, raw.trainer.model.coefficients_rad)
 
 
@@ -81,11 +81,11 @@ def test_true_pupil_and_slippage_leave_little_gaze_error_and_slippage_unseen_muc
     calibration leave some degrees; slippage that is not read adds far more.
     """
     settings = _settings(tmp_path)
-    people = bench.people(runs.start(settings).scenes(1), 6, 20, seed=3)
+    people = bench.simulate_people(runs.start_run(settings).scenes(1), 6, 20, seed=3)
     camera = people.scenes.camera.pitch_um * people.scenes.camera.pixels / 32
     pupil = ((people.labels.pupil_px - 15.5) * camera * 1e-3).numpy()
     slip = (people.labels.slip_um * 1e-3).numpy()
-    true = bench.calibrated_error_deg(people, Readings(pupil, slip))
-    blind = bench.calibrated_error_deg(people, Readings(pupil, 0 * slip))
+    true = bench.calibrated_error_deg(people, NetworkReadings(pupil, slip))
+    blind = bench.calibrated_error_deg(people, NetworkReadings(pupil, 0 * slip))
     assert true < 0.6 * blind
     assert math.isfinite(blind)

@@ -43,8 +43,10 @@ def _train(settings, path, die_at=None):
     """
     child = os.fork()
     if child == 0:
-        going = run.resume(path, settings) if path.exists() else run.start(settings)
-        for record in run.train(going, path):
+        going = (
+            run.resume_run(path, settings) if path.exists() else run.start_run(settings)
+        )
+        for record in run.train_run(going, path):
             if die_at is not None and record.step >= die_at:
                 os.kill(os.getpid(), signal.SIGKILL)
         os._exit(0)
@@ -55,7 +57,7 @@ def _train(settings, path, die_at=None):
 @pytest.mark.slow
 def test_twenty_kills_at_random_steps_change_no_byte(tmp_path):
     (tmp_path / "run.toml").write_text(STEPS)
-    settings = run.load(tmp_path / "run.toml")
+    settings = run.load_run_settings(tmp_path / "run.toml")
     assert _train(settings, tmp_path / "whole")
     assert _train(settings, tmp_path / "again")
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "again").read_bytes()

@@ -10,8 +10,8 @@ import torch
 from codesign.optics import formed, stack
 from codesign.optics.stack import OpticsConfig
 from codesign.train import run
-from codesign.train.light import Light
-from metalens.ground.errors import TrainingError
+from codesign.train.light import StepImaging
+from metalens.core.errors import TrainingError
 from metalens.image import Imager
 
 FRAMES = """
@@ -58,7 +58,7 @@ window_samples = 11
 """
 
 
-LIVE = formed.live
+LIVE = formed.make_differentiable_imager
 
 
 def _never(step):
@@ -79,13 +79,15 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
         image="true", image_tolerance=0.5,
     )  # fmt: skip
     place = torch.zeros(5, dtype=torch.float64)
-    formed_once = formed.imager(settings, place, 30, margin=5)
+    formed_once = formed.make_imager(settings, place, 30, margin=5)
     assert isinstance(formed_once, Imager)
-    monkeypatch.setattr(formed, "imager", imaged)
+    monkeypatch.setattr(formed, "make_imager", imaged)
     monkeypatch.setattr(
-        formed, "live", lambda settings, whole, pairs: formed.Live(place, whole, pairs)
+        formed,
+        "make_differentiable_imager",
+        lambda settings, whole, pairs: formed.DifferentiableImager(place, whole, pairs),
     )
-    light = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
+    light = StepImaging(settings, (), refresh=3, draws=2, seed=0, draw=_never)
     for step, moved in enumerate((0.0, 0.0, 1.0, 2.0, 3.0, 4.0)):
         light.at(step, place + moved, 30, 5, live=step > 0)
     assert made == [
@@ -95,7 +97,7 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
     light.at(6, place + 4.0, 30, 5, live=False)
     light.at(7, place + 4.0, 30, 5, live=False)
     assert made == [0.0, 2.0, 4.0]  # at rest once, as it is
-    other = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
+    other = StepImaging(settings, (), refresh=3, draws=2, seed=0, draw=_never)
     other.restore(light.state())
     other.at(8, place + 4.0, 30, 5, live=False)
     assert made == [0.0, 2.0, 4.0, 4.0]
@@ -118,7 +120,7 @@ def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
         passed.append((len(pairs[0]), set(pairs[0].tolist())))
         return torch.zeros((), requires_grad=True)
 
-    monkeypatch.setattr(formed, "live", live)
+    monkeypatch.setattr(formed, "make_differentiable_imager", live)
     monkeypatch.setattr(formed, "surrogate", surrogate)
     for step in steps:
         light.at(step, place, 30, 5, live=True)
@@ -132,41 +134,41 @@ def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
 
 def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp_path):
     (tmp_path / "run.toml").write_text(TRUE)
-    settings = run.load(tmp_path / "run.toml")
-    whole = run.start(settings)
-    records = list(run.train(whole, tmp_path / "whole"))
+    settings = run.load_run_settings(tmp_path / "run.toml")
+    whole = run.start_run(settings)
+    records = list(run.train_run(whole, tmp_path / "whole"))
     assert all(r.skipped == 0 for r in records)
-    part = run.start(settings)
-    steps = run.train(part, tmp_path / "part")
+    part = run.start_run(settings)
+    steps = run.train_run(part, tmp_path / "part")
     next(steps), next(steps)  # imaged at step 0, moved since
-    going = run.resume(tmp_path / "part", settings)
-    list(run.train(going, tmp_path / "part"))
-    assert torch.equal(run.coefficients(whole), run.coefficients(going))
-    assert float(run.coefficients(whole).abs().max()) > 1e-3
+    going = run.resume_run(tmp_path / "part", settings)
+    list(run.train_run(going, tmp_path / "part"))
+    assert torch.equal(run.lens_coefficients(whole), run.lens_coefficients(going))
+    assert float(run.lens_coefficients(whole).abs().max()) > 1e-3
     with pytest.raises(TrainingError, match=r'optics\.image: "true" -> "uniform"'):
-        run.resume(
+        run.resume_run(
             tmp_path / "part",
             replace(settings, optics=replace(settings.optics, image="uniform")),
         )
     one = replace(settings, optics=replace(settings.optics, image="uniform"))
-    run.save(tmp_path / "one", run.start(one))
+    run.save_run(tmp_path / "one", run.start_run(one))
     with pytest.raises(TrainingError, match=r'optics\.image: "uniform" -> "true"'):
-        run.resume(tmp_path / "one", settings)
+        run.resume_run(tmp_path / "one", settings)
     with pytest.raises(TrainingError, match=r"optics\.fwhm_nm: 0\.0 -> 30\.0"):
-        run.resume(
+        run.resume_run(
             tmp_path / "part",
             replace(settings, optics=replace(settings.optics, fwhm_nm=30.0)),
         )
     pixel = replace(settings.run, pitch_um=settings.run.pitch_um * 1.5)
     with pytest.raises(TrainingError, match=r"run\.pitch_um: "):
-        run.resume(tmp_path / "part", replace(settings, run=pixel))
+        run.resume_run(tmp_path / "part", replace(settings, run=pixel))
 
 
 def test_a_made_lens_known_on_axis_alone_is_no_true_image():
     settings = OpticsConfig(polynomials=0)
     assert settings.image == "true"  # what training sees where nothing is said
-    made = stack.stack(replace(settings, image="uniform"), torch.zeros(0))
-    light = Light(settings, (made,), refresh=2, draws=2, seed=0, draw=_never)
+    made = stack.lens_psf_stack(replace(settings, image="uniform"), torch.zeros(0))
+    light = StepImaging(settings, (made,), refresh=2, draws=2, seed=0, draw=_never)
     with pytest.raises(TrainingError, match="cannot stand for the field"):
         light.at(0, torch.zeros(0), 160, 16, live=False)
 
@@ -206,13 +208,13 @@ def test_a_still_lens_trains_to_the_same_bits_on_two_threads_after_a_stop(
 ):
     path = tmp_path / "r.toml"
     path.write_text(STILL, "utf-8")
-    settings, found = run.load(path), []
+    settings, found = run.load_run_settings(path), []
     threads(2)
     for stop in (4, 1):
-        trainer = run.start(settings).trainer
+        trainer = run.start_run(settings).trainer
         lines = list(trainer.run(until=stop))
         if stop < 4:
-            again = run.start(settings).trainer
+            again = run.start_run(settings).trainer
             again.restore(trainer.state())
             lines, trainer = lines + list(again.run()), again
         found.append((lines, trainer.model.net.state_dict()))

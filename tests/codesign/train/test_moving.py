@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign.train import moving
-from codesign.train.moving import Schedule
+from codesign.train.moving import LearningRateSchedule
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ from codesign.train.moving import Schedule
 )
 def test_rates_warm_up_over_a_tenth_and_fall_as_a_cosine(inside, share):
     """From 0.3 to 0.8 of the run: nothing before, and nothing from its end on."""
-    made = Schedule(0.07, 0.3, 0.8)
+    made = LearningRateSchedule(0.07, 0.3, 0.8)
     want = 0.07 * share * math.cos(math.pi * inside / 2) ** 2
     assert made.at(0.3 + 0.5 * inside + 1e-15) == pytest.approx(want, rel=1e-9)
     assert (made.at(0.2999), made.at(0.8), made.at(0.95)) == (0.0, 0.0, 0.0)
@@ -35,6 +35,6 @@ def test_rates_warm_up_over_a_tenth_and_fall_as_a_cosine(inside, share):
 )
 def test_the_pitch_is_brought_back_between_its_bounds(pitch, held, then):
     log = torch.nn.Parameter(torch.tensor(math.log(pitch), dtype=torch.float64))
-    made = moving.Model(None, torch.nn.Parameter(torch.zeros(2)), log)
+    made = moving.TrainedModel(None, torch.nn.Parameter(torch.zeros(2)), log)
     assert made.hold(4.5, 40.0) == held
     assert float(made.pitch_um.detach()) == pytest.approx(then, rel=1e-12)

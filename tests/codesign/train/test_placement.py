@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from codesign.network import largest
+from codesign.network import largest_architecture
 from codesign.train import finish, placement, run
-from metalens.ground import config
-from metalens.ground.errors import ConfigError
+from metalens.core import config
+from metalens.core.errors import ConfigError
 from tests.elsewhere import AWAY, elsewhere
 
 GPU = torch.cuda.is_available()
@@ -24,11 +24,11 @@ TRUE = {
 
 
 def _going(change=None, frozen=()):
-    small = config.merged(run.preset_table("smoke"), SMALL)
-    table = config.merged(
-        config.merged(small, {"run": {"frozen": list(frozen)}}), change or {}
+    small = config.merge_tables(run.preset_table("smoke"), SMALL)
+    table = config.merge_tables(
+        config.merge_tables(small, {"run": {"frozen": list(frozen)}}), change or {}
     )
-    return run.start(config.from_table(table, run.RunConfig, where="a test"))
+    return run.start_run(config.from_table(table, run.RunConfig, where="a test"))
 
 
 def test_without_a_gpu_the_processor_is_taken():
@@ -47,7 +47,9 @@ def test_a_network_computes_where_its_parameters_are():
     the processor.
     """
     net = _going().trainer.model.net.eval().to("meta")
-    answer = net(torch.empty(2, 1, 64, 64, device="meta"), largest(net.space))
+    answer = net(
+        torch.empty(2, 1, 64, 64, device="meta"), largest_architecture(net.space)
+    )
     parts = [getattr(answer, name) for name in answer.__slots__]
     assert {part.device.type for part in parts if part is not None} == {"meta"}
 
@@ -59,7 +61,7 @@ def test_frames_and_gradients_pass_through_an_attended_network():
     plain, attended = (
         _going({"optics": {"image": "uniform"}}).trainer for _ in range(2)
     )
-    placement.attend(attended.model.net, torch.device("cpu"))
+    placement.follow_device(attended.model.net, torch.device("cpu"))
     for one, other in zip(plain.run(until=2), attended.run(until=2), strict=True):
         assert one == other
     assert float(attended.model.coefficients_rad.grad.norm()) > 0
@@ -94,7 +96,7 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
     plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
     (want,) = plain.run(until=1)
     with elsewhere() as done:
-        placement.place(moved, AWAY)
+        placement.place_on_device(moved, AWAY)
         (found,) = moved.run(until=1)
         there = {name: p.cpu() for name, p in moved.model.net.named_parameters()}
     assert {"convolution", "convolution_backward", "_fft_r2c"} <= done
@@ -122,10 +124,10 @@ def test_what_a_run_ends_with_is_formed_where_it_trained():
         "ambiguity_pairs": 8,
     }
     plain, moved = _going(change), _going(change)
-    (want,) = finish.finish(plain)
+    (want,) = finish.finish_budgets(plain)
     with elsewhere() as done:
-        placement.place(moved.trainer, AWAY)
-        (found,) = finish.finish(moved)
+        placement.place_on_device(moved.trainer, AWAY)
+        (found,) = finish.finish_budgets(moved)
     assert {"convolution_backward", "_fft_r2c"} <= done  # trained on, and imaged
     # a difference of readings, of a network that knows no depth yet: what single counts
     # that fall the other way leave
@@ -139,13 +141,13 @@ def test_what_a_run_ends_with_is_formed_where_it_trained():
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
 def test_a_gpu_trains_to_the_same_losses_and_resumes():
     plain, moved = _going().trainer, _going().trainer
-    placement.place(moved, placement.device_of("cuda"))
+    placement.place_on_device(moved, placement.device_of("cuda"))
     losses = [
         (a.loss, b.loss)
         for a, b in zip(plain.run(until=2), moved.run(until=2), strict=True)
     ]
     again = _going().trainer
     again.restore(moved.state())
-    placement.place(again, placement.device_of("cuda"))
+    placement.place_on_device(again, placement.device_of("cuda"))
     losses += [(a.loss, b.loss) for a, b in zip(moved.run(), again.run(), strict=True)]
     assert all(math.isclose(a, b, rel_tol=1e-2) for a, b in losses)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import torch
 
-from codesign.train.placement import attend, place
+from codesign.train.placement import follow_device, place_on_device
 
 
 def test_on_the_processor_nothing_is_taken_to_a_device():
@@ -12,7 +12,7 @@ def test_on_the_processor_nothing_is_taken_to_a_device():
     moved = []
     optimiser = SimpleNamespace(state_dict=dict, load_state_dict=moved.append)
     was = torch.backends.cudnn.deterministic
-    place(
+    place_on_device(
         SimpleNamespace(
             model=SimpleNamespace(net=net), optimisers={"weights": optimiser}
         ),
@@ -27,7 +27,7 @@ def test_on_the_processor_nothing_is_taken_to_a_device():
 def test_frames_on_the_processor_are_taken_to_the_device_and_what_else_is_given_stays():
     """A device without numbers stands for a GPU."""
     net, there = torch.nn.Linear(3, 2).to("meta"), torch.device("meta")
-    attend(net, there)
+    follow_device(net, there)
     (enter,) = net._forward_pre_hooks.values()
     here, moved = torch.ones(4, 3), torch.ones(2, 3, device="meta")
     given = enter(net, (here, moved, "subnet", None))

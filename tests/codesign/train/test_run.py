@@ -15,14 +15,14 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from codesign.batches import Pool
+from codesign.batches import FramePool
 from codesign.commands import codesign as command_codesign
 from codesign.network import windows
-from codesign.network.architecture import smallest
+from codesign.network.architecture import smallest_architecture
 from codesign.train import run, search
-from codesign.train.finish import finish, finished
+from codesign.train.finish import finish_budgets, finished_budgets
 from metalens import cli
-from metalens.ground.errors import ConfigError, TrainingError
+from metalens.core.errors import ConfigError, TrainingError
 
 TINY = """
 preset = "smoke"
@@ -57,7 +57,7 @@ window_samples = 9
 @pytest.fixture
 def settings(tmp_path):
     (tmp_path / "run.toml").write_text(TINY)
-    return run.load(tmp_path / "run.toml")
+    return run.load_run_settings(tmp_path / "run.toml")
 
 
 def test_runs_of_several_seeds_hold_one_pool_of_frames_between_them(settings):
@@ -65,28 +65,28 @@ def test_runs_of_several_seeds_hold_one_pool_of_frames_between_them(settings):
     rendered again, the same.
     """
     going = [
-        run.start(replace(settings, inner=replace(settings.inner, seed=seed)))
+        run.start_run(replace(settings, inner=replace(settings.inner, seed=seed)))
         for seed in (31, 32)
     ]
     first, other, again = (going[i].trainer.scenes.batch(1, 2) for i in (0, 1, 0))
     gc.collect()
-    assert sum(isinstance(held, Pool) for held in gc.get_objects()) <= 1
+    assert sum(isinstance(held, FramePool) for held in gc.get_objects()) <= 1
     assert torch.equal(first.slip_mm, again.slip_mm)
     assert torch.equal(first.mask, again.mask)
     assert not torch.equal(first.slip_mm, other.slip_mm)
 
 
 def _end(going, path):
-    list(run.train(going, path))
+    list(run.train_run(going, path))
     list(search.search(going, path))
-    return finish(going)
+    return finish_budgets(going)
 
 
 def test_frames_are_those_of_the_run_s_own_camera(settings):
     """1.0 mm in the file are 1000 um to the scenes, of training and of any other
     stream.
     """
-    going = run.start(replace(settings, scenes=replace(settings.scenes, pool=0)))
+    going = run.start_run(replace(settings, scenes=replace(settings.scenes, pool=0)))
     for scenes in (going.trainer.scenes, going.scenes(5)):
         assert scenes.sensor_distance_um == pytest.approx(1000.0)
         assert scenes.sample_um == settings.optics.sample_um
@@ -103,7 +103,7 @@ def test_preset_fills_what_the_file_leaves_out(settings):
 @pytest.mark.parametrize("name", ["smoke", "laptop", "paper"])
 def test_every_preset_is_a_valid_run_whose_psfs_fit_its_margin(tmp_path, name):
     (tmp_path / "run.toml").write_text(f'preset = "{name}"')
-    found = run.load(tmp_path / "run.toml")
+    found = run.load_run_settings(tmp_path / "run.toml")
     assert found.preset == name
     assert found.scenes.margin >= found.optics.window_samples // 2
     side = found.scenes.pixels + 2 * found.scenes.margin
@@ -113,20 +113,20 @@ def test_every_preset_is_a_valid_run_whose_psfs_fit_its_margin(tmp_path, name):
 def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(
     settings, tmp_path
 ):
-    whole = run.start(settings)
+    whole = run.start_run(settings)
     rows = _end(whole, tmp_path / "whole")
 
-    first = run.start(settings)
-    steps = run.train(first, tmp_path / "part")
+    first = run.start_run(settings)
+    steps = run.train_run(first, tmp_path / "part")
     next(steps), next(steps)
-    second = run.resume(tmp_path / "part", settings)
+    second = run.resume_run(tmp_path / "part", settings)
     assert (
         second.trainer.step == 1
     )  # the checkpoint of the second step is written after the record is taken
-    list(run.train(second, tmp_path / "part"))
+    list(run.train_run(second, tmp_path / "part"))
     births = search.search(second, tmp_path / "part")
     next(births), next(births)
-    third = run.resume(tmp_path / "part", settings)
+    third = run.resume_run(tmp_path / "part", settings)
     assert _end(third, tmp_path / "part") == rows
     for a, b in zip(
         whole.trainer.model.net.state_dict().values(),
@@ -134,19 +134,19 @@ def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_withi
         strict=True,
     ):
         assert torch.equal(a, b)
-    assert torch.equal(run.coefficients(whole), run.coefficients(third))
-    assert float(run.coefficients(whole).abs().max()) > 0
+    assert torch.equal(run.lens_coefficients(whole), run.lens_coefficients(third))
+    assert float(run.lens_coefficients(whole).abs().max()) > 0
     assert all(c.macs <= 2e6 for s in whole.searches for c in s.history)
 
 
 def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
-    going = run.start(settings)
-    run.save(tmp_path / "c", going)
+    going = run.start_run(settings)
+    run.save_run(tmp_path / "c", going)
     (tmp_path / "other.toml").write_text(TINY.replace("steps = 2", "steps = 4"))
     with pytest.raises(TrainingError, match=r"inner\.steps: 2 -> 4"):
-        run.resume(tmp_path / "c", run.load(tmp_path / "other.toml"))
+        run.resume_run(tmp_path / "c", run.load_run_settings(tmp_path / "other.toml"))
     with pytest.raises(TrainingError, match="0 of 1 searches"):
-        finish(going)
+        finish_budgets(going)
 
 
 @pytest.mark.parametrize(
@@ -195,12 +195,14 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
 def test_bad_configs_are_refused_by_name(tmp_path, change, message):
     (tmp_path / "run.toml").write_text(change + "\n")
     with pytest.raises(ConfigError, match=message):
-        run.load(tmp_path / "run.toml")
+        run.load_run_settings(tmp_path / "run.toml")
 
 
 def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
     with pytest.raises(TrainingError, match="below the smallest network"):
-        run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
+        run.start_run(
+            replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,)))
+        )
 
 
 def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_budget(
@@ -222,12 +224,12 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
         TrainingError,
         match=r"at run.pitch_um = 9: raise run.budgets_mmacs, or begin with",
     ) as no:
-        run.start(of(9.0))
+        run.start_run(of(9.0))
     named = float(str(no.value).split(" = ")[-1].split(" ")[0])
     with pytest.raises(TrainingError, match="below the smallest network"):
-        run.start(of(named - 0.02))
-    run.start(of(named))
-    going = run.start(of(named + 2.0))
+        run.start_run(of(named - 0.02))
+    run.start_run(of(named))
+    going = run.start_run(of(named + 2.0))
     made = going.trainer.model
     assert named - 0.01 < made.finest_um <= named
     made.log_pitch.data.fill_(
@@ -236,7 +238,7 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
     going.trainer.optimisers.clear()
     going.trainer._apply({"pitch": 0.1}, finite=True)
     assert going.trainer.pitch_held_um == made.finest_um
-    least = smallest(settings.space)
+    least = smallest_architecture(settings.space)
     assert (
         going.macs(least) <= 1.6e6 < going.counted(least, 0.98 * made.finest_um)
     )  # two rows of pixels more
@@ -264,9 +266,9 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     pixels, by torch's counter.
     """
     pitch = 1.07 * settings.run.pitch_um
-    going = run.start(replace(settings, run=replace(settings.run, pitch_um=pitch)))
+    going = run.start_run(replace(settings, run=replace(settings.run, pitch_um=pitch)))
     net = going.trainer.model.net.eval()
-    chosen = replace(smallest(settings.space), resolution=0.87)
+    chosen = replace(smallest_architecture(settings.space), resolution=0.87)
     pixels = math.ceil(settings.scenes.pixels * settings.optics.sample_um / pitch)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, pixels, pixels), chosen)
@@ -303,18 +305,18 @@ def test_no_network_that_is_found_takes_more_than_its_budget(
         settings.inner, pitch=replace(settings.inner.pitch, rate=0.0), steps=1
     )
     rows = _end(
-        run.start(replace(settings, run=budgets, inner=still)), tmp_path / "run"
+        run.start_run(replace(settings, run=budgets, inner=still)), tmp_path / "run"
     )
     for row in rows:
         assert 0 < row["mmacs"] <= row["budget_mmacs"]
 
 
 def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
-    going = run.start(
+    going = run.start_run(
         replace(settings, run=replace(settings.run, frozen=("optics", "architecture")))
     )
     rows = _end(going, tmp_path / "c")
-    assert not run.coefficients(going).any()
+    assert not run.lens_coefficients(going).any()
     assert [len(s.history) for s in going.searches] == [1]
     assert len(set(rows[0]["architecture"]["kernels"])) == 1
     assert rows[0]["mmacs"] <= 2.0
@@ -324,13 +326,13 @@ def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tm
     tuned = replace(
         settings, run=replace(settings.run, finetune_steps=2), ambiguity_pairs=2
     )
-    going = run.start(tuned)
+    going = run.start_run(tuned)
     rows = _end(going, tmp_path / "c")
-    plain = finish(run.resume(tmp_path / "c", tuned))
+    plain = finish_budgets(run.resume_run(tmp_path / "c", tuned))
     assert plain == rows
     assert {"ambiguous_axial_slip_mm", "depth_response_mm_per_mm"} <= set(rows[0])
     before = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
-    end = finished(going)[0]
+    end = finished_budgets(going)[0]
     row, made = end.row, end.trainer.model
     assert row == rows[0]
     assert torch.equal(made.coefficients_rad, going.trainer.model.coefficients_rad)
@@ -340,9 +342,9 @@ def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tm
 def test_a_log_line_cut_by_a_kill_is_dropped(settings, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    going = run.start(settings)
-    next(run.train(going, folder / "unused"))
-    run.save(folder / command_codesign.CHECKPOINT, going)
+    going = run.start_run(settings)
+    next(run.train_run(going, folder / "unused"))
+    run.save_run(folder / command_codesign.CHECKPOINT, going)
     lines = [json.dumps({"kind": "step", "step": s}) for s in (1, 2, 3)]
     (folder / command_codesign.LOG).write_text("\n".join(lines)[:-5])
     command_codesign._resume(folder, settings)

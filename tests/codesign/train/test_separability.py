@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.batches import EyeScenes, SceneConfig, irradiance
+from codesign.batches import EyeScenes, SceneConfig, sensor_irradiance
 from codesign.optics import stack as lens
 from codesign.optics.stack import OpticsConfig
 from codesign.train.separability import (
     SeparabilityConfig,
+    fisher_separability,
     moved_states,
     render_triplets,
-    separability,
 )
-from metalens.ground.errors import ConfigError
+from metalens.core.errors import ConfigError
 from metalens.image import Sensor, encircled_energy
 
 OPTICS = OpticsConfig(
@@ -50,7 +50,9 @@ def test_the_fisher_matrix_is_the_plain_sum_over_pixels():
     ]
     want = np.array([[(a * b).sum() / 2 for b in fields] for a in fields])
     shares = torch.tensor([0.3, 0.5])
-    found = separability(frames, _pinhole, shares, CONFIG, sensor=SENSOR, sample_um=9.0)
+    found = fisher_separability(
+        frames, _pinhole, shares, CONFIG, sensor=SENSOR, sample_um=9.0
+    )
     assert found.fisher.numpy() == pytest.approx(want, rel=2e-3, abs=2e-3 * want.max())
     off = sum(
         want[i, j] ** 2 / (want[i, i] * want[j, j])
@@ -84,11 +86,11 @@ def test_the_loss_has_the_gradient_that_differences_say():
     frames = render_triplets(SCENES, CONFIG, 1)
 
     def loss(coefficients):
-        made = lens.stack(OPTICS, coefficients)
-        imager = lens.prepared(OPTICS, made, 56, margin=4)
+        made = lens.lens_psf_stack(OPTICS, coefficients)
+        imager = lens.prepare_transfers(OPTICS, made, 56, margin=4)
         shares = encircled_energy(made.intensity, 9.0, radius_um=18.0)
-        return separability(
-            frames, lambda f: irradiance(f, imager, margin=4), shares, CONFIG,
+        return fisher_separability(
+            frames, lambda f: sensor_irradiance(f, imager, margin=4), shares, CONFIG,
             sensor=SENSOR, sample_um=9.0,
         ).loss.value  # fmt: skip
 

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layout.arrange import At, apart, joined, parts
-from layout.formats import QUARTERS, CellContent, MaskContent, Placed
-from layout.process.process import Exposure, Process, Rules
-from metalens.ground.errors import MaskFileError, ProcessError
+from layout.arrange import Placement, apart, joined, parts
+from layout.formats import QUARTERS, CellContent, CellPlacements, MaskContent
+from layout.process.process import DesignRules, ExposureSettings, Process
+from metalens.core.errors import MaskFileError, ProcessError
 
-PLAIN = Process(rules=Rules(minimum_gap_nm=70))
-BEAM = Process(exposure=Exposure(alpha_um=0.01, beta_um=30.0, eta=0.7, tolerance=0.01))
+PLAIN = Process(rules=DesignRules(minimum_gap_nm=70))
+BEAM = Process(
+    exposure=ExposureSettings(alpha_um=0.01, beta_um=30.0, eta=0.7, tolerance=0.01)
+)
 
 
 def part(name, doses, *, box=(-1000, -500, 2000, 900), corrected=False, cell="SHAPE"):
@@ -23,15 +25,17 @@ def part(name, doses, *, box=(-1000, -500, 2000, 900), corrected=False, cell="SH
     shape = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     cells = {cell: CellContent(cell, {layer: [shape] for layer in doses})}
     boxes = {parts.PILLARS: np.array([box]), parts.APERTURE: np.empty((0, 4), np.int64)}
-    return parts.Part(name, cell, cells, doses, {}, boxes, np.array(box), corrected)
+    return parts.DieComponent(
+        name, cell, cells, doses, {}, boxes, np.array(box), corrected
+    )
 
 
 def test_two_doses_never_share_a_datatype_and_one_dose_has_one():
     first = part("A", {(1, 0): 1.27, (1, 1): 1.31})
     second = part("B", {(1, 0): 1.31, (1, 1): 1.4, (1, 2): 1.27}, cell="OTHER")
-    made = joined.die(
+    made = joined.die_cell(
         "TOP",
-        [joined.Placing(p, (At(),)) for p in (first, second)],
+        [joined.PartPlacement(p, (Placement(),)) for p in (first, second)],
         kept=frozenset({(1, 2), (10, 0)}),
     )
     assert made.doses == {
@@ -45,10 +49,10 @@ def test_two_doses_never_share_a_datatype_and_one_dose_has_one():
 
 def test_cells_of_one_name_are_told_apart_and_placed_where_they_were():
     inner = CellContent("X", {(2, 0): [np.array([[0, 0], [5, 0], [5, 7]])]})
-    placed = Placed(
+    placed = CellPlacements(
         ("X",), *(np.array([v], np.int32) for v in (0, 11, -3)), np.array([5], np.uint8)
     )
-    one = parts.Part(
+    one = parts.DieComponent(
         "A",
         "Y",
         {"X": inner, "Y": CellContent("Y", placed=placed)},
@@ -58,10 +62,10 @@ def test_cells_of_one_name_are_told_apart_and_placed_where_they_were():
         np.zeros(4),
     )
     two = part("B", {(1, 0): 1.0}, cell="X")
-    at = At(x_um=2.5, y_um=-1.25, turn_deg=90.0, columns=3, step_um=(10.0, 20.0))
-    made = joined.die(
+    at = Placement(x_um=2.5, y_um=-1.25, turn_deg=90.0, columns=3, step_um=(10.0, 20.0))
+    made = joined.die_cell(
         "TOP",
-        [joined.Placing(two, (At(),)), joined.Placing(one, (at,))],
+        [joined.PartPlacement(two, (Placement(),)), joined.PartPlacement(one, (at,))],
         kept=frozenset(),
     )
     assert set(made.cells) == {"TOP", "X", "X_2", "Y"}
@@ -77,7 +81,7 @@ def test_cells_of_one_name_are_told_apart_and_placed_where_they_were():
 
 
 def content(unit_nm, shape, place=(0, 0)):
-    top = Placed(
+    top = CellPlacements(
         ("P",), *(np.array([v], np.int32) for v in (0, *place)), np.zeros(1, np.uint8)
     )
     cells = {
@@ -88,13 +92,15 @@ def content(unit_nm, shape, place=(0, 0)):
 
 
 def test_another_database_unit_is_brought_to_nanometres_or_refused():
-    made = parts.scaled(content(5.0, [[0, 0], [3, 0], [3, 7]], (-4, 9)), 1.0, "FILE")
+    made = parts.scale_part(
+        content(5.0, [[0, 0], [3, 0], [3, 7]], (-4, 9)), 1.0, "FILE"
+    )
     assert made.cells["P"].polygons[9, 1][0].tolist() == [[0, 0], [15, 0], [15, 35]]
     assert (made.cells["T"].placed.x[0], made.cells["T"].placed.y[0]) == (-20, 45)
-    half = parts.scaled(content(0.5, [[0, 0], [30, 0], [30, 70]]), 1.0, "FILE")
+    half = parts.scale_part(content(0.5, [[0, 0], [30, 0], [30, 70]]), 1.0, "FILE")
     assert half.cells["P"].polygons[9, 1][0].tolist() == [[0, 0], [15, 0], [15, 35]]
     with pytest.raises(MaskFileError, match=r"FILE: its database unit is 0\.5 nm"):
-        parts.scaled(content(0.5, [[0, 0], [31, 0], [30, 70]]), 1.0, "FILE")
+        parts.scale_part(content(0.5, [[0, 0], [31, 0], [30, 70]]), 1.0, "FILE")
 
 
 @pytest.mark.parametrize("away", [69, 70])
@@ -104,10 +110,10 @@ def test_the_gap_between_parts_is_that_of_the_rule(away):
     # middle
     x = 2.0 + 0.9 + away / 1000
     placed = [
-        joined.Placing(one, (At(),)),
-        joined.Placing(two, (At(x_um=x, y_um=0.1, turn_deg=90.0),)),
+        joined.PartPlacement(one, (Placement(),)),
+        joined.PartPlacement(two, (Placement(x_um=x, y_um=0.1, turn_deg=90.0),)),
     ]
-    found = apart.check(placed, PLAIN)
+    found = apart.check_separation(placed, PLAIN)
     assert len(found) == (away < 70)
     if found:
         assert found[0].value == pytest.approx(69.0)
@@ -116,8 +122,10 @@ def test_the_gap_between_parts_is_that_of_the_rule(away):
 
 def test_copies_of_an_array_are_held_to_the_rule_too():
     def check(step):
-        at = At(columns=4, rows=2, step_um=(step, 5.0))
-        return apart.check([joined.Placing(part("A", {(1, 0): 1.0}), (at,))], PLAIN)
+        at = Placement(columns=4, rows=2, step_um=(step, 5.0))
+        return apart.check_separation(
+            [joined.PartPlacement(part("A", {(1, 0): 1.0}), (at,))], PLAIN
+        )
 
     assert not check(3.07)
     assert len(check(3.05)) == 6  # three pairs in each of two rows
@@ -134,8 +142,11 @@ def test_backscatter_reaches_as_far_as_its_error_function_says():
             part("A", {(1, 0): 1.0}, corrected=corrected),
             part("B", {(1, 0): 1.0}),
         )
-        return apart.check(
-            [joined.Placing(one, (At(),)), joined.Placing(two, (At(x_um=3 + away),))],
+        return apart.check_separation(
+            [
+                joined.PartPlacement(one, (Placement(),)),
+                joined.PartPlacement(two, (Placement(x_um=3 + away),)),
+            ],
             BEAM,
         )
 
@@ -150,12 +161,12 @@ def test_impossible_places_are_refused():
     with pytest.raises(
         ProcessError, match="step_um is missing for 2 columns and 1 rows"
     ):
-        At(columns=2)
-    many = joined.Placing(
-        part("A", {(1, 0): 1.0}), (At(columns=4001, step_um=(9.0, 9.0)),)
+        Placement(columns=2)
+    many = joined.PartPlacement(
+        part("A", {(1, 0): 1.0}), (Placement(columns=4001, step_um=(9.0, 9.0)),)
     )
     with pytest.raises(ProcessError, match="4001 copies of A on a die"):
-        apart.check([many], PLAIN)
+        apart.check_separation([many], PLAIN)
 
 
 def test_a_disc_is_sliced_so_that_its_corners_stay_free():

@@ -5,9 +5,9 @@ stand.
 import numpy as np
 import pytest
 
-from layout.arrange import At, joined, parts, seen
-from layout.formats import CellContent, Placed, Sites
-from layout.mask import Lattice
+from layout.arrange import Placement, joined, parts, seen
+from layout.formats import CellContent, CellPlacements, PillarSites
+from layout.mask import PillarLattice
 from layout.process.process import Process
 
 AREA = 90.0 * 80 / 2
@@ -22,8 +22,10 @@ def lens(block):
         "LENS": CellContent("LENS"),
     }
     cells["TOP"] = CellContent("TOP", placed=PLACED)
-    sites = Sites(Lattice.of("OWN", block, pitch=400, x0=-2000, y0=3000), ("TRI",))
-    return parts.Part(
+    sites = PillarSites(
+        PillarLattice.of("OWN", block, pitch=400, x0=-2000, y0=3000), ("TRI",)
+    )
+    return parts.DieComponent(
         "A",
         "TOP",
         cells,
@@ -35,14 +37,14 @@ def lens(block):
     )
 
 
-PLACED = Placed(
+PLACED = CellPlacements(
     ("LENS",), *(np.array([v], np.int32) for v in (0, 700, -300)), np.zeros(1, np.uint8)
 )
 
 
 def pads():
     shape = np.array([[0, 0], [50_000, 0], [50_000, 20_000], [0, 20_000]])
-    return parts.Part(
+    return parts.DieComponent(
         "P",
         "PAD",
         {"PAD": CellContent("PAD", {(2, 0): [shape]})},
@@ -57,15 +59,15 @@ def test_every_area_is_seen_once_and_where_it_stands():
     block = np.zeros((31, 21), np.uint8)
     block[4:, 3:] = np.random.default_rng(2).integers(0, 2, (27, 18))
     at = (
-        At(x_um=20.0, y_um=-15.0, turn_deg=90.0),
-        At(x_um=-40.0, y_um=12.0, columns=2, step_um=(15.0, 3.0)),
+        Placement(x_um=20.0, y_um=-15.0, turn_deg=90.0),
+        Placement(x_um=-40.0, y_um=12.0, columns=2, step_um=(15.0, 3.0)),
     )
     placed = [
-        joined.Placing(lens(block), at),
-        joined.Placing(pads(), (At(x_um=-10.0, y_um=20.0),)),
+        joined.PartPlacement(lens(block), at),
+        joined.PartPlacement(pads(), (Placement(x_um=-10.0, y_um=20.0),)),
     ]
-    view = seen.View.over(np.array([-70_000, -60_000, 80_000, 60_000]), 75)
-    found = seen.covered(placed, Process(), view)
+    view = seen.DensityView.over(np.array([-70_000, -60_000, 80_000, 60_000]), 75)
+    found = seen.coverage_map(placed, Process(), view)
     assert set(found) == {parts.PILLARS, parts.APERTURE}
     assert found[parts.PILLARS].sum() * view.side**2 == pytest.approx(
         3 * block.sum() * AREA, rel=1e-9
@@ -105,7 +107,7 @@ def test_a_picture_has_the_points_of_its_longer_side_and_one_for_the_rest(
     box, side, shape
 ):
     """100 by 20 units by 25 points of 4; a box of nothing has the point at its corner."""
-    view = seen.View.over(np.array(box), 25)
+    view = seen.DensityView.over(np.array(box), 25)
     assert (view.left, view.bottom, view.side) == (box[0], box[1], side)
     assert (view.rows, view.columns) == shape
 
@@ -114,7 +116,7 @@ def test_area_on_four_points_keeps_its_sum_and_its_middle_of_mass():
     """Linear shares: the sums of area, area x and area y over the points' middles are
     those of the spots.
     """
-    view = seen.View(-7.0, 3.0, 2.5, 9, 13)
+    view = seen.DensityView(-7.0, 3.0, 2.5, 9, 13)
     rng = np.random.default_rng(5)
     area = rng.uniform(0.1, 2.0, 40)
     x, y = (

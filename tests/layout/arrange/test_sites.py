@@ -10,15 +10,15 @@ import pytest
 import layout
 from layout.formats import (
     QUARTERS,
-    Assembly,
     CellContent,
-    Copies,
-    Sites,
+    CellCopies,
+    MaskAssembly,
+    PillarSites,
     compare,
     gdsii_write,
     oasis_write,
 )
-from layout.mask import Lattice
+from layout.mask import PillarLattice
 
 NAMES = (
     "THIN",
@@ -35,10 +35,12 @@ def assembly(block):
         if name
     }
     cells |= {"LENS": CellContent("LENS"), "TOP": CellContent("TOP")}
-    sites = Sites(Lattice.of("OWN", block, pitch=410, x0=-7001, y0=9003), NAMES)
+    sites = PillarSites(
+        PillarLattice.of("OWN", block, pitch=410, x0=-7001, y0=9003), NAMES
+    )
     copies = {
         "TOP": (
-            Copies(
+            CellCopies(
                 "LENS",
                 500,
                 -300,
@@ -50,7 +52,7 @@ def assembly(block):
             ),
         )
     }
-    return Assembly("LIB", cells, copies, sites={"LENS": sites})
+    return MaskAssembly("LIB", cells, copies, sites={"LENS": sites})
 
 
 @pytest.mark.parametrize(
@@ -69,7 +71,7 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     made = assembly(block)
     write(made, tmp_path / "m")
     content = read(tmp_path / "m", keep=keep)
-    assert compare.differences(made, content) == []
+    assert compare.mask_differences(made, content) == []
     if keep is None:
         row, column = np.nonzero(block == 3)
         x, y = content.sites("LENS")["WIDER_ONE"]
@@ -83,10 +85,10 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     lost[np.unravel_index(np.flatnonzero(block == 3)[-1], block.shape)] = 0
     for other in (swapped, lost, np.roll(block, 1, axis=1)):
         assert not np.array_equal(other, block)
-        found = compare.differences(assembly(other), content)
+        found = compare.mask_differences(assembly(other), content)
         assert any(text.startswith("cell LENS: ") for text in found), found
     moved = dataclasses.replace(
         made,
         copies={"TOP": (dataclasses.replace(made.copies["TOP"][0], turn=QUARTERS[4]),)},
     )
-    assert compare.differences(moved, content)
+    assert compare.mask_differences(moved, content)

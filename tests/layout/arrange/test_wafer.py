@@ -9,9 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from layout.arrange.record import Mark, Wafer
-from layout.arrange.wafer import chord_um, dies, refuse_marks_off, stepped
-from metalens.ground.errors import ProcessError
+from layout.arrange.record import WaferMark, WaferSettings
+from layout.arrange.wafer import (
+    chord_um,
+    refuse_marks_off,
+    step_and_repeat,
+    usable_dies,
+)
+from metalens.core.errors import ProcessError
 
 
 def edge(wafer, count=4000):
@@ -69,68 +74,68 @@ BOX = (-2100.0, -1300.0, 1900.0, 1700.0)  # not about its middle
 @pytest.mark.parametrize(
     "wafer",
     [
-        Wafer(
+        WaferSettings(
             (4600.0, 3350.0),
             diameter_mm=50.8,
             edge_exclusion_mm=2.0,
             flat_mm=15.88,
             offset_um=(710.0, 1290.0),
         ),
-        Wafer(
+        WaferSettings(
             (4310.0, 3470.0),
             diameter_mm=76.2,
             edge_exclusion_mm=4.3,
             notch_mm=1.1,
             offset_um=(350.0, 900.0),
         ),
-        Wafer((4000.0, 3000.0), diameter_mm=40.0, edge_exclusion_mm=0.0),
+        WaferSettings((4000.0, 3000.0), diameter_mm=40.0, edge_exclusion_mm=0.0),
     ],
 )
 def test_dies_are_those_that_keep_away_from_every_point_of_the_edge(wafer):
     # points lie 40 um apart at most: the distance of a die is found to 40^2 / 8 / 2000
     # um, 0.1 um
-    assert {tuple(pair) for pair in dies(wafer, BOX).index.tolist()} == counted(
+    assert {tuple(pair) for pair in usable_dies(wafer, BOX).index.tolist()} == counted(
         wafer, BOX
     )
 
 
 def test_a_flat_takes_a_row_and_a_notch_one_die():
-    plain = Wafer(
+    plain = WaferSettings(
         (5000.0, 5000.0),
         diameter_mm=100.0,
         edge_exclusion_mm=2.0,
         offset_um=(0.0, 1000.0),
     )
     box = (-2500.0, -2500.0, 2500.0, 2500.0)
-    whole = {tuple(pair) for pair in dies(plain, box).index.tolist()}
-    flat = Wafer(
+    whole = {tuple(pair) for pair in usable_dies(plain, box).index.tolist()}
+    flat = WaferSettings(
         (5000.0, 5000.0), flat_mm=32.5, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
     )
-    cut = {tuple(pair) for pair in dies(flat, box).index.tolist()}
+    cut = {tuple(pair) for pair in usable_dies(flat, box).index.tolist()}
     # the chord lies sqrt(50^2 - 16.25^2) = 47.28 mm below the middle: rows that end
     # above -45.28 mm stay
     lowest = min(j for _, j in whole)
     assert lowest * 5000 + 1000 - 2500 == -46500
     assert whole - cut == {(i, j) for i, j in whole if j == lowest}
-    notch = Wafer(
+    notch = WaferSettings(
         (5000.0, 5000.0), notch_mm=1.6, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
     )
-    assert whole - {tuple(pair) for pair in dies(notch, box).index.tolist()} == {
+    assert whole - {tuple(pair) for pair in usable_dies(notch, box).index.tolist()} == {
         (0, lowest)
     }  # tip at -48.4 mm
 
 
 def test_dies_that_touch_a_mark_are_left_out():
     box = (-2000.0, -1500.0, 2000.0, 1500.0)
-    free = Wafer((4000.0, 3000.0), diameter_mm=40.0)
-    taken = Wafer(
+    free = WaferSettings((4000.0, 3000.0), diameter_mm=40.0)
+    taken = WaferSettings(
         (4000.0, 3000.0),
         diameter_mm=40.0,
         mark_um=400.0,
-        marks=(Mark(8.1, 3.0), Mark(-6.0, 0.2)),
+        marks=(WaferMark(8.1, 3.0), WaferMark(-6.0, 0.2)),
     )
-    gone = {tuple(p) for p in dies(free, box).index.tolist()} - {
-        tuple(p) for p in dies(taken, box, around_marks_um=30.0).index.tolist()
+    gone = {tuple(p) for p in usable_dies(free, box).index.tolist()} - {
+        tuple(p) for p in usable_dies(taken, box, around_marks_um=30.0).index.tolist()
     }
     # 8.1 mm lies in column 2 (6 to 10 mm), 3 mm in row 1 (1.5 to 4.5); -6 mm on the
     # border of columns -2 and -1
@@ -139,7 +144,9 @@ def test_dies_that_touch_a_mark_are_left_out():
         ProcessError, match=r"mark at \(19\.5, 0\) mm is off the usable wafer"
     ):
         refuse_marks_off(
-            Wafer((4000.0, 3000.0), diameter_mm=40.0, marks=(Mark(19.5, 0.0),))
+            WaferSettings(
+                (4000.0, 3000.0), diameter_mm=40.0, marks=(WaferMark(19.5, 0.0),)
+            )
         )
 
 
@@ -149,14 +156,14 @@ def test_dies_that_touch_a_mark_are_left_out():
     offset=st.tuples(st.integers(-900, 900), st.integers(-900, 900)),
 )
 def test_arrays_hold_every_die_once_at_its_place(diameter, pitch, offset):
-    wafer = Wafer(
+    wafer = WaferSettings(
         tuple(map(float, pitch)),
         diameter_mm=diameter,
         edge_exclusion_mm=1.0,
         offset_um=tuple(map(float, offset)),
     )
-    found = dies(wafer, (-1000.0, -600.0, 1000.0, 600.0))
-    copies = stepped("DIE", found, units_per_um=1000.0)
+    found = usable_dies(wafer, (-1000.0, -600.0, 1000.0, 600.0))
+    copies = step_and_repeat("DIE", found, units_per_um=1000.0)
     there = [
         tuple(p)
         for one in copies
@@ -173,13 +180,13 @@ def test_what_does_not_fit_is_refused_by_key():
         ProcessError,
         match=r"wafer\.pitch_um is 3000 along y, but a die is 3000\.500 um long",
     ):
-        dies(Wafer((5000.0, 3000.0)), (-1.0, -1500.25, 1.0, 1500.25))
+        usable_dies(WaferSettings((5000.0, 3000.0)), (-1.0, -1500.25, 1.0, 1500.25))
     with pytest.raises(ProcessError, match=r"no die of 70000 x 70000 um fits"):
-        dies(
-            Wafer((70000.0, 70000.0), diameter_mm=98.0),
+        usable_dies(
+            WaferSettings((70000.0, 70000.0), diameter_mm=98.0),
             (-35000.0, -35000.0, 35000.0, 35000.0),
         )
     with pytest.raises(ProcessError, match="whole nanometres"):
-        Wafer((5000.0005, 3000.0))
+        WaferSettings((5000.0005, 3000.0))
     with pytest.raises(ProcessError, match=r"flat_mm = 10\.0 and notch_mm = 1\.0"):
-        Wafer((5000.0, 3000.0), flat_mm=10.0, notch_mm=1.0)
+        WaferSettings((5000.0, 3000.0), flat_mm=10.0, notch_mm=1.0)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from layout.arrange import Wafer, wafer
+from layout.arrange import WaferSettings, wafer
 
 
 def notch_outline(radius, depth, bottom=0.9):
@@ -26,7 +26,7 @@ def notch_outline(radius, depth, bottom=0.9):
 @pytest.mark.parametrize("exclusion", [0.0, 0.35])
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (130.0, 71.0)])
 def test_no_die_lies_on_the_notch_or_nearer_to_it_than_the_exclusion(exclusion, offset):
-    size = Wafer(
+    size = WaferSettings(
         pitch_um=(310, 290),
         diameter_mm=50,
         notch_mm=1.0,
@@ -34,14 +34,14 @@ def test_no_die_lies_on_the_notch_or_nearer_to_it_than_the_exclusion(exclusion, 
         offset_um=offset,
     )
     box = (-150.0, -140.0, 150.0, 140.0)
-    found = {tuple(i) for i in wafer.dies(size, box).index.tolist()}
-    whole = Wafer(
+    found = {tuple(i) for i in wafer.usable_dies(size, box).index.tolist()}
+    whole = WaferSettings(
         pitch_um=(310, 290),
         diameter_mm=50,
         edge_exclusion_mm=exclusion,
         offset_um=offset,
     )
-    every = wafer.dies(whole, box)
+    every = wafer.usable_dies(whole, box)
     outline = notch_outline(25.0, 1.0) * 1e3
     kept = set()
     for index, place in zip(every.index.tolist(), every.place_um.tolist(), strict=True):

@@ -9,7 +9,14 @@ import pytest
 
 import layout
 from layout.commands import make
-from layout.formats import QUARTERS, Assembly, CellContent, Copies, doses, gdsii_write
+from layout.formats import (
+    QUARTERS,
+    CellContent,
+    CellCopies,
+    MaskAssembly,
+    doses,
+    gdsii_write,
+)
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -48,8 +55,12 @@ def folder(tmp_path_factory):
         "PAD", {(1, 0): [np.array([[0, 0], [400, 0], [400, 200], [0, 200]])]}
     )
     chip = CellContent("CHIP", {(20, 3): [np.array([[0, 0], [9, 0], [9, 11]])]})
-    pads = Copies("PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900))
-    made = Assembly("PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0)
+    pads = CellCopies(
+        "PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900)
+    )
+    made = MaskAssembly(
+        "PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0
+    )
     gdsii_write.write(made, target / "pads.gds")
     (target / "process.toml").write_text(
         "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
@@ -176,7 +187,7 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
         text in page for text in ("mirrored", "pads.gds", f"{len(dies)} whole dies")
     )
     assert (tmp_path / "m" / "wafer.png").is_file()
-    held = doses.read(tmp_path / "m" / "doses.csv")
+    held = doses.read_dose_table(tmp_path / "m" / "doses.csv")
     assert held[1, 0] == 1.0
     assert held[1, 1] == held[20, 3] == 1.5
 
@@ -233,7 +244,7 @@ def test_doses_of_lenses_and_their_surroundings_are_corrected_each(
     assert run(folder, text, tmp_path / "m", "--json") == 0
     values = json.loads(capsys.readouterr().out)
     assert values["failures"] == []
-    held = doses.read(tmp_path / "m" / "doses.csv")
+    held = doses.read_dose_table(tmp_path / "m" / "doses.csv")
     assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(
         n == 1 for n, _ in held
     )

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from layout.formats import Assembly, CellContent, gdsii_write
+from layout.formats import CellContent, MaskAssembly, gdsii_write
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -68,7 +68,7 @@ def folder(tmp_path_factory):
     )
     for cell in (pads, thin):
         file = target / f"{cell.name.lower()}.gds"
-        gdsii_write.write(Assembly(cell.name, {cell.name: cell}, {}), file)
+        gdsii_write.write(MaskAssembly(cell.name, {cell.name: cell}, {}), file)
     (target / "pec.toml").write_text(PEC)
     (target / "plain.toml").write_text(PLAIN)
     return target

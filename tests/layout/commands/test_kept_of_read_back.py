@@ -27,7 +27,7 @@ def test_a_cell_of_more_than_65536_places_is_read_back_as_sums(
         DiameterMap(np.full((rows, 256), 0.2), 0.4), process, furnished=False
     )
     layout.write_gdsii(plan, tmp_path / "mask.gds")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     seen, compare = [], make.verify.compare
     monkeypatch.setattr(
         make.verify,

@@ -15,12 +15,12 @@ from layout.commands import make, page
 from layout.drc import check_plan, write_lyp, write_lyrdb
 from layout.formats import dxf
 from layout.pec.psf import point_exposure
-from layout.process.process import Exposure, Rules
+from layout.process.process import DesignRules, ExposureSettings
 from layout.shapes import polygon
 from layout.study import page as study_page
 from metalens import cli, lens
 from metalens.cell.record import Cell
-from metalens.ground.errors import MaskFileError, ProcessError
+from metalens.core.errors import MaskFileError, ProcessError
 from metalens.lens import Layers, Stop
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
@@ -131,7 +131,7 @@ def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
     monkeypatch.setattr(
         study_page, "answers_of", lambda lens: {"": SimpleNamespace(error=error)}
     )
-    monkeypatch.setattr(study_page, "sections", lambda *about: [])
+    monkeypatch.setattr(study_page, "study_sections", lambda *about: [])
     assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
     told = capsys.readouterr().out
     assert "The mask passes its own checks." in told
@@ -158,13 +158,16 @@ def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(
         header="radius_um,density",
         comments="",
     )
-    measured = Exposure(csv=tmp_path / "point.csv")
+    measured = ExposureSettings(csv=tmp_path / "point.csv")
     point = point_exposure(measured)
     assert 1e-3 < point.fit_error < 0.05
     told = page._table_said(measured, point)
     assert f"the table point.csv, as {len(point.weights)} Gaussians" in told
     assert f"by up to {100 * point.fit_error:.2g} % of the whole" in told
-    assert page._table_said(Exposure(alpha_um=0.01, beta_um=40.0, eta=0.7), point) == ""
+    assert (
+        page._table_said(ExposureSettings(alpha_um=0.01, beta_um=40.0, eta=0.7), point)
+        == ""
+    )
 
 
 def test_a_corrected_mask_is_certified_and_hands_on_its_lens(
@@ -275,7 +278,7 @@ def test_an_existing_mask_stays_without_force_and_stale_files_go_with_it(
 
 def test_dxf_of_a_window_reads_in_klayout(plan, tmp_path):
     db = pytest.importorskip("klayout.db")
-    window = dxf.Window(-2.0, 1.0, 4.0)
+    window = dxf.DxfWindow(-2.0, 1.0, 4.0)
     count = layout.write_dxf(plan, tmp_path / "m.dxf", window=window)
     inside = [
         (x, y, k)
@@ -300,21 +303,21 @@ def test_dxf_of_a_window_reads_in_klayout(plan, tmp_path):
 
 def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path):
     ezdxf = pytest.importorskip("ezdxf")
-    window, path = dxf.Window(-2.0, 1.0, 4.0), tmp_path / "m.dxf"
+    window, path = dxf.DxfWindow(-2.0, 1.0, 4.0), tmp_path / "m.dxf"
     layout.write_dxf(plan, path, window=window)
     drawing = ezdxf.readfile(path)
     assert drawing.units == 13  # micrometres, in the table of $INSUNITS
     assert {"PILLAR": "1/0", "MARKS": "3/0"}.items() <= {
         e.dxf.name: e.description for e in drawing.layers
     }.items()
-    assert dxf.differences(plan, path, window=window) == ()
+    assert dxf.dxf_differences(plan, path, window=window) == ()
     layout.write_dxf(plan, tmp_path / "again.dxf", window=window)
     assert path.read_bytes() == (tmp_path / "again.dxf").read_bytes()
     first = drawing.modelspace().query('LWPOLYLINE[layer=="PILLAR"]')[0]
     first.set_points([(x + 0.001, y) for x, y in first.get_points("xy")], format="xy")
     drawing.units = ezdxf.units.MM
     drawing.saveas(path)
-    found = dxf.differences(plan, path, window=window)
+    found = dxf.dxf_differences(plan, path, window=window)
     assert found[0].startswith("unit 4, planned 13")
     assert found[1:] == (
         "layer PILLAR: 1 polygons missing",
@@ -322,13 +325,13 @@ def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path
     )
     path.write_text("no drawing")
     with pytest.raises(MaskFileError, match=r"m\.dxf: cannot be read"):
-        dxf.differences(plan, path, window=window)
+        dxf.dxf_differences(plan, path, window=window)
 
 
 def test_dxf_beyond_its_limit_is_refused(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(dxf, "MOST_PILLARS", 3)
     with pytest.raises(ProcessError, match="take at most 3"):
-        layout.write_dxf(plan, tmp_path / "m.dxf", window=dxf.Window(0, 0, 50))
+        layout.write_dxf(plan, tmp_path / "m.dxf", window=dxf.DxfWindow(0, 0, 50))
     assert not list(tmp_path.iterdir())
 
 
@@ -343,7 +346,7 @@ def test_layer_properties_name_every_layer(plan, tmp_path):
 def test_markers_stand_where_the_violations_are(make_plan, tmp_path):
     rdb = pytest.importorskip("klayout.rdb")
     plan = make_plan(np.array([[7, 7]], np.uint8))
-    found = check_plan(plan, Rules(minimum_gap_nm=300, minimum_feature_nm=1))
+    found = check_plan(plan, DesignRules(minimum_gap_nm=300, minimum_feature_nm=1))
     write_lyrdb(found, plan.name, tmp_path / "m.lyrdb")
     database = rdb.ReportDatabase()
     database.load(str(tmp_path / "m.lyrdb"))

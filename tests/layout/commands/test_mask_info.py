@@ -8,9 +8,9 @@ import pytest
 
 from layout.formats import (
     QUARTERS,
-    Assembly,
     CellContent,
-    Copies,
+    CellCopies,
+    MaskAssembly,
     gdsii_write,
     oasis_write,
 )
@@ -89,21 +89,21 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
     steps = {"across": (300, 0), "up": (0, 310)}
     copies = {
         "LENS": (
-            Copies("DOT", 0, 0, columns=600, rows=700, **steps),
-            Copies("BAR", 5, 9, QUARTERS[3]),
+            CellCopies("DOT", 0, 0, columns=600, rows=700, **steps),
+            CellCopies("BAR", 5, 9, QUARTERS[3]),
         ),
         "DIE": (
-            Copies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
-            Copies("BAR", 0, 0, rows=3, up=(0, 9)),
+            CellCopies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
+            CellCopies("BAR", 0, 0, rows=3, up=(0, 9)),
         ),
         "WAFER": (
-            Copies("DIE", -7, 0, columns=210, rows=330, **steps),
-            Copies("LENS", 0, 0),
+            CellCopies("DIE", -7, 0, columns=210, rows=330, **steps),
+            CellCopies("LENS", 0, 0),
         ),
     }
     cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
     write = oasis_write.write if ending == "oas" else gdsii_write.write
-    write(Assembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
+    write(MaskAssembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
     assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
     lenses = 210 * 330 * 40 * 50 + 1
@@ -124,11 +124,12 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
         CellContent("TWO"),
     ]
     copies = {
-        "ONE": (Copies("A", 0, 0), Copies("EMPTY", 0, 0, rows=9, up=(0, 5))),
-        "TWO": (Copies("A", 3, 4),) * 3,
+        "ONE": (CellCopies("A", 0, 0), CellCopies("EMPTY", 0, 0, rows=9, up=(0, 5))),
+        "TWO": (CellCopies("A", 3, 4),) * 3,
     }
     gdsii_write.write(
-        Assembly("L", {cell.name: cell for cell in cells}, copies), tmp_path / "w.gds"
+        MaskAssembly("L", {cell.name: cell for cell in cells}, copies),
+        tmp_path / "w.gds",
     )
     assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)

@@ -13,10 +13,10 @@ import pytest
 from layout.commands import view
 from layout.drc import DrcReport, Violation, write_lyrdb
 from layout.formats import gdsii_write, oasis_write
-from layout.process.process import Rules
+from layout.process.process import DesignRules
 from metalens import cli
-from metalens.ground.errors import MaskFileError
-from metalens.view.page import html
+from metalens.core.errors import MaskFileError
+from metalens.view.page import page_html
 
 KINDS = {"Float32Array": "<f4", "Int32Array": "<i4", "Uint8Array": "u1"}
 
@@ -40,7 +40,9 @@ def test_every_shape_is_in_the_page_where_the_file_has_it(make_plan, tmp_path, e
     plan = make_plan(seed=5)
     write = oasis_write.write if ending == "oas" else gdsii_write.write
     write(plan, tmp_path / f"m.{ending}")
-    panel = content(html("mask", view.panels(tmp_path / f"m.{ending}")))["panels"][0]
+    panel = content(page_html("mask", view.mask_panels(tmp_path / f"m.{ending}")))[
+        "panels"
+    ][0]
     assert panel["unit"] == pytest.approx(1e-3, rel=1e-12)
     found = set()
     for outline in panel["outlines"]:
@@ -68,10 +70,10 @@ def test_doses_and_broken_rules_beside_the_mask_are_shown(plan, tmp_path):
     oasis_write.write(plan, tmp_path / "mask.oas")
     (tmp_path / "doses.csv").write_text("layer,datatype,relative_dose\n1,0,1.37\n")
     broken = Violation("space", (-5000, 4300, -4700, 4500), 55.0, 70.0, "two pillars")
-    report = DrcReport.empty(1.0, Rules())
+    report = DrcReport.empty(1.0, DesignRules())
     report.add("space", 1, layer=1, cell="TOP", worst=55.0, examples=[broken])
     write_lyrdb(report, "TOP", tmp_path / "mask.lyrdb")
-    drawn, layers = view.panels(tmp_path)
+    drawn, layers = view.mask_panels(tmp_path)
     ((x, y, rule),) = drawn.marks
     assert (x, y, rule) == (pytest.approx(-4.85), pytest.approx(4.4), "space")
     assert {
@@ -85,7 +87,7 @@ def test_doses_and_broken_rules_beside_the_mask_are_shown(plan, tmp_path):
 
 def test_what_holds_no_mask_is_refused(tmp_path, capsys):
     with pytest.raises(MaskFileError, match="no mask file"):
-        view.panels(tmp_path)
+        view.mask_panels(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
     assert cli.main(["view", str(tmp_path), "-o", str(tmp_path / "page.html")]) == 2
     assert (

@@ -6,8 +6,8 @@ import numba
 import numpy as np
 import pytest
 
-from layout.commands.stages import Rows, Stages
-from layout.process import noticed
+from layout.commands.stages import RowProgress, StageTimes
+from layout.process import announce_compilation
 
 
 def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
@@ -20,7 +20,7 @@ def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
         if share in text:
             heard.set()
 
-    stages = Stages(say, first_s=0.02, next_s=0.02)
+    stages = StageTimes(say, first_s=0.02, next_s=0.02)
     watched = stages.rows.watched(plan)
     with stages("write"):
         assert np.array_equal(watched.lattices[0].source(0, 9), lens.source(0, 9))
@@ -29,14 +29,14 @@ def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
         )  # lines from before the rows were taken may come first, without a share
     assert all(line.startswith("write: ") for line in said)
     count = len(said)
-    with Stages(said.append, first_s=60.0)("short"):
+    with StageTimes(said.append, first_s=60.0)("short"):
         pass
     assert len(said) == count
     assert set(stages.seconds) == {"write"}
 
 
 def test_an_error_ends_the_stage():
-    stages = Stages(lambda text: None)
+    stages = StageTimes(lambda text: None)
     with pytest.raises(ZeroDivisionError), stages("broken"):
         _ = 1 / 0
     assert "broken" in stages.seconds
@@ -44,7 +44,7 @@ def test_an_error_ends_the_stage():
 
 
 def test_the_time_left_is_of_the_pass_that_runs(plan):
-    rows = Rows()
+    rows = RowProgress()
     source = rows.watched(plan).lattices[0].source
     assert rows.text == ""
     source(0, 11)
@@ -60,11 +60,11 @@ def test_the_time_left_is_of_the_pass_that_runs(plan):
 def test_compilation_is_told_once_and_not_what_is_compiled_already():
     loop = numba.njit(lambda x: x + 3)
     said = []
-    with noticed(said.append):
+    with announce_compilation(said.append):
         assert loop(2) == 5
         assert loop(2.5) == 5.5
     assert len(said) == 1
     assert "compiling" in said[0]
-    with noticed(said.append):
+    with announce_compilation(said.append):
         assert loop(4) == 7
     assert len(said) == 1

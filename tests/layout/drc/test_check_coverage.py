@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.drc import check_library
-from layout.process.process import Rules
+from layout.process.process import DesignRules
 from metalens import cli
 
 db = pytest.importorskip("klayout.db")
@@ -280,8 +280,8 @@ def test_least_width_and_space_are_those_of_klayout_in_projection(tmp_path, kind
     top.insert(db.CellInstArray(sub.cell_index(), at, *steps, 2, 3))
     path = tmp_path / f"m.{('gds', 'oas')[seed % 2]}"
     made.write(str(path))
-    rules = Rules(minimum_gap_nm=MOST, minimum_feature_nm=MOST)
-    report = check_library(read(path), rules)
+    rules = DesignRules(minimum_gap_nm=MOST, minimum_feature_nm=MOST)
+    report = check_library(read_mask(path), rules)
     region = db.Region(top.begin_shapes_rec(layer)).merged()
     holes = [hole for p in region.each() for hole in range(p.holes())]
     if is_turned and holes:
@@ -315,11 +315,11 @@ def test_a_hierarchy_is_checked_as_its_flattened_drawing(tmp_path, seed):
     block.shapes(layer).insert(db.Box(-900, -900, -860, 3000))
     path = tmp_path / "m.oas"
     made.write(str(path))
-    rules = Rules(minimum_gap_nm=90, minimum_feature_nm=95)
-    report = check_library(read(path), rules)
+    rules = DesignRules(minimum_gap_nm=90, minimum_feature_nm=95)
+    report = check_library(read_mask(path), rules)
     made.flatten(top.cell_index(), -1, True)
     made.write(str(tmp_path / "flat.oas"))
-    flat = check_library(read(tmp_path / "flat.oas"), rules)
+    flat = check_library(read_mask(tmp_path / "flat.oas"), rules)
     assert report.counts == flat.counts
     assert report.sizes == flat.sizes
     assert report.shapes == flat.shapes

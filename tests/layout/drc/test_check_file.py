@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.drc import check_library, check_plan
 from layout.formats import CellContent, MaskContent
 from layout.mask import build
 from layout.process import process as processes
-from layout.process.process import Rules
+from layout.process.process import DesignRules
 from metalens import cli
 from metalens.lens import DiameterMap
 
@@ -76,8 +76,8 @@ def test_turned_convex_pillars_anywhere_agree_with_klayout(tmp_path, suffix):
         for b in shapes[i + 1 : i + 40]
         if a.bbox().touches(b.bbox()) and a.touches(b)
     )
-    rules = Rules(minimum_gap_nm=70, minimum_feature_nm=1)
-    report = check_library(read(path), rules, metric="euclidean")
+    rules = DesignRules(minimum_gap_nm=70, minimum_feature_nm=1)
+    report = check_library(read_mask(path), rules, metric="euclidean")
     assert report.shapes == len(shapes)
     own = {v.box for v in report.violations if v.rule == "space"}
     theirs = pairs_of_klayout(shapes, 70)
@@ -218,10 +218,14 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
     path = tmp_path / "m.gds"
     made.write(str(path))
     region = db.Region(top.begin_shapes_rec(layer))
-    report = check_library(read(path), Rules(minimum_gap_nm=45, minimum_feature_nm=95))
+    report = check_library(
+        read_mask(path), DesignRules(minimum_gap_nm=45, minimum_feature_nm=95)
+    )
     assert report.ok
     assert region.width_check(95, False, db.Region.Projection).is_empty()
-    thin = check_library(read(path), Rules(minimum_gap_nm=50, minimum_feature_nm=102))
+    thin = check_library(
+        read_mask(path), DesignRules(minimum_gap_nm=50, minimum_feature_nm=102)
+    )
     assert thin.counts["width"] == 20
     assert (
         thin.minimum_space_nm == 49
@@ -268,7 +272,9 @@ def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
     top.shapes(layer).insert(plate)
     path = tmp_path / "m.gds"
     made.write(str(path))
-    report = check_library(read(path), Rules(minimum_gap_nm=90, minimum_feature_nm=90))
+    report = check_library(
+        read_mask(path), DesignRules(minimum_gap_nm=90, minimum_feature_nm=90)
+    )
     assert report.counts["notch"] == 1
     assert report.counts["width"] == 0
     assert plate.notch_check(
@@ -294,7 +300,7 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
         'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 20\n'
     )
     rules = processes.load(process)
-    plan = build.prepare(DiameterMap(size, 0.3), rules, furniture="none").plan
+    plan = build.prepare_mask(DiameterMap(size, 0.3), rules, furniture="none").plan
     layout.write_oasis(plan, tmp_path / "m.oas")
     planned = check_plan(plan, rules.rules)
     assert (
@@ -320,7 +326,7 @@ def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
         'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n'
     )
     rules = processes.load(process)
-    plan = build.prepare(DiameterMap(size, 0.33), rules, furniture="none").plan
+    plan = build.prepare_mask(DiameterMap(size, 0.33), rules, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
     assert check_plan(plan, rules.rules).ok
     assert (
@@ -357,12 +363,14 @@ def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
         )
     path = tmp_path / "m.gds"
     made.write(str(path))
-    report = check_library(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=119))
+    report = check_library(
+        read_mask(path), DesignRules(minimum_gap_nm=70, minimum_feature_nm=119)
+    )
     assert report.ok
     assert 119 < report.minimum_width_nm < 123
     assert (
         check_library(
-            read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)
+            read_mask(path), DesignRules(minimum_gap_nm=70, minimum_feature_nm=124)
         ).counts["width"]
         == 3
     )
@@ -386,6 +394,6 @@ def test_a_polygon_without_area_draws_nothing(flat):
     box = np.array([[0, 0], [500, 0], [500, 400], [0, 400]])
     for drawn in ([box], []):
         cell = CellContent("T", {(1, 0): [*drawn, np.array(flat)]})
-        report = check_library(MaskContent("GDSII", 1.0, {"T": cell}), Rules())
+        report = check_library(MaskContent("GDSII", 1.0, {"T": cell}), DesignRules())
         assert report.ok == bool(drawn)  # nothing checked is not passed
         assert report.minimum_width_nm == (400 if drawn else math.inf)

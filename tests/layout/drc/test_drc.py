@@ -12,11 +12,17 @@ from hypothesis import strategies as st
 
 from layout.drc import check_plan
 from layout.drc.report import DrcReport
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, pillar_classes
-from layout.process.process import Rules, Zone
+from layout.mask.plan import (
+    FigureCell,
+    MaskPlan,
+    PillarClass,
+    PillarLattice,
+    pillar_classes,
+)
+from layout.process.process import DesignRules, KeepOutZone
 from layout.shapes import convex, polygon
 
-LOOSE = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
+LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
 
 
 def plan_of(diameters, classes, *, pitch=400, vertices=16):
@@ -28,7 +34,7 @@ def plan_of(diameters, classes, *, pitch=400, vertices=16):
         vertices=vertices,
         shape="round",
     )
-    lattice = Lattice.of(
+    lattice = PillarLattice.of(
         "LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000
     )
     return MaskPlan("TOP", made, (lattice,))
@@ -92,7 +98,7 @@ def klayout_findings(plan, rules):
 def agree(size, seeds, seed):
     plan, rules = (
         seeded(size, seeds, seed),
-        Rules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1),
+        DesignRules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1),
     )
     found = check_plan(plan, rules)
     close, thin = klayout_findings(plan, rules)
@@ -123,7 +129,7 @@ def test_gap_is_the_least_of_all_pairs_by_brute_force(rows):
     plan = plan_of([100, 180, 240, 300, 350, 390], rows)
     found = check_plan(plan, LOOSE)
     gaps = [
-        convex.gap(
+        convex.convex_gap(
             plan.classes[k - 1].outline, plan.classes[m - 1].outline, u - x, v - y
         )
         for (x, y, k), (u, v, m) in itertools.combinations(sites(plan), 2)
@@ -151,7 +157,7 @@ def test_overlap_and_touch_are_found_with_their_place():
     touching = MaskPlan(
         "T",
         (PillarClass("A", 450.0, 450, (1, 0), square),),
-        (Lattice.of("L", np.ones((1, 2), np.uint8), pitch=400, x0=0, y0=0),),
+        (PillarLattice.of("L", np.ones((1, 2), np.uint8), pitch=400, x0=0, y0=0),),
     )
     assert check_plan(touching, LOOSE).minimum_space_nm == 0
     assert not check_plan(touching, LOOSE).ok
@@ -161,12 +167,13 @@ def test_a_rule_as_wide_as_two_pitches_looks_at_second_neighbours():
     plan = plan_of([100], [[1, 0, 1]], pitch=200)
     assert (
         check_plan(
-            plan, Rules(minimum_gap_nm=310, minimum_feature_nm=1, maximum_density=1)
+            plan,
+            DesignRules(minimum_gap_nm=310, minimum_feature_nm=1, maximum_density=1),
         ).counts["space"]
         == 1
     )
     assert check_plan(
-        plan, Rules(minimum_gap_nm=290, minimum_feature_nm=1, maximum_density=1)
+        plan, DesignRules(minimum_gap_nm=290, minimum_feature_nm=1, maximum_density=1)
     ).ok
 
 
@@ -180,12 +187,13 @@ def test_off_grid_vertices_and_sites_are_found():
 def test_density_is_the_share_of_the_window():
     plan = plan_of([300], np.ones((60, 60)))
     found = check_plan(
-        plan, Rules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8)
+        plan,
+        DesignRules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8),
     )
     share = polygon.twice_area(plan.classes[0].outline) / 2 / 400**2
     assert found.maximum_density == pytest.approx(share, rel=1e-12)
     assert found.counts["density"] > 0
-    assert check_plan(plan, Rules(minimum_feature_nm=1, maximum_density=0.45)).ok
+    assert check_plan(plan, DesignRules(minimum_feature_nm=1, maximum_density=0.45)).ok
 
 
 @given(
@@ -196,7 +204,7 @@ def test_density_is_the_share_of_the_window():
 )
 def test_exclusion_zones_agree_with_klayout(x, y, w, h):
     db = pytest.importorskip("klayout.db")
-    zone = Zone(
+    zone = KeepOutZone(
         round(x, 3), round(y, 3), max(round(w, 3), 0.001), max(round(h, 3), 0.001)
     )
     plan = plan_of([120, 260], np.indices((9, 9)).sum(0) % 3)
@@ -224,7 +232,7 @@ def test_exclusion_zones_agree_with_klayout(x, y, w, h):
             shape.transformed(db.ICplxTrans(1000))
             & box.transformed(db.ICplxTrans(1000))
         ).is_empty()
-    rules = Rules(
+    rules = DesignRules(
         minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, exclusion=(zone,)
     )
     assert check_plan(plan, rules).counts["exclusion"] == inside
@@ -233,7 +241,7 @@ def test_exclusion_zones_agree_with_klayout(x, y, w, h):
 def test_structures_that_meet_are_found(make_plan):
     plan = make_plan()
     again = plan.lattices[0]
-    other = Lattice.of(
+    other = PillarLattice.of(
         "OTHER", np.ones((2, 2), np.uint8), pitch=400, x0=again.x0 + 300, y0=again.y0
     )
     found = check_plan(plan.replace(lattices=(again, other)), LOOSE)
@@ -241,24 +249,26 @@ def test_structures_that_meet_are_found(make_plan):
 
 
 def test_width_of_a_regular_polygon_and_of_a_triangle():
-    octagon = polygon.pillar(1000, vertices=8).points
-    assert convex.width(octagon) == pytest.approx(
+    octagon = polygon.pillar_polygon(1000, vertices=8).points
+    assert convex.least_width(octagon) == pytest.approx(
         min(2 * octagon[:, 0].max(), abs(octagon @ (1, 1)).max() * math.sqrt(2))
     )
-    assert convex.width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(
+    assert convex.least_width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(
         12 / 5
     )  # height on the hypotenuse
 
 
 def test_summary_says_what_was_found():
-    report = check_plan(plan_of([200, 380], [[1, 2, 2]]), Rules(minimum_gap_nm=70))
+    report = check_plan(
+        plan_of([200, 380], [[1, 2, 2]]), DesignRules(minimum_gap_nm=70)
+    )
     assert isinstance(report, DrcReport)
     assert "space" in report.summary
     assert "3 shapes" in report.summary
     assert (
         "2,500 shapes"
         in check_plan(
-            plan_of([200], np.full((50, 50), 1)), Rules(minimum_gap_nm=70)
+            plan_of([200], np.full((50, 50), 1)), DesignRules(minimum_gap_nm=70)
         ).summary
     )
 
@@ -290,10 +300,10 @@ def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
         ]
     )
     figures = tuple(
-        Figure("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)})
+        FigureCell("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)})
         for shape in (cross, slot)
     )
-    rules = Rules(minimum_feature_nm=80, minimum_gap_nm=70, maximum_density=1)
+    rules = DesignRules(minimum_feature_nm=80, minimum_gap_nm=70, maximum_density=1)
     before = check_plan(plan, rules)
     thin, narrow = (
         check_plan(plan.replace(figures=(figure,)), rules) for figure in figures
@@ -314,7 +324,7 @@ def test_feet_that_nearly_meet_are_found():
     found = check_plan(plan, LOOSE, foot_nm=feet)
     assert found.minimum_foot_space_nm == pytest.approx(400 - (241 + 305) / 2)
     assert found.counts["foot"] == 0
-    tight = Rules(
+    tight = DesignRules(
         minimum_feature_nm=1,
         minimum_gap_nm=1,
         maximum_density=1,
@@ -336,7 +346,7 @@ def test_a_gap_across_either_diagonal_is_found(corner):
     classes[row + 1 - corner[0], column + 1 - corner[1]] = 1
     found = check_plan(
         plan_of([546], classes, vertices=32),
-        Rules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1),
+        DesignRules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1),
     )
     assert found.counts["space"] == 1
     assert found.minimum_space_nm == pytest.approx(

@@ -78,6 +78,8 @@ def test_convex_ones_are_as_far_apart_as_lines_between_them_say():
     edges = [contour_edges([shape]) for shape in shapes]
     found, _ = measure_separation(edges, one, two, np.column_stack([dx, dy]))
     some = zip(one.tolist(), two.tolist(), dx.tolist(), dy.tolist(), strict=True)
-    wanted = [max(convex.gap(shapes[a], shapes[b], x, y), 0.0) for a, b, x, y in some]
+    wanted = [
+        max(convex.convex_gap(shapes[a], shapes[b], x, y), 0.0) for a, b, x, y in some
+    ]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
     assert 30 < np.count_nonzero(found == 0) < 300

@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 
 from layout.formats import (
     QUARTERS,
-    Assembly,
     CellContent,
-    Copies,
-    Placed,
-    Turn,
-    arrays,
+    CellCopies,
+    CellPlacements,
+    MaskAssembly,
+    Orientation,
+    find_arrays,
     gdsii_read,
     gdsii_write,
     oasis_read,
     oasis_write,
 )
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 WRITERS = {
     ".gds": (gdsii_write.write, gdsii_read.read),
@@ -58,7 +58,7 @@ def expanded(made):
 
 
 def placements(child, x, y, turn):
-    return Placed(
+    return CellPlacements(
         ("A", "B"),
         *(np.asarray(v, np.int32) for v in (child, x, y)),
         np.asarray(turn, np.uint8),
@@ -82,7 +82,7 @@ def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
     placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
     cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in placed.children}
     write(
-        Assembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}),
+        MaskAssembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}),
         tmp_path / f"a{suffix}",
     )
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
@@ -93,9 +93,9 @@ def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
 def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_path):
     """Beyond the eight quarter turns 300 angles, more than a byte numbers."""
     write, read = WRITERS[suffix]
-    turns = (*QUARTERS, *(Turn(0.5 + n / 4) for n in range(300)))
+    turns = (*QUARTERS, *(Orientation(0.5 + n / 4) for n in range(300)))
     x = 7 * np.arange(308, dtype=np.int32)
-    placed = Placed(
+    placed = CellPlacements(
         ("A",),
         np.zeros(308, np.int32),
         x,
@@ -107,7 +107,7 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
         "A": CellContent("A", {(1, 0): [BAR]}),
         "TOP": CellContent("TOP", placed=placed),
     }
-    write(Assembly("TOP", cells, {}), tmp_path / f"a{suffix}")
+    write(MaskAssembly("TOP", cells, {}), tmp_path / f"a{suffix}")
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
     for got, want in zip(
         sorted(listed(found), key=sort_key),
@@ -134,7 +134,7 @@ def test_arrays_and_what_is_left_are_all_copies_and_none_twice(seed, shape, loos
     child, turn = (np.r_[np.full(len(i), k), rng.integers(0, 2, loose)] for k in (1, 0))
     order = rng.permutation(len(x))
     placed = placements(child[order], x[order], y[order], turn[order])
-    made, left = arrays(placed)
+    made, left = find_arrays(placed)
     assert sorted(expanded(made) + listed(left), key=sort_key) == sorted(
         listed(placed), key=sort_key
     )
@@ -144,18 +144,20 @@ def test_arrays_and_what_is_left_are_all_copies_and_none_twice(seed, shape, loos
 def test_a_raster_becomes_one_array_however_it_was_listed():
     i, j = (v.ravel() for v in np.meshgrid(np.arange(7), np.arange(5)))
     order = np.random.default_rng(2).permutation(35)
-    made, left = arrays(
+    made, left = find_arrays(
         placements(
             np.ones(35), (11 - 31 * i)[order], (5 + 43 * j)[order], np.full(35, 6)
         )
     )
-    assert made == (Copies("B", 11 - 31 * 6, 5, QUARTERS[6], 7, 5, (31, 0), (0, 43)),)
+    assert made == (
+        CellCopies("B", 11 - 31 * 6, 5, QUARTERS[6], 7, 5, (31, 0), (0, 43)),
+    )
     assert not len(left.child)
 
 
 def assembly():
-    turns = (*QUARTERS, Turn(33.5, True, 1.5), Turn(211.25))
-    loose = Placed(
+    turns = (*QUARTERS, Orientation(33.5, True, 1.5), Orientation(211.25))
+    loose = CellPlacements(
         ("A", "B"),
         np.array([0, 1, 0, 1, 1], np.int32),
         np.array([5, -700, 5, 2**30, 12], np.int32),
@@ -169,11 +171,11 @@ def assembly():
         "TOP": CellContent("TOP", placed=loose),
     }
     copies = (
-        Copies("A", 5, -6, QUARTERS[5], 3, 4, (0, 1000), (-700, 30)),
-        Copies("B", 60_000, -8, Turn(17.0), 1, 9, (0, 0), (0, -4100)),
-        Copies("B", -60_000, 1),
+        CellCopies("A", 5, -6, QUARTERS[5], 3, 4, (0, 1000), (-700, 30)),
+        CellCopies("B", 60_000, -8, Orientation(17.0), 1, 9, (0, 0), (0, -4100)),
+        CellCopies("B", -60_000, 1),
     )
-    return Assembly("TOP", cells, {"TOP": copies}, layer_names={(1, 0): "pillar"})
+    return MaskAssembly("TOP", cells, {"TOP": copies}, layer_names={(1, 0): "pillar"})
 
 
 @pytest.mark.parametrize("end", [".gds", ".oas"])
@@ -232,16 +234,20 @@ def test_files_do_not_grow_with_copies(tmp_path):
     for end, (write, _) in WRITERS.items():
         sizes = []
         for side in (3, 300):
-            many = Copies("A", 7, -3, QUARTERS[2], side, side + 1, (100, 0), (0, 130))
-            write(Assembly("TOP", cells, {"TOP": (many,)}), tmp_path / f"{side}{end}")
+            many = CellCopies(
+                "A", 7, -3, QUARTERS[2], side, side + 1, (100, 0), (0, 130)
+            )
+            write(
+                MaskAssembly("TOP", cells, {"TOP": (many,)}), tmp_path / f"{side}{end}"
+            )
             sizes.append((tmp_path / f"{side}{end}").stat().st_size)
         assert sizes[1] - sizes[0] <= 4  # a few digits of two numbers
 
 
 def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
     cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
-    long = Assembly(
-        "TOP", cells, {"TOP": (Copies("A", 0, 0, columns=32768, across=(30, 0)),)}
+    long = MaskAssembly(
+        "TOP", cells, {"TOP": (CellCopies("A", 0, 0, columns=32768, across=(30, 0)),)}
     )
     with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
         gdsii_write.write(long, tmp_path / "m.gds")

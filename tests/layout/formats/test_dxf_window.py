@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.formats.dxf import Window, sites_in
-from layout.mask.plan import Lattice, MaskPlan, PillarClass
+from layout.formats.dxf import DxfWindow, sites_in
+from layout.mask.plan import MaskPlan, PillarClass, PillarLattice
 
 SQUARE = np.array([[-60, -60], [60, -60], [60, 60], [-60, 60]])
 RNG = np.random.default_rng(7)
@@ -27,7 +27,7 @@ def test_sites_in_a_window_are_those_between_its_sides(x_um, y_um, size_um):
     """Units of 2 nm, rows of another distance than columns; left and upper sides belong
     to the window.
     """
-    lattice = Lattice.of(
+    lattice = PillarLattice.of(
         "LENS", RNG.integers(0, 3, (9, 13)).astype(np.uint8), pitch=170, x0=-230, y0=205
     )
     lattice = dataclasses.replace(lattice, row_pitch=145)
@@ -38,4 +38,6 @@ def test_sites_in_a_window_are_those_between_its_sides(x_um, y_um, size_um):
         x, y = -230 + 170 * column, 205 - 145 * row
         if -half <= x - x_um * 500 < half and -half < y - y_um * 500 <= half:
             want.append((int(lattice.array[row, column]), x, y))
-    assert sorted(sites_in(plan, lattice, Window(x_um, y_um, size_um))) == sorted(want)
+    assert sorted(sites_in(plan, lattice, DxfWindow(x_um, y_um, size_um))) == sorted(
+        want
+    )

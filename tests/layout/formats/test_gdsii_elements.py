@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands.check import read
+from layout.commands.check import read_mask
 from layout.formats import flatten
 from metalens import cli
 
@@ -72,7 +72,9 @@ def reference(name, x, y, *transform):
 def region_of(db, file):
     own = db.Region()
     content = layout.read_gdsii(file)
-    for shape in (s for top in content.tops for s in flatten.shapes(content, top)):
+    for shape in (
+        s for top in content.tops for s in flatten.flatten_shapes(content, top)
+    ):
         for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True):
             corners = [db.Point(int(a) + x, int(b) + y) for a, b in shape.outline]
             own.insert(db.Polygon(corners))
@@ -205,7 +207,7 @@ def test_a_path_of_a_moving_stage_is_read_with_its_width(tmp_path):
     )  # fmt: skip
     file = tmp_path / "raith.gds"
     file.write_bytes(library(structure(b"AA", element)))
-    (outline,) = read(file).cells["AA"].polygons[1, 2]
+    (outline,) = read_mask(file).cells["AA"].polygons[1, 2]
     assert np.ptp(outline, axis=0).tolist() == [300, 60]
     assert cli.main(["check", str(file)]) == 1  # 60 nm wide, the default needs 80
 

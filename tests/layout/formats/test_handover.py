@@ -11,10 +11,12 @@ import pytest
 import layout
 from layout.formats import doses, handover
 from layout.mask import fields
-from layout.process.process import Die, Exposure, Process, WriteField
+from layout.process.process import DieSettings, ExposureSettings, Process, WriteField
 from metalens.lens.record import DiameterMap
 
-PROCESS = Process(exposure=Exposure(base_uC_cm2=370.0), write_field=WriteField(7.3))
+PROCESS = Process(
+    exposure=ExposureSettings(base_uC_cm2=370.0), write_field=WriteField(7.3)
+)
 
 
 def lens_map():
@@ -26,12 +28,14 @@ def lens_map():
 
 @pytest.fixture(scope="module")
 def made():
-    return layout.plan(lens_map(), PROCESS), fields.split(lens_map(), PROCESS)
+    return layout.plan(lens_map(), PROCESS), fields.split_write_fields(
+        lens_map(), PROCESS
+    )
 
 
 def test_fields_go_row_by_row_and_back_and_hold_every_pillar_once(made, tmp_path):
     source, split = lens_map(), made[1]
-    steps = handover.sequence(split)
+    steps = handover.field_sequence(split)
     assert len(steps) == split.used < split.pillars.size
     assert [s.sequence for s in steps] == list(range(1, len(steps) + 1))
     rows = [[s for s in steps if s.y_um == y] for y in sorted({s.y_um for s in steps})]
@@ -98,16 +102,16 @@ def test_the_charge_is_dose_times_area(made):
     [
         {},
         {"tone": "negative"},
-        {"exposure": Exposure(alpha_um=0.01, beta_um=8, eta=0.7)},
+        {"exposure": ExposureSettings(alpha_um=0.01, beta_um=8, eta=0.7)},
     ],
 )
 def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
     process = dataclasses.replace(
-        PROCESS, die=Die(mark_um=80.0, mark_width_um=4.0), **change
+        PROCESS, die=DieSettings(mark_um=80.0, mark_width_um=4.0), **change
     )
     from layout.mask import build
 
-    plan = build.prepare(lens_map(), process).plan
+    plan = build.prepare_mask(lens_map(), process).plan
     marks = handover.marks_um(plan)
     crosses = [m for m in marks if m[2:] == (80.0, 80.0)]
     assert len(marks) == 9  # four crosses, coarse and fine, and the F
@@ -152,4 +156,4 @@ def test_a_dose_table_that_an_editor_saved_is_read(tmp_path):
     path.write_text(
         "layer,datatype,relative_dose\n7,3,1.375\n2,0,0.9\n", encoding="utf-8-sig"
     )
-    assert doses.read(path) == {(7, 3): 1.375, (2, 0): 0.9}
+    assert doses.read_dose_table(path) == {(7, 3): 1.375, (2, 0): 0.9}

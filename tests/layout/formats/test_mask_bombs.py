@@ -13,50 +13,59 @@ from layout.drc import check_library
 from layout.formats import gdsii_read, hierarchy, oasis_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
-from layout.process import Rules
+from layout.process import DesignRules
 from metalens import cli
-from metalens.ground.errors import MaskFileError
+from metalens.core.errors import MaskFileError
 
 MOST_BYTES = 60e6  # of Python and numpy; the limits of the test itself are small
 
 
-LEAF = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, 9) + gds.shorts(gds.DATATYPE, 3)
-LEAF += gds.points(np.array([[0, 0], [500, 0], [0, 600], [0, 0]])) + gds.record(
-    gds.ENDEL
+LEAF = (
+    gds.gdsii_record(gds.BOUNDARY)
+    + gds.integer_record(gds.LAYER, 9)
+    + gds.integer_record(gds.DATATYPE, 3)
 )
+LEAF += gds.xy_record(
+    np.array([[0, 0], [500, 0], [0, 600], [0, 0]])
+) + gds.gdsii_record(gds.ENDEL)
 
 
 def structure(name, *elements):
     return (
-        gds.shorts(gds.BGNSTR, *[0] * 12)
-        + gds.text(gds.STRNAME, name)
+        gds.integer_record(gds.BGNSTR, *[0] * 12)
+        + gds.text_record(gds.STRNAME, name)
         + b"".join(elements)
-        + gds.record(gds.ENDSTR)
+        + gds.gdsii_record(gds.ENDSTR)
     )
 
 
 def array(child, columns, rows, step=(1000, 900)):
     corners = np.array([[0, 0], [columns * step[0], 0], [0, rows * step[1]]])
     body = (
-        gds.record(gds.AREF)
-        + gds.text(gds.SNAME, child)
-        + gds.shorts(gds.COLROW, columns, rows)
+        gds.gdsii_record(gds.AREF)
+        + gds.text_record(gds.SNAME, child)
+        + gds.integer_record(gds.COLROW, columns, rows)
     )
-    return body + gds.points(corners) + gds.record(gds.ENDEL)
+    return body + gds.xy_record(corners) + gds.gdsii_record(gds.ENDEL)
 
 
 def gdsii(*structures):
     head = (
-        gds.shorts(gds.HEADER, 600)
-        + gds.shorts(gds.BGNLIB, *[0] * 12)
-        + gds.text(gds.LIBNAME, "L")
+        gds.integer_record(gds.HEADER, 600)
+        + gds.integer_record(gds.BGNLIB, *[0] * 12)
+        + gds.text_record(gds.LIBNAME, "L")
     )
-    head += gds.record(gds.UNITS, gds.real(1e-3) + gds.real(1e-9))
-    return head + structure("A", LEAF) + b"".join(structures) + gds.record(gds.ENDLIB)
+    head += gds.gdsii_record(gds.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9))
+    return (
+        head
+        + structure("A", LEAF)
+        + b"".join(structures)
+        + gds.gdsii_record(gds.ENDLIB)
+    )
 
 
 def grid(columns, rows, step):
-    return b"".join(map(oasis.unsigned, (1, columns - 2, rows - 2, step, step)))
+    return b"".join(map(oasis.unsigned_integer, (1, columns - 2, rows - 2, step, step)))
 
 
 def placement(child, repetition):
@@ -66,20 +75,20 @@ def placement(child, repetition):
 def rectangle(repetition):
     return (
         bytes([oasis.RECTANGLE, 0x67, 7, 3])
-        + oasis.unsigned(60)
-        + oasis.unsigned(50)
+        + oasis.unsigned_integer(60)
+        + oasis.unsigned_integer(50)
         + repetition
     )
 
 
 def oasis_file(*cells):
-    body = oasis.start(1.0) + b"".join(
-        bytes([oasis.CELLNAME]) + oasis.string(f"C{n}") for n in range(len(cells))
+    body = oasis.start_record(1.0) + b"".join(
+        bytes([oasis.CELLNAME]) + oasis.oasis_string(f"C{n}") for n in range(len(cells))
     )
     body += b"".join(
         bytes([oasis.CELL_REF, n]) + records for n, records in enumerate(cells)
     )
-    return body + oasis.end((0,) * 6, zlib.crc32(body))
+    return body + oasis.end_record((0,) * 6, zlib.crc32(body))
 
 
 def block(records):
@@ -87,8 +96,8 @@ def block(records):
     packed = engine.compress(records) + engine.flush()
     return (
         bytes([34, 0])
-        + oasis.unsigned(len(records))
-        + oasis.unsigned(len(packed))
+        + oasis.unsigned_integer(len(records))
+        + oasis.unsigned_integer(len(packed))
         + packed
     )
 
@@ -152,7 +161,11 @@ def test_memory_is_not_taken_before_the_count(tmp_path):
         for name, (data, _) in BOMBS.items():
             if name in ("packed.oas", "circle.gds", "nested.gds"):
                 continue
-            read = gdsii_read.parse if name.endswith("gds") else oasis_read.parse
+            read = (
+                gdsii_read.parse_gdsii
+                if name.endswith("gds")
+                else oasis_read.parse_oasis
+            )
             with pytest.raises(MaskFileError, match="at most"):
                 read(np.frombuffer(data, np.uint8), limit=100_000)
         assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
@@ -166,7 +179,7 @@ def test_arrays_are_summed_in_bounded_memory():
     )
     tracemalloc.start()
     try:
-        sums = gdsii_read.parse(data, keep=1000).cells["TOP"].sums
+        sums = gdsii_read.parse_gdsii(data, keep=1000).cells["TOP"].sums
         assert (
             tracemalloc.get_traced_memory()[1] < 150e6
         )  # a twelfth of the copies at once, 13 to 60 bytes each
@@ -179,13 +192,13 @@ def test_arrays_are_summed_in_bounded_memory():
 
 
 def test_the_number_of_shapes_is_the_product_of_the_arrays():
-    content = gdsii_read.parse(
+    content = gdsii_read.parse_gdsii(
         np.frombuffer(
             gdsii(structure("B", array("A", 9, 8)), structure("TOP", array("B", 7, 3))),
             np.uint8,
         )
     )
-    assert dict(hierarchy.shapes(content)) == {(9, 3): 9 * 8 * 7 * 3}
+    assert dict(hierarchy.count_shapes(content)) == {(9, 3): 9 * 8 * 7 * 3}
     hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3)
     with pytest.raises(MaskFileError, match=r"1,512 shapes.*at most 1,511"):
         hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
@@ -195,7 +208,7 @@ def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
     """Two polygons of a leaf on one layer, drawn five times and seven; a cell that
     nothing places is drawn once.
     """
-    content = gdsii_read.parse(
+    content = gdsii_read.parse_gdsii(
         np.frombuffer(
             gdsii(
                 structure("TWO", LEAF, LEAF),
@@ -204,10 +217,12 @@ def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
             np.uint8,
         )
     )
-    assert hierarchy.shapes(content)[9, 3] == 2 * (5 + 7) + 1
+    assert hierarchy.count_shapes(content)[9, 3] == 2 * (5 + 7) + 1
 
 
 def test_shapes_on_each_other_are_refused_before_they_are_paired():
     data = gdsii(structure("TOP", array("A", 3000, 10, (0, 0))))
     with pytest.raises(MaskFileError, match=r"pairs of shapes.*lie on"):
-        check_library(gdsii_read.parse(np.frombuffer(data, np.uint8)), Rules())
+        check_library(
+            gdsii_read.parse_gdsii(np.frombuffer(data, np.uint8)), DesignRules()
+        )

@@ -17,8 +17,8 @@ import layout
 from layout.formats import gdsii_write, oasis_write
 from layout.formats import oasis_records as oasis_bytes
 from layout.mask import symmetry
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
-from metalens.ground.errors import MaskFileError, ProcessError
+from layout.mask.plan import FigureCell, MaskPlan, PillarClass, PillarLattice
+from metalens.core.errors import MaskFileError, ProcessError
 
 FORMS = [("gds", {}), ("oas", {}), ("oas", {"fold": False})]
 READ = {"gds": layout.read_gdsii, "oas": layout.read_oasis}
@@ -204,7 +204,7 @@ def test_row_blocks_give_the_same_file_as_the_whole_map(
         calls.append((first, end))
         return classes[first:end].copy()
 
-    streamed = Lattice(
+    streamed = PillarLattice(
         whole.name, whole.rows, whole.columns, whole.pitch, whole.x0, whole.y0, rows
     )
     one = write(plan, tmp_path / f"a.{suffix}", options).read_bytes()
@@ -251,7 +251,9 @@ def test_thousands_of_classes(tmp_path, count):
         PillarClass(f"C{n:05}", 80.0, 80, (1, 0), outline) for n in range(count)
     )
     classes = np.arange(1, count + 1, dtype=np.uint16).reshape(15, -1)
-    plan = MaskPlan("TOP", made, (Lattice.of("LENS", classes, pitch=400, x0=0, y0=0),))
+    plan = MaskPlan(
+        "TOP", made, (PillarLattice.of("LENS", classes, pitch=400, x0=0, y0=0),)
+    )
     for suffix in ("gds", "oas"):
         content = READ[suffix](write(plan, tmp_path / f"m.{suffix}", {}))
         assert layout.compare(plan, content).ok
@@ -264,9 +266,11 @@ def test_65536_classes_are_refused(plan):
 
 def test_coordinates_beyond_32_bit_are_refused():
     with pytest.raises(ProcessError, match="beyond 32 bits"):
-        Lattice.of("LENS", np.ones((2, 3), np.uint8), pitch=400, x0=2**31 - 500, y0=0)
+        PillarLattice.of(
+            "LENS", np.ones((2, 3), np.uint8), pitch=400, x0=2**31 - 500, y0=0
+        )
     with pytest.raises(ProcessError, match="beyond 32 bits"):
-        Figure("F", {(1, 0): (np.array([[0, 0], [2**31, 0], [0, 5]]),)})
+        FigureCell("F", {(1, 0): (np.array([[0, 0], [2**31, 0], [0, 5]]),)})
 
 
 def test_polygons_beyond_8190_points_are_refused_by_gdsii_and_the_old_file_stays(
@@ -280,11 +284,11 @@ def test_polygons_beyond_8190_points_are_refused_by_gdsii_and_the_old_file_stays
     path.write_bytes(b"old")
     with pytest.raises(ProcessError, match="8190 vertices"):
         layout.write_gdsii(
-            plan.replace(figures=(Figure("BIG", {(2, 0): (ring,)}),)), path
+            plan.replace(figures=(FigureCell("BIG", {(2, 0): (ring,)}),)), path
         )
     assert path.read_bytes() == b"old"
     layout.write_gdsii(
-        plan.replace(figures=(Figure("BIG", {(2, 0): (ring[:-1],)}),)), path
+        plan.replace(figures=(FigureCell("BIG", {(2, 0): (ring[:-1],)}),)), path
     )
     assert len(layout.read_gdsii(path).cells["BIG"].polygons[2, 0][0]) == 8189
 
@@ -377,7 +381,7 @@ def test_a_moved_pillar_and_another_diameter_are_found(make_plan, tmp_path):
     row, column = np.argwhere(classes == 1)[5]
     classes[row, column] = 2
     other = plan.replace(
-        lattices=(Lattice.of("LENS", classes, pitch=400, x0=-6000, y0=4400),)
+        lattices=(PillarLattice.of("LENS", classes, pitch=400, x0=-6000, y0=4400),)
     )
     place = f"at ({-6000 + 400 * column}, {4400 - 400 * row})"
     wrong = layout.compare(other, layout.read_gdsii(path)).differences
@@ -432,13 +436,13 @@ def test_masks_of_klayout_are_read(tmp_path):
 
 
 def test_reals_and_integers_of_oasis_follow_the_standard():
-    assert oasis_bytes.unsigned(0) == b"\0"
-    assert oasis_bytes.unsigned(300) == b"\xac\x02"
-    assert oasis_bytes.signed(-1) == b"\x03"
-    assert oasis_bytes.real(1000.0) == b"\x00\xe8\x07"
-    assert oasis_bytes.real(0.25) == b"\x02\x04"
+    assert oasis_bytes.unsigned_integer(0) == b"\0"
+    assert oasis_bytes.unsigned_integer(300) == b"\xac\x02"
+    assert oasis_bytes.signed_integer(-1) == b"\x03"
+    assert oasis_bytes.oasis_real(1000.0) == b"\x00\xe8\x07"
+    assert oasis_bytes.oasis_real(0.25) == b"\x02\x04"
     assert (
-        len(oasis_bytes.end((0, 0, 0, 0, 0, 0), 0))
-        == len(oasis_bytes.end((2**40,) * 6, 0))
+        len(oasis_bytes.end_record((0, 0, 0, 0, 0, 0), 0))
+        == len(oasis_bytes.end_record((2**40,) * 6, 0))
         == 256
     )

@@ -11,7 +11,7 @@ import layout
 from layout.formats import flatten, gdsii_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
-from metalens.ground.errors import MaskFileError
+from metalens.core.errors import MaskFileError
 
 db = pytest.importorskip("klayout.db")
 
@@ -19,7 +19,7 @@ db = pytest.importorskip("klayout.db")
 def region_of(content, layer):
     """Everything on a layer, flat, as a region of KLayout."""
     found = db.Region()
-    for shape in flatten.shapes(content, content.tops[0]):
+    for shape in flatten.flatten_shapes(content, content.tops[0]):
         if shape.layer == layer:
             for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True):
                 found.insert(
@@ -122,47 +122,48 @@ def test_any_turn_and_magnification_nested_and_in_arrays(tmp_path, suffix):
 
 def gdsii(*elements):
     head = (
-        gds.shorts(gds.HEADER, 600)
-        + gds.shorts(gds.BGNLIB, *[0] * 12)
-        + gds.text(gds.LIBNAME, "L")
+        gds.integer_record(gds.HEADER, 600)
+        + gds.integer_record(gds.BGNLIB, *[0] * 12)
+        + gds.text_record(gds.LIBNAME, "L")
     )
-    head += gds.record(gds.UNITS, gds.real(1e-3) + gds.real(1e-9))
+    head += gds.gdsii_record(gds.UNITS, gds.gdsii_real(1e-3) + gds.gdsii_real(1e-9))
     leaf = (
-        gds.shorts(gds.BGNSTR, *[0] * 12)
-        + gds.text(gds.STRNAME, "A")
-        + gds.record(gds.BOUNDARY)
+        gds.integer_record(gds.BGNSTR, *[0] * 12)
+        + gds.text_record(gds.STRNAME, "A")
+        + gds.gdsii_record(gds.BOUNDARY)
     )
-    leaf += gds.shorts(gds.LAYER, 7) + gds.shorts(gds.DATATYPE, 3)
+    leaf += gds.integer_record(gds.LAYER, 7) + gds.integer_record(gds.DATATYPE, 3)
     leaf += (
-        gds.points(np.array([[0, 0], [50, 0], [0, 60], [0, 0]]))
-        + gds.record(gds.ENDEL)
-        + gds.record(gds.ENDSTR)
+        gds.xy_record(np.array([[0, 0], [50, 0], [0, 60], [0, 0]]))
+        + gds.gdsii_record(gds.ENDEL)
+        + gds.gdsii_record(gds.ENDSTR)
     )
     top = (
-        gds.shorts(gds.BGNSTR, *[0] * 12)
-        + gds.text(gds.STRNAME, "TOP")
+        gds.integer_record(gds.BGNSTR, *[0] * 12)
+        + gds.text_record(gds.STRNAME, "TOP")
         + b"".join(elements)
     )
     return np.frombuffer(
-        head + leaf + top + gds.record(gds.ENDSTR) + gds.record(gds.ENDLIB), np.uint8
+        head + leaf + top + gds.gdsii_record(gds.ENDSTR) + gds.gdsii_record(gds.ENDLIB),
+        np.uint8,
     )
 
 
 def aref(columns, rows, *corners):
     body = (
-        gds.record(gds.AREF)
-        + gds.text(gds.SNAME, "A")
-        + gds.shorts(gds.COLROW, columns, rows)
+        gds.gdsii_record(gds.AREF)
+        + gds.text_record(gds.SNAME, "A")
+        + gds.integer_record(gds.COLROW, columns, rows)
     )
-    return body + gds.points(np.array(corners)) + gds.record(gds.ENDEL)
+    return body + gds.xy_record(np.array(corners)) + gds.gdsii_record(gds.ENDEL)
 
 
 def test_arrays_off_the_grid_stand_next_to_their_places():
-    x, _ = gdsii_read.parse(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))).sites(
+    x, _ = gdsii_read.parse_gdsii(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))).sites(
         "TOP"
     )["A"]
     assert x.tolist() == [0, 333, 667]
-    x, y = gdsii_read.parse(
+    x, y = gdsii_read.parse_gdsii(
         gdsii(aref(2, 3, (7, 9), (7 + 41, 9 - 13), (7 + 20, 9 + 100)))
     ).sites("TOP")["A"]
     exact = {
@@ -175,7 +176,7 @@ def test_arrays_off_the_grid_stand_next_to_their_places():
     assert all(
         min(max(abs(u - p), abs(v - q)) for p, q in found) <= 0.5 for u, v in exact
     )
-    x, _ = gdsii_read.parse(gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))).sites(
+    x, _ = gdsii_read.parse_gdsii(gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))).sites(
         "TOP"
     )["A"]
     assert x.tolist() == [5, 338, 671]
@@ -183,11 +184,11 @@ def test_arrays_off_the_grid_stand_next_to_their_places():
 
 def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
     far = (
-        gds.record(gds.SREF)
-        + gds.text(gds.SNAME, "A")
-        + gds.points(np.array([[2**31 - 20, 0]]))
+        gds.gdsii_record(gds.SREF)
+        + gds.text_record(gds.SNAME, "A")
+        + gds.xy_record(np.array([[2**31 - 20, 0]]))
     )
-    content = gdsii_read.parse(gdsii(far + gds.record(gds.ENDEL)))
+    content = gdsii_read.parse_gdsii(gdsii(far + gds.gdsii_record(gds.ENDEL)))
     nested = content.cells["TOP"].placed
     content.cells["OUTER"] = type(content.cells["TOP"])(
         "OUTER",
@@ -200,22 +201,24 @@ def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
     with pytest.raises(MaskFileError, match="32 bits"):
         content.sites("OUTER")
     with pytest.raises(MaskFileError, match="32 bits"):
-        list(flatten.shapes(content, "OUTER"))
+        list(flatten.flatten_shapes(content, "OUTER"))
 
 
 def oasis_file(*records):
-    name = bytes([oasis.CELLNAME]) + oasis.string("TOP")
-    body = oasis.start(1.0) + name + bytes([oasis.CELL_REF, 0]) + b"".join(records)
-    return body + oasis.end((0,) * 6, __import__("zlib").crc32(body))
+    name = bytes([oasis.CELLNAME]) + oasis.oasis_string("TOP")
+    body = (
+        oasis.start_record(1.0) + name + bytes([oasis.CELL_REF, 0]) + b"".join(records)
+    )
+    return body + oasis.end_record((0,) * 6, __import__("zlib").crc32(body))
 
 
 def compact(kind, w, h):
-    size = oasis.unsigned(w) + oasis.unsigned(h)
+    size = oasis.unsigned_integer(w) + oasis.unsigned_integer(h)
     return (
         bytes([oasis.CTRAPEZOID, 0xFB, 7, 3, kind])
         + size
-        + oasis.signed(11)
-        + oasis.signed(-5)
+        + oasis.signed_integer(11)
+        + oasis.signed_integer(-5)
     )
 
 
@@ -234,16 +237,16 @@ def test_compact_trapezoids(tmp_path, kind):
 def test_trapezoids(tmp_path, upright, kind, slopes):
     info = (
         bytes([kind, 0x7B | upright << 7, 7, 3])
-        + oasis.unsigned(700)
-        + oasis.unsigned(500)
+        + oasis.unsigned_integer(700)
+        + oasis.unsigned_integer(500)
     )
     path = tmp_path / "t.oas"
     path.write_bytes(
         oasis_file(
             info
-            + b"".join(map(oasis.signed, slopes))
-            + oasis.signed(-40)
-            + oasis.signed(9)
+            + b"".join(map(oasis.signed_integer, slopes))
+            + oasis.signed_integer(-40)
+            + oasis.signed_integer(9)
         )
     )
     assert agrees(path)

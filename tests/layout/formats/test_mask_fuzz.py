@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands.validate import validate
-from layout.formats import Assembly, CellContent, gdsii_read, oasis_read
+from layout.commands.validate import validate_mask
+from layout.formats import CellContent, MaskAssembly, gdsii_read, oasis_read
 from layout.formats import gdsii_write as assemble
 from metalens import cli
-from metalens.ground.errors import MaskFileError
+from metalens.core.errors import MaskFileError
 
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
 READ = {"gds": gdsii_read.read, "oas": oasis_read.read}
-PARSE = {"gds": gdsii_read.parse, "oas": oasis_read.parse}
+PARSE = {"gds": gdsii_read.parse_gdsii, "oas": oasis_read.parse_oasis}
 FORMS = [
     ("gds", {}),
     ("oas", {}),
@@ -127,16 +127,23 @@ def test_an_empty_file_is_refused(tmp_path):
 def test_a_bomb_of_copies_is_refused(tmp_path):
     from layout.formats import oasis_records as oasis
 
-    matrix = b"\x01" + oasis.unsigned(2**40) + oasis.unsigned(2**40) + b"\x01\x01"
+    matrix = (
+        b"\x01"
+        + oasis.unsigned_integer(2**40)
+        + oasis.unsigned_integer(2**40)
+        + b"\x01\x01"
+    )
     body = (
         bytes([oasis.CELL])
-        + oasis.string("T")
+        + oasis.oasis_string("T")
         + bytes([oasis.PLACEMENT, 0xB8])
-        + oasis.string("U")
+        + oasis.oasis_string("U")
         + b"\0\0"
         + matrix
     )
-    (tmp_path / "b.oas").write_bytes(oasis.start(1.0) + body + oasis.end((0,) * 6, 0))
+    (tmp_path / "b.oas").write_bytes(
+        oasis.start_record(1.0) + body + oasis.end_record((0,) * 6, 0)
+    )
     with pytest.raises(MaskFileError, match=r"copies, at most 16,777,216 more"):
         layout.read_oasis(tmp_path / "b.oas")
 
@@ -145,9 +152,14 @@ def test_a_bomb_of_zeros_is_refused(tmp_path):
     from layout.formats import oasis_records as oasis
 
     block = (
-        bytes([oasis.CBLOCK, 0]) + oasis.unsigned(2**45) + oasis.unsigned(3) + b"abc"
+        bytes([oasis.CBLOCK, 0])
+        + oasis.unsigned_integer(2**45)
+        + oasis.unsigned_integer(3)
+        + b"abc"
     )
-    (tmp_path / "z.oas").write_bytes(oasis.start(1.0) + block + oasis.end((0,) * 6, 0))
+    (tmp_path / "z.oas").write_bytes(
+        oasis.start_record(1.0) + block + oasis.end_record((0,) * 6, 0)
+    )
     with pytest.raises(MaskFileError, match="compressed block of 3 bytes"):
         layout.read_oasis(tmp_path / "z.oas")
 
@@ -158,7 +170,7 @@ def test_own_masks_pass_the_validator(plan, tmp_path, suffix, options):
     (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
         plan, path, **options
     )
-    assert validate(path) == []
+    assert validate_mask(path) == []
 
 
 def test_the_validator_says_what_is_wrong(plan, tmp_path):
@@ -166,14 +178,14 @@ def test_the_validator_says_what_is_wrong(plan, tmp_path):
     layout.write_oasis(plan, path)
     data = path.read_bytes()
     path.write_bytes(data[:-300])
-    (finding,) = validate(path)
+    (finding,) = validate_mask(path)
     assert finding.byte >= 0
     db = pytest.importorskip("klayout.db")
     other = db.Layout()
     for name in ("ONE", "TWO", "odd name"):
         other.create_cell(name)
     other.write(str(tmp_path / "k.gds"))
-    texts = [finding.text for finding in validate(tmp_path / "k.gds")]
+    texts = [finding.text for finding in validate_mask(tmp_path / "k.gds")]
     assert any("top cells" in text for text in texts)
 
 
@@ -187,7 +199,7 @@ def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
     assert first == (0 if values["ok"] else 1)
     square = np.array([[0, 0], [900, 0], [900, 900], [0, 900]])
     both = {name: CellContent(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
-    assemble.write(Assembly("LIB", both, {}), tmp_path / "m.gds")
+    assemble.write(MaskAssembly("LIB", both, {}), tmp_path / "m.gds")
     assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
     told = capsys.readouterr().out
     assert "keeps the design rules" in told.splitlines()[0]

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from layout.formats import Cursor
+from layout.formats import ByteCursor
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_tiles as tiles
-from layout.formats.oasis_write import vector
-from metalens.ground.errors import MaskFileError
+from layout.formats.oasis_write import g_delta
+from metalens.core.errors import MaskFileError
 
 
 def cursor(data):
     """At the first of some bytes, given as hexadecimal text or as they are."""
     raw = bytes.fromhex(data) if isinstance(data, str) else data
-    return Cursor("FILE", np.frombuffer(raw, np.uint8))
+    return ByteCursor("FILE", np.frombuffer(raw, np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def cursor(data):
     ],
 )
 def test_unsigned_integers_take_seven_bits_a_byte_least_first(value, data):
-    assert oasis.unsigned(value) == bytes.fromhex(data)
+    assert oasis.unsigned_integer(value) == bytes.fromhex(data)
     assert cursor(data).unsigned() == value
     out = np.zeros(12, np.uint8)
     end = tiles.put_unsigned(out, 1, value)
@@ -56,14 +56,14 @@ def test_unsigned_integers_take_seven_bits_a_byte_least_first(value, data):
     ],
 )
 def test_signed_integers_have_their_sign_in_the_lowest_bit(value, data):
-    assert oasis.signed(value) == bytes.fromhex(data)
+    assert oasis.signed_integer(value) == bytes.fromhex(data)
     assert cursor(data).signed() == value
 
 
 @given(st.integers(-(2**31) + 1, 2**31 - 1))
 def test_integers_come_back(value):
-    assert cursor(oasis.signed(value)).coordinate() == value
-    assert cursor(oasis.unsigned(abs(value))).unsigned() == abs(value)
+    assert cursor(oasis.signed_integer(value)).coordinate() == value
+    assert cursor(oasis.unsigned_integer(abs(value))).unsigned() == abs(value)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_reals_of_all_eight_forms(data, value):
 )
 def test_reals_are_written_in_their_shortest_exact_form(value, data):
     want = b"\7" + struct.pack("<d", value) if data is None else bytes.fromhex(data)
-    assert oasis.real(value) == want
+    assert oasis.oasis_real(value) == want
     assert cursor(want).real() == value
 
 
@@ -119,7 +119,7 @@ def test_reals_are_written_in_their_shortest_exact_form(value, data):
 )
 def test_g_deltas_of_both_forms(data, step):
     assert cursor(data).delta() == step
-    assert cursor(vector(*step)).delta() == step
+    assert cursor(g_delta(*step)).delta() == step
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_bytes_are_packed_only_where_that_makes_them_fewer():
     noise, more = np.random.default_rng(4).bytes(30), set()
     for run in range(30):
         raw = b"a" + noise + b"a" * run
-        made = oasis.compressed(raw, 9)
+        made = oasis.compressed_block(raw, 9)
         packer = zlib.compressobj(9, zlib.DEFLATED, -15)
         size = 4 + len(
             packer.compress(raw) + packer.flush()
@@ -253,7 +253,7 @@ def test_bytes_are_packed_only_where_that_makes_them_fewer():
 
 def test_the_end_record_has_256_bytes_and_the_checksum_of_all_before():
     before = b"anything"
-    data = oasis.end((300, 0, 0, 0, 17, 0), zlib.crc32(before))
+    data = oasis.end_record((300, 0, 0, 0, 17, 0), zlib.crc32(before))
     assert len(data) == oasis.END_SIZE == 256
     assert data[:12] == bytes.fromhex("02 01 ac 02 01 00 01 00 01 00 01 11")
     assert data[-5] == 1  # CRC-32

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from metalens.ground.errors import MaskFileError
+from metalens.core.errors import MaskFileError
 
 
 def u(value):

@@ -39,7 +39,7 @@ def test_a_right_angle_is_mitred_and_the_ends_go_on():
     """Right, then down; 140 wide; 30 before its first point and 11 beyond its last: the
     left edge, then the right.
     """
-    made = paths.outline(
+    made = paths.path_outline(
         np.array([[0, 0], [700, 0], [700, 0], [700, -500]]), 70.0, begin=30, end=11
     )
     assert made.tolist() == [
@@ -56,13 +56,13 @@ def test_beyond_a_right_angle_each_arm_goes_on_by_half_its_width():
     """From +x to (-0.6, 0.8): inside the edges meet 2 half widths before the corner;
     outside at (1050, -50) and
     (1000, 0) - 50 (-0.6, 0.8) + 50 (0.8, 0.6)."""
-    made = paths.outline(np.array([[0, 0], [1000, 0], [400, 800]]), 50.0)
+    made = paths.path_outline(np.array([[0, 0], [1000, 0], [400, 800]]), 50.0)
     left, right = (
         [[0, 50], [900, 50], [360, 770]],
         [[440, 830], [1070, -10], [1050, -50], [0, -50]],
     )
     assert made.tolist() == left + right
-    mirrored = paths.outline(np.array([[0, 0], [1000, 0], [400, -800]]), 50.0)
+    mirrored = paths.path_outline(np.array([[0, 0], [1000, 0], [400, -800]]), 50.0)
     assert mirrored.tolist() == [[x, -y] for x, y in (left + right)[::-1]]
 
 
@@ -81,7 +81,7 @@ def test_a_path_is_what_lies_within_half_its_width_of_its_arms():
         )
         line = np.rint(np.cumsum(np.vstack([[0, 0], steps]), axis=0))
         places = RNG.uniform(line.min(0) - 2 * half, line.max(0) + 2 * half, (900, 2))
-        inside = wound(paths.outline(line, half), places) != 0
+        inside = wound(paths.path_outline(line, half), places) != 0
         distance, along, long = away(line, places)
         beside = ((distance < half - 1.5) & (along > 1.5) & (along < long - 1.5)).any(0)
         assert inside[beside].all()
@@ -91,7 +91,9 @@ def test_a_path_is_what_lies_within_half_its_width_of_its_arms():
 def test_round_ends_are_half_of_a_polygon_around_their_circle():
     """32 tan(pi / 32) r² of both together; lengths at the ends are not added."""
     half, line = 4e5, np.array([[1e5, -3e5], [1.9e6, 2.1e6]])
-    made = paths.outline(line, half, begin=77.0, end=99.0, rounded=True).astype(float)
+    made = paths.path_outline(line, half, begin=77.0, end=99.0, rounded=True).astype(
+        float
+    )
     assert len(made) == 32
     x, y = made.T
     area = 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())

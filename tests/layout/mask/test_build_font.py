@@ -19,7 +19,9 @@ def disc():
 
 
 def layers(furniture):
-    made = build.prepare(disc(), PROCESS, furniture=furniture, with_doses=False).plan
+    made = build.prepare_mask(
+        disc(), PROCESS, furniture=furniture, with_doses=False
+    ).plan
     return {layer for figure in made.figures for layer in figure.polygons}
 
 
@@ -32,11 +34,11 @@ def test_an_opening_alone_comes_without_marks_and_nothing_without_an_opening():
 @pytest.mark.parametrize(("x", "y"), [(30, -700), (-120, 45)])
 def test_a_line_of_text_stands_where_it_is_asked_for(x, y):
     """Seven squares high from y, six wide a letter from x: "LI" is 11 wide."""
-    every = np.concatenate(font.text("LI", x=x, y=y, square=10))
+    every = np.concatenate(font.text_rectangles("LI", x=x, y=y, square=10))
     assert every.min(axis=0).tolist() == [x, y]
     assert every[:, 1].max() == y + 70
     assert x + 60 < every[:, 0].max() <= x + 110
-    home = np.concatenate(font.text("LI", x=0, y=0, square=10))
+    home = np.concatenate(font.text_rectangles("LI", x=0, y=0, square=10))
     assert np.array_equal(every - [x, y], home)
 
 
@@ -46,7 +48,7 @@ def test_squares_of_a_letter_meet_along_edges_and_none_lies_on_another():
     """
     words = "".join(font._GLYPHS)
     filled = np.zeros((60, 20 + 24 * len(words)), int)
-    for box in font.text(words, x=8, y=12, square=4):
+    for box in font.text_rectangles(words, x=8, y=12, square=4):
         (left, bottom), (right, top) = box.min(0), box.max(0)
         filled[bottom:top, left:right] += 1
     assert filled.max() == 1

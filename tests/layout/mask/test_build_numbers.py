@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from layout.mask import build
-from layout.process.process import Die, Exposure, Layers, Process, Rules
+from layout.process.process import (
+    DesignRules,
+    DieSettings,
+    ExposureSettings,
+    LayerTable,
+    Process,
+)
 from metalens.cell.record import Cell
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -25,8 +31,8 @@ SIZES = np.array([[0.1, 0.2, 0.0, 0.15], [0.0, 0.0, 0.2, 0.0], [0.12, 0.0, 0.0, 
 
 def process(grid=1, **more):
     return Process(
-        rules=Rules(grid_nm=grid, diameter_step_nm=2 * grid),
-        exposure=Exposure(correct=False),
+        rules=DesignRules(grid_nm=grid, diameter_step_nm=2 * grid),
+        exposure=ExposureSettings(correct=False),
         **more,
     )
 
@@ -61,7 +67,7 @@ def test_the_map_s_first_row_is_the_lowest_of_the_mask():
     """Rows 0.37 um apart; the opening reaches half a pitch beyond the farthest pillar's
     middle.
     """
-    made = build.prepare(
+    made = build.prepare_mask(
         DiameterMap(SIZES, 0.4, row_um=0.37), process(), name="A", furniture="aperture"
     )
     (lattice,) = made.plan.lattices
@@ -83,7 +89,9 @@ def test_the_map_s_first_row_is_the_lowest_of_the_mask():
 
 
 def test_classes_have_polygons_of_the_rules_on_the_grid():
-    made = build.prepare(DiameterMap(SIZES, 0.4), process(2), furniture="none").plan
+    made = build.prepare_mask(
+        DiameterMap(SIZES, 0.4), process(2), furniture="none"
+    ).plan
     assert [c.name for c in made.classes] == [
         "D100",
         "D120",
@@ -112,8 +120,8 @@ def test_a_label_says_profile_wavelength_size_and_pitch():
 
 
 def test_surroundings_are_the_die_without_the_lens():
-    about = process(die=Die(verniers=False))
-    made = build.surroundings(
+    about = process(die=DieSettings(verniers=False))
+    made = build.die_surroundings(
         lens(), about, name="D", size_um=(1400.0, 900.0), clear_um=90.0, label="AB"
     )
     assert [lattice.name for lattice in made.plan.lattices] == ["WITNESS", "DOSETEST"]
@@ -139,9 +147,9 @@ def test_a_wafer_s_mark_has_the_pillars_of_the_lens_as_witnesses():
 
 def test_doses_on_the_layer_of_something_else_are_refused():
     """Nine doses of the test array from 5/0 on meet witnesses on 5/4."""
-    about = process(layers=Layers(witness=(5, 4)))
+    about = process(layers=LayerTable(witness=(5, 4)))
     with pytest.raises(
         ProcessError,
         match="layer 5/4 is a dose of the dose layer and the witness layer",
     ):
-        build.prepare(lens(), about)
+        build.prepare_mask(lens(), about)

@@ -8,15 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from layout.mask import Lattice, MaskPlan, PillarClass, die
-from layout.mask.marks import Box, Units
-from layout.process.process import Die, Layers, Process
-from metalens.ground.errors import ProcessError
+from layout.mask import MaskPlan, PillarClass, PillarLattice, die
+from layout.mask.marks import DatabaseUnits, MarkBox
+from layout.process.process import DieSettings, LayerTable, Process
+from metalens.core.errors import ProcessError
 
 SIZES = (150, 110, 170, 130)  # not in order
 PROCESS = Process(
-    layers=Layers(dose=(5, 7), witness=(6, 2)),
-    die=Die(size_um=(1300.0, 900.0), label="AB", verniers=False),
+    layers=LayerTable(dose=(5, 7), witness=(6, 2)),
+    die=DieSettings(size_um=(1300.0, 900.0), label="AB", verniers=False),
 )
 
 
@@ -29,7 +29,7 @@ def plan(sizes=SIZES, **more):
     classes = [
         PillarClass(f"D{d:03}", float(d), d, (1, 0), square(d // 2)) for d in sizes
     ]
-    lattice = Lattice(
+    lattice = PillarLattice(
         "LENS",
         3,
         4,
@@ -51,7 +51,7 @@ def plan(sizes=SIZES, **more):
 
 
 def furnished(sizes=SIZES):
-    return die.furnish(plan(sizes), PROCESS, radius_um=40.0, label="default")
+    return die.add_die_frame(plan(sizes), PROCESS, radius_um=40.0, label="default")
 
 
 def blocks(sites, side):
@@ -154,12 +154,13 @@ def test_what_is_not_corrected_has_dose_one_and_every_layer_its_name():
     assert [f.name for f in made.figures] == ["APERTURE", "MARKS", "LABEL", "OUTLINE"]
     (outline,) = made.figures[3].polygons[10, 0]
     assert (
-        outline.tolist() == Box(-650_000, -450_000, 650_000, 450_000).polygon.tolist()
+        outline.tolist()
+        == MarkBox(-650_000, -450_000, 650_000, 450_000).polygon.tolist()
     )
 
 
 def test_an_aperture_without_furniture_has_the_area_of_its_circle():
-    made = die.opened(plan(), PROCESS, radius_um=40.0)
+    made = die.open_aperture(plan(), PROCESS, radius_um=40.0)
     (figure,) = made.figures
     (disc,) = figure.polygons[2, 0]
     x, y = disc.T
@@ -177,11 +178,11 @@ def test_an_aperture_without_furniture_has_the_area_of_its_circle():
 
 
 def test_a_die_without_a_size_leaves_its_margin_around_the_aperture():
-    unit = Units(plan())
-    assert die._outline(Process(die=Die(margin_um=70.0)), unit, 40.0) == Box(
-        -110_000, -110_000, 110_000, 110_000
-    )
-    assert die._outline(PROCESS, unit, 40.0) == Box(
+    unit = DatabaseUnits(plan())
+    assert die._outline(
+        Process(die=DieSettings(margin_um=70.0)), unit, 40.0
+    ) == MarkBox(-110_000, -110_000, 110_000, 110_000)
+    assert die._outline(PROCESS, unit, 40.0) == MarkBox(
         -650_000, -450_000, 650_000, 450_000
     )
 
@@ -208,12 +209,12 @@ def test_a_block_is_centred_to_the_grid_below_and_its_cells_reach_half_a_step_be
         die._centred("X", np.ones((4, 8), np.uint8), plan(), -9999).x0 == -11_408
     )  # -9999 - 1407 = -11 406
     assert die._centred("X", np.ones((4, 8), np.uint8), plan(), 0).y0 == 448  # 450
-    assert die._extent(made) == Box(
+    assert die._extent(made) == MarkBox(
         8796 - 201, 600 - 1200 - 201, 8796 + 2412 + 201, 600 + 201
     )
     hexagonal = die._centred("X", np.ones((5, 7), np.uint8), plan(centred=True), 0)
     assert hexagonal.centred
-    assert die._extent(hexagonal) == Box(
+    assert die._extent(hexagonal) == MarkBox(
         -1208 - 402, -600 - 402, -1208 + 2412 + 402, 600 + 402
     )
 
@@ -237,7 +238,10 @@ def test_a_wafer_mark_has_sixteen_by_sixteen_pillars_of_three_sizes_between_two_
         pytest.approx(100_000, abs=4),
     )  # the grid
     (window,) = made.figures[0].polygons[2, 0]
-    assert window.tolist() == Box(-205_000, -205_000, 205_000, 205_000).polygon.tolist()
+    assert (
+        window.tolist()
+        == MarkBox(-205_000, -205_000, 205_000, 205_000).polygon.tolist()
+    )
     assert len(made.figures[1].polygons[3, 0]) == 5
     assert made.doses == {(2, 0): 1.0, (3, 0): 1.0, (6, 2): 1.0}
     assert made.layer_names == {(2, 0): "aperture", (3, 0): "marks", (6, 2): "witness"}
@@ -246,7 +250,10 @@ def test_a_wafer_mark_has_sixteen_by_sixteen_pillars_of_three_sizes_between_two_
 def refused(boxes, aperture, half=5000):
     with pytest.raises(ProcessError) as told:
         die._refuse_overlaps(
-            boxes, aperture, Units(plan()), Box(-half, -half - 1000, half, half + 1000)
+            boxes,
+            aperture,
+            DatabaseUnits(plan()),
+            MarkBox(-half, -half - 1000, half, half + 1000),
         )
     return str(told.value)
 
@@ -254,22 +261,24 @@ def refused(boxes, aperture, half=5000):
 def test_overlaps_are_found_with_the_disc_and_with_each_other_and_touching_is_none():
     """A box whose corner is 300 and 400 from the middle of an aperture of 500."""
     apart = {
-        "DOSETEST": [Box(310, 420, 900, 800)],
-        "MARKS": [Box(900, 0, 990, 420), Box(-70, 800, 310, 950)],
+        "DOSETEST": [MarkBox(310, 420, 900, 800)],
+        "MARKS": [MarkBox(900, 0, 990, 420), MarkBox(-70, 800, 310, 950)],
     }
-    die._refuse_overlaps(apart, ((10.0, 20.0), 500.0), Units(plan()), Box(-1, -1, 1, 1))
-    near = apart | {"DOSETEST": [Box(309, 420, 900, 800)]}
+    die._refuse_overlaps(
+        apart, ((10.0, 20.0), 500.0), DatabaseUnits(plan()), MarkBox(-1, -1, 1, 1)
+    )
+    near = apart | {"DOSETEST": [MarkBox(309, 420, 900, 800)]}
     assert "DOSETEST and the aperture overlap on a die of 10 x 12 um" in refused(
         near, ((10.0, 20.0), 500.0)
     )
     for corner in (
-        Box(-900, -800, -289, -380),
-        Box(309, -800, 900, -380),
-        Box(-900, 420, -289, 800),
+        MarkBox(-900, -800, -289, -380),
+        MarkBox(309, -800, 900, -380),
+        MarkBox(-900, 420, -289, 800),
     ):
         assert "DOSETEST and the aperture" in refused(
             {"DOSETEST": [corner]}, ((10.0, 20.0), 500.0)
         )
-    on = apart | {"LABEL": [Box(5000, 0, 5100, 10), Box(980, 400, 1000, 500)]}
+    on = apart | {"LABEL": [MarkBox(5000, 0, 5100, 10), MarkBox(980, 400, 1000, 500)]}
     assert "MARKS and LABEL overlap" in refused(on, ((10.0, 20.0), 0.0))
     assert "draw smaller marks" in refused(on, ((10.0, 20.0), 0.0))

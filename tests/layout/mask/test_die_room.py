@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import layout
-from layout.process.process import Die, Exposure, Process
+from layout.process.process import DieSettings, ExposureSettings, Process
 from metalens.cell import Lattice
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
 
 CLEAR_NM, PITCH_NM, RATIO = 10_000, 400, 1.3
@@ -25,8 +25,8 @@ def lens_map():
 
 def process(**die):
     return Process(
-        die=Die(verniers=False, **{"size_um": (1300.0, 900.0)} | die),
-        exposure=Exposure(correct=False),
+        die=DieSettings(verniers=False, **{"size_um": (1300.0, 900.0)} | die),
+        exposure=ExposureSettings(correct=False),
     )
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from layout.mask import MaskPlan, dosed
-from layout.mask.plan import Figure, Lattice, pillar_classes
+from layout.mask.plan import FigureCell, PillarLattice, pillar_classes
 from layout.pec.assign import dose_ladder
-from layout.process import Exposure, Process
+from layout.process import ExposureSettings, Process
 
 RNG = np.random.default_rng(41)
 PROCESS = Process(
-    exposure=Exposure(alpha_um=0.02, beta_um=2.1, eta=0.7, tolerance=0.02)
+    exposure=ExposureSettings(alpha_um=0.02, beta_um=2.1, eta=0.7, tolerance=0.02)
 )
 MARK = np.array(
     [
@@ -56,22 +56,22 @@ def plan():
     lens = RNG.integers(0, 4, (31, 38)).astype(np.uint8)
     lens[:12, :20] = 3  # denser here
     lattices = (
-        Lattice.of("LENS", lens, pitch=400, x0=-7400, y0=6000),
-        Lattice.of(
+        PillarLattice.of("LENS", lens, pitch=400, x0=-7400, y0=6000),
+        PillarLattice.of(
             "TEST",
             RNG.choice([0, 4], (5, 3)).astype(np.uint8),
             pitch=700,
             x0=-12000,
             y0=-9000,
         ),
-        Lattice.of(
+        PillarLattice.of(
             "WITNESS", np.full((2, 3), 5, np.uint8), pitch=900, x0=12000, y0=9000
         ),
     )
     figures = (
-        Figure("MARKS", {(3, 0): (MARK, BESIDE, ALONE)}),
-        Figure("LABEL", {(4, 0): (LETTER,)}),
-        Figure("OUTLINE", {(10, 0): (DIE,)}),
+        FigureCell("MARKS", {(3, 0): (MARK, BESIDE, ALONE)}),
+        FigureCell("LABEL", {(4, 0): (LETTER,)}),
+        FigureCell("OUTLINE", {(10, 0): (DIE,)}),
     )
     names = {
         (1, 0): "pillar",
@@ -90,9 +90,9 @@ def plan():
 @pytest.fixture(scope="module")
 def made():
     before = plan()
-    wanted = dosed.want(before, PROCESS)
+    wanted = dosed.solve_wanted_doses(before, PROCESS)
     steps = dose_ladder([wanted.doses.range], PROCESS.exposure)
-    return (before, *dosed.corrected(wanted, PROCESS, *steps))
+    return (before, *dosed.apply_dose_classes(wanted, PROCESS, *steps))
 
 
 def test_every_pillar_keeps_its_shape_and_gets_the_dose_that_was_found_for_it(made):
@@ -224,7 +224,7 @@ def test_what_is_exposed_is_told_in_micrometres_whatever_the_unit_of_the_mask():
         "prefix": "D",
     }
     classes = tuple(pillar_classes(size, **about))
-    lattice = Lattice(
+    lattice = PillarLattice(
         "LENS",
         7,
         5,

@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from layout.mask import FieldPlan, Lattice, MaskPlan, PillarClass, field_figure
-from layout.process.process import Layers, Process
+from layout.mask import FieldPlan, MaskPlan, PillarClass, PillarLattice, field_figure
+from layout.process.process import LayerTable, Process
 
 SQUARE = np.array([[-60, -60], [60, -60], [60, 60], [-60, 60]])
 
@@ -21,7 +21,7 @@ def test_each_field_is_a_box_from_midway_to_midway_on_the_grid():
     4: a border before column c at
     -1000 + 401 c - 200, one before row r from below at 300 + 300 r - 150, both down to
     the grid."""
-    lattice = Lattice(
+    lattice = PillarLattice(
         "LENS",
         10,
         13,
@@ -44,7 +44,9 @@ def test_each_field_is_a_box_from_midway_to_midway_on_the_grid():
         0.1,
         0.3,
     )
-    made = field_figure.with_fields(plan, split, Process(layers=Layers(fields=(8, 3))))
+    made = field_figure.with_fields(
+        plan, split, Process(layers=LayerTable(fields=(8, 3)))
+    )
     (figure,) = made.figures
     assert (figure.name, list(figure.polygons)) == ("FIELDS", [(8, 3)])
     xs, ys = (-1200, 404, 2408, 4012), (748, 1648, 3148)

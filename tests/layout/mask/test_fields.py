@@ -13,8 +13,8 @@ from layout.mask import fields
 from layout.process.process import Process, WriteField
 from layout.study import stitching
 from metalens.cell.record import Cell
+from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
-from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -54,7 +54,7 @@ def test_no_border_cuts_a_pillar_and_every_pillar_has_one_field(n, m, size, mode
     d = np.where(rng.random((n, m)) < 0.7, rng.uniform(0.05, 0.39, (n, m)), 0)
     d[rng.integers(n), rng.integers(m)] = 0.3
     diameters = DiameterMap(d, 0.4)
-    plan = fields.split(diameters, process(size, mode))
+    plan = fields.split_write_fields(diameters, process(size, mode))
     rows, columns = np.nonzero(d)
     for positions, borders, index in (
         (diameters.x_um, plan.x_um, columns),
@@ -78,13 +78,15 @@ def test_no_border_cuts_a_pillar_and_every_pillar_has_one_field(n, m, size, mode
 
 
 def test_floating_fields_are_as_few_and_as_equal_as_can_be():
-    plan = fields.split(DiameterMap(np.full((250, 101), 0.2), 0.4), process(40.0))
+    plan = fields.split_write_fields(
+        DiameterMap(np.full((250, 101), 0.2), 0.4), process(40.0)
+    )
     assert np.diff(plan.rows).tolist() == [83, 83, 84]
     assert np.diff(plan.columns).tolist() == [50, 51]
 
 
 def test_a_fixed_raster_is_shifted_to_the_gaps_and_keeps_its_period():
-    plan = fields.split(
+    plan = fields.split_write_fields(
         DiameterMap(np.full((250, 250), 0.2), 0.4), process(30.1, "shift")
     )
     assert set(np.diff(plan.rows).tolist()) == {75}
@@ -94,7 +96,7 @@ def test_a_fixed_raster_is_shifted_to_the_gaps_and_keeps_its_period():
 
 def test_what_an_unshifted_raster_would_cut_is_counted_pillar_by_pillar():
     lens = hyperbolic(121)
-    plan = fields.split(lens.diameters, process(7.0))
+    plan = fields.split_write_fields(lens.diameters, process(7.0))
     d, x = lens.diameters.diameter_um, lens.diameters.x_um
     away = abs(x - 7.0 * np.rint(x / 7.0))
     want = ((d > 0) & ((away < d / 2) | (away[:, None] < d / 2))).sum()
@@ -103,7 +105,7 @@ def test_what_an_unshifted_raster_would_cut_is_counted_pillar_by_pillar():
 
 def test_a_field_below_the_pitch_is_refused():
     with pytest.raises(ProcessError, match="smaller than the pitch"):
-        fields.split(hyperbolic(21).diameters, process(0.3))
+        fields.split_write_fields(hyperbolic(21).diameters, process(0.3))
 
 
 def test_stitching_hurts_as_the_square_of_the_offset_and_not_at_all_at_zero():
@@ -111,8 +113,12 @@ def test_stitching_hurts_as_the_square_of_the_offset_and_not_at_all_at_zero():
     loss = []
     for error in (0.0, 10.0, 20.0):
         chosen = process(30.0, stitching_nm=error)
-        report = stitching.stitching(
-            lens, fields.split(lens.diameters, chosen), chosen, draws=100, seed=1
+        report = stitching.simulate_stitching(
+            lens,
+            fields.split_write_fields(lens.diameters, chosen),
+            chosen,
+            draws=100,
+            seed=1,
         )
         loss.append(1 - report.strehl.mean())
     assert loss[0] == pytest.approx(0, abs=1e-6)
@@ -126,8 +132,8 @@ def test_the_loss_is_what_the_variance_of_the_ramps_says():
     # 1 - S = variance over the pillars of k delta (sin of the angle to the focus + to
     # the source)
     lens, chosen = hyperbolic(), process(30.0)
-    plan = fields.split(lens.diameters, chosen)
-    report = stitching.stitching(lens, plan, chosen, draws=400, seed=2)
+    plan = fields.split_write_fields(lens.diameters, chosen)
+    report = stitching.simulate_stitching(lens, plan, chosen, draws=400, seed=2)
     x, y = lens.diameters.x_um, lens.diameters.y_um[:, None]
     r2 = x**2 + y**2
     sine = 1 / np.sqrt(r2 + 200.0**2) + 1 / np.sqrt(r2 + 2000.0**2)
@@ -163,7 +169,7 @@ def test_the_clearance_is_that_of_what_is_drawn():
     bias = dataclasses.replace(
         process(30.0), bias=Bias(table_nm=((50.0, -20.0), (400.0, -20.0)))
     )
-    plan = fields.split(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
+    plan = fields.split_write_fields(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
     drawn_um = float(bias.written_diameter_nm(250.0)) * 1e-3
     assert drawn_um > 0.269  # drawn wider by what the process takes
     assert plan.clearance_um == pytest.approx(

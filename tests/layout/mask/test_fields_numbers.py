@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from layout.mask import fields
-from layout.process.process import Process, Rules, WriteField
-from metalens.ground.errors import ProcessError
+from layout.process.process import DesignRules, Process, WriteField
+from metalens.core.errors import ProcessError
 from metalens.lens import DiameterMap
 
 PLAN = fields.FieldPlan(
@@ -25,7 +25,7 @@ PLAN = fields.FieldPlan(
 
 def process(size_um, mode="floating"):
     return Process(
-        rules=Rules(diameter_step_nm=2.0), write_field=WriteField(size_um, mode)
+        rules=DesignRules(diameter_step_nm=2.0), write_field=WriteField(size_um, mode)
     )
 
 
@@ -85,7 +85,7 @@ def test_pillars_are_counted_field_by_field_and_borders_keep_their_distance():
     """
     assert 1.2 / 0.4 < 3
     sizes = ragged()
-    plan = fields.split(DiameterMap(sizes, 0.4, row_um=0.37), process(1.2))
+    plan = fields.split_write_fields(DiameterMap(sizes, 0.4, row_um=0.37), process(1.2))
     assert (plan.columns.tolist(), plan.rows.tolist()) == (
         [1, 4, 7, 10, 13],
         [0, 2, 5, 8],
@@ -103,7 +103,7 @@ def test_pillars_are_counted_field_by_field_and_borders_keep_their_distance():
     assert plan.pillars.tolist() == want
     assert plan.clearance_um == pytest.approx((0.37 - 0.342) / 2, abs=1e-12)
     with pytest.raises(ProcessError, match="smaller than the pitch"):
-        fields.split(DiameterMap(sizes, 0.4, row_um=0.37), process(0.38))
+        fields.split_write_fields(DiameterMap(sizes, 0.4, row_um=0.37), process(0.38))
 
 
 @pytest.mark.parametrize("sites", [1 << 20, 26, 5])
@@ -120,16 +120,22 @@ def test_a_raster_about_the_axis_cuts_pillars_that_lie_on_its_borders(
         x, y, half = (column - 6) * 0.4, (row - 4.5) * 0.37, sizes[row, column] / 2
         borders = size_um * np.arange(-5, 6)
         want += bool((abs(borders - x) < half).any() or (abs(borders - y) < half).any())
-    plan = fields.split(DiameterMap(sizes, 0.4, row_um=0.37), process(size_um))
+    plan = fields.split_write_fields(
+        DiameterMap(sizes, 0.4, row_um=0.37), process(size_um)
+    )
     assert plan.cut_before == want
     assert 5 < want < np.count_nonzero(sizes)
     assert plan.pillars.sum() == np.count_nonzero(sizes)
 
 
 def test_a_single_column_of_pillars_lies_on_the_border_at_the_axis():
-    plan = fields.split(DiameterMap(np.array([[0.1], [0.0], [0.2]]), 0.4), process(1.2))
+    plan = fields.split_write_fields(
+        DiameterMap(np.array([[0.1], [0.0], [0.2]]), 0.4), process(1.2)
+    )
     assert (plan.cut_before, plan.pillars.tolist()) == (2, [[2]])
-    row = fields.split(DiameterMap(np.array([[0.1, 0.3]]), 0.4), process(1.2))
+    row = fields.split_write_fields(
+        DiameterMap(np.array([[0.1, 0.3]]), 0.4), process(1.2)
+    )
     assert (row.cut_before, row.pillars.tolist(), row.columns.tolist()) == (
         2,
         [[2]],

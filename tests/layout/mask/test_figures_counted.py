@@ -46,7 +46,7 @@ def test_a_rectangle_of_the_write_fields_holds_the_sites_of_its_field():
 
 
 def test_a_wafer_cross_is_the_same_after_a_quarter_turn_and_leaves_its_middle_free():
-    unit = marks.Units(
+    unit = marks.DatabaseUnits(
         SimpleNamespace(unit_nm=1.0, grid=5, lattices=[SimpleNamespace(constant=400)])
     )
     *bars, fine = marks.wafer_cross(unit, 400.0, 21.0)

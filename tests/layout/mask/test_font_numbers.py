@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from layout.mask import font
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 DRAWN = {
     "F": ["#####", "#....", "#....", "####.", "#....", "#....", "#...."],
@@ -23,7 +23,7 @@ def filled(words, square, x, y):
     """
     half = square // 2
     image = np.zeros((14, 12 * len(words)), int)
-    for box in font.text(words, x=x, y=y, square=square):
+    for box in font.text_rectangles(words, x=x, y=y, square=square):
         (left, bottom), (right, top) = box.min(0).tolist(), box.max(0).tolist()
         sides = [left - x, right - x, bottom - y, top - y]
         assert not any(side % half for side in sides)
@@ -69,14 +69,14 @@ def test_letters_are_their_bits_and_small_squares_where_corners_meet(words):
 
 
 def test_small_letters_are_capitals_and_unknown_ones_are_named():
-    assert [b.tolist() for b in font.text("f4", x=5, y=7, square=6)] == [
-        b.tolist() for b in font.text("F4", x=5, y=7, square=6)
+    assert [b.tolist() for b in font.text_rectangles("f4", x=5, y=7, square=6)] == [
+        b.tolist() for b in font.text_rectangles("F4", x=5, y=7, square=6)
     ]
     with pytest.raises(
         ProcessError, match="label 'A!': no '!' in the font; use letters, digits and # "
     ):
-        font.text("A!", x=0, y=0, square=2)
-    assert font.text(" ", x=0, y=0, square=2) == ()
+        font.text_rectangles("A!", x=0, y=0, square=2)
+    assert font.text_rectangles(" ", x=0, y=0, square=2) == ()
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_small_letters_are_capitals_and_unknown_ones_are_named():
 def test_a_line_is_as_long_as_its_letters_of_five_squares_and_the_gaps_between(
     words, squares
 ):
-    assert font.width(words, 34) == 34 * squares
+    assert font.text_width(words, 34) == 34 * squares
 
 
 def test_every_letter_stands_in_five_columns_of_seven_rows():

@@ -8,9 +8,9 @@ import pytest
 import layout
 from layout.formats import handover
 from layout.mask import fields
-from layout.mask.build import prepare
-from layout.process.process import Die, Exposure, Process, Rules
-from metalens.ground.errors import ProcessError
+from layout.mask.build import prepare_mask
+from layout.process.process import DesignRules, DieSettings, ExposureSettings, Process
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
 
 STEP_NM, PITCH_UM = 70.0, 7.3
@@ -23,7 +23,9 @@ def lens_map():
 
 def process(**die):
     settings = {"vernier_step_nm": STEP_NM, "vernier_pitch_um": PITCH_UM, **die}
-    return Process(die=Die(**settings), exposure=Exposure(correct=False))
+    return Process(
+        die=DieSettings(**settings), exposure=ExposureSettings(correct=False)
+    )
 
 
 def parts(plan, made):
@@ -109,9 +111,9 @@ def test_a_box_in_a_box_has_equal_margins_that_differ_by_twice_a_shift():
 @pytest.mark.parametrize("grid", [1, 5])
 def test_verniers_keep_the_rules_and_the_grid(grid):
     made = Process(
-        rules=Rules(grid_nm=grid, diameter_step_nm=10),
-        die=Die(vernier_step_nm=35.0),
-        exposure=Exposure(correct=False),
+        rules=DesignRules(grid_nm=grid, diameter_step_nm=10),
+        die=DieSettings(vernier_step_nm=35.0),
+        exposure=ExposureSettings(correct=False),
     )
     plan = layout.plan(lens_map(), made)
     assert layout.check_plan(plan, made.rules).ok
@@ -141,8 +143,8 @@ def test_fine_crosses_are_a_fifth_of_the_coarse_ones_beside_them():
 def test_verniers_are_said_on_the_job_sheet_and_can_be_left_out():
     for wanted in (True, False):
         made = process(verniers=wanted)
-        plan = prepare(lens_map(), made).plan
-        split = fields.split(lens_map(), made)
+        plan = prepare_mask(lens_map(), made).plan
+        split = fields.split_write_fields(lens_map(), made)
         sheet = handover.job_sheet(plan, made, split, {}, "fine")
         assert (f"{STEP_NM:g} nm longer from bar to bar" in sheet) == wanted
         assert any(f.name == "VERNIERS" for f in plan.figures) == wanted
@@ -150,7 +152,8 @@ def test_verniers_are_said_on_the_job_sheet_and_can_be_left_out():
 
 def test_a_step_below_the_grid_and_a_die_without_room_are_refused_by_key():
     coarse = Process(
-        rules=Rules(grid_nm=20, diameter_step_nm=20), die=Die(vernier_step_nm=8.0)
+        rules=DesignRules(grid_nm=20, diameter_step_nm=20),
+        die=DieSettings(vernier_step_nm=8.0),
     )
     with pytest.raises(
         ProcessError,

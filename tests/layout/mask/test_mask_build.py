@@ -11,16 +11,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import layout
-from layout.mask import Lattice, build, cells, die, font, marks
+from layout.mask import PillarLattice, build, cells, die, font, marks
 from layout.pec import psf
-from layout.process.process import Die, Exposure, Layers, Process, Rules
+from layout.process.process import (
+    DesignRules,
+    DieSettings,
+    ExposureSettings,
+    LayerTable,
+    Process,
+)
 from layout.shapes import polygon
+from metalens.core.errors import LensError, ProcessError
 from metalens.fabrication import Bias
-from metalens.ground.errors import LensError, ProcessError
 from metalens.lens.record import DiameterMap
 from tests.referees import rims
 
-PLAIN = Process(exposure=Exposure(correct=False))
+PLAIN = Process(exposure=ExposureSettings(correct=False))
 
 
 def disc_map(n=41, pitch=0.4, seed=0):
@@ -34,7 +40,9 @@ def disc_map(n=41, pitch=0.4, seed=0):
 @given(step=st.integers(1, 10), seed=st.integers(0, 99))
 def test_drawn_diameters_are_within_half_a_step(step, seed):
     source = disc_map(15, seed=seed)
-    found = cells.quantise(source, Process(rules=Rules(diameter_step_nm=step)))
+    found = cells.quantise_diameters(
+        source, Process(rules=DesignRules(diameter_step_nm=step))
+    )
     there = source.diameter_um > 0
     assert np.array_equal(found.classes > 0, there)
     drawn = found.diameters_nm[found.classes[there].astype(int) - 1]
@@ -47,8 +55,8 @@ def test_drawn_diameters_are_within_half_a_step(step, seed):
 
 def test_bias_is_taken_off():
     process = Process(bias=Bias(table_nm=((50.0, -10.0), (400.0, -10.0))))
-    one = cells.quantise(DiameterMap(np.array([[0.2]]), 0.4), Process())
-    other = cells.quantise(DiameterMap(np.array([[0.2]]), 0.4), process)
+    one = cells.quantise_diameters(DiameterMap(np.array([[0.2]]), 0.4), Process())
+    other = cells.quantise_diameters(DiameterMap(np.array([[0.2]]), 0.4), process)
     assert other.diameters_nm[0] - one.diameters_nm[0] == 10
 
 
@@ -95,14 +103,15 @@ def test_a_pitch_off_the_grid_is_refused():
         layout.plan(disc_map(pitch=0.4005), PLAIN)
     with pytest.raises(ProcessError, match="no multiple of the grid"):
         layout.plan(
-            disc_map(pitch=0.402), Process(rules=Rules(grid_nm=5, diameter_step_nm=10))
+            disc_map(pitch=0.402),
+            Process(rules=DesignRules(grid_nm=5, diameter_step_nm=10)),
         )
 
 
 def test_coordinates_beyond_32_bit_are_refused():
     rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
     with pytest.raises(ProcessError, match="32 bits"):
-        Lattice(
+        PillarLattice(
             "LENS",
             rows,
             2,
@@ -135,7 +144,8 @@ def test_an_even_lens_on_an_odd_pitch_lies_half_a_step_off_and_says_so():
 
 def test_a_coarse_grid_holds_for_everything():
     process = Process(
-        rules=Rules(grid_nm=5, diameter_step_nm=10), exposure=Exposure(correct=False)
+        rules=DesignRules(grid_nm=5, diameter_step_nm=10),
+        exposure=ExposureSettings(correct=False),
     )
     plan = layout.plan(disc_map(31), process)
     assert plan.grid == 5
@@ -146,8 +156,11 @@ BEAM = {"alpha_um": 0.012, "beta_um": 27.0, "eta": 0.65}
 
 
 def test_without_a_point_exposure_the_lens_has_one_datatype_and_one_dose():
-    for process in (Process(), Process(exposure=Exposure(**BEAM, correct=False))):
-        made = build.prepare(disc_map(61), process)
+    for process in (
+        Process(),
+        Process(exposure=ExposureSettings(**BEAM, correct=False)),
+    ):
+        made = build.prepare_mask(disc_map(61), process)
         assert made.dose is None
         lens = [c for c in made.plan.classes if c.name[0] == "D"]
         assert {c.layer for c in lens} == {(1, 0)}
@@ -155,8 +168,8 @@ def test_without_a_point_exposure_the_lens_has_one_datatype_and_one_dose():
 
 
 def test_doses_become_named_datatypes_and_every_shape_has_one():
-    made = build.prepare(
-        disc_map(61), Process(exposure=Exposure(**BEAM, tolerance=0.02))
+    made = build.prepare_mask(
+        disc_map(61), Process(exposure=ExposureSettings(**BEAM, tolerance=0.02))
     )
     assert made.dose is not None
     assert made.dose.worst < 0.02
@@ -174,8 +187,8 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
     """Pillars of lens, dose test and witness cells, and a mark: the direct sum over all
     of them, at some edges.
     """
-    settings = Exposure(**BEAM, tolerance=0.01)
-    plan = build.prepare(disc_map(41), Process(exposure=settings)).plan
+    settings = ExposureSettings(**BEAM, tolerance=0.01)
+    plan = build.prepare_mask(disc_map(41), Process(exposure=settings)).plan
     point = psf.point_exposure(settings)
     centres, wide, dose, goal = [], [], [], []
     for lattice in plan.lattices:
@@ -212,7 +225,7 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
 
 
 def test_the_die_holds_everything_within_its_street_and_apart():
-    process = Process(exposure=Exposure(correct=False))
+    process = Process(exposure=ExposureSettings(correct=False))
     plan = layout.plan(disc_map(101), process, name="LENS_7")
     names = {figure.name for figure in plan.figures} | {
         lattice.name for lattice in plan.lattices
@@ -267,7 +280,7 @@ def test_the_aperture_opens_the_lens_and_the_test_structures():
 
 @given(radius=st.floats(1e3, 5e6), grid=st.sampled_from([1, 5]))
 def test_the_aperture_disc_keeps_its_area_and_fits_gdsii(radius, grid):
-    shape = die.disc(radius, (0.0, 0.0), grid)
+    shape = die.disc_polygon(radius, (0.0, 0.0), grid)
     assert len(shape) <= 8000
     assert (shape % grid == 0).all()
     # rounding moves each vertex by at most 0.71 grid steps, its edge by as much: 1.5 g
@@ -279,7 +292,9 @@ def test_the_aperture_disc_keeps_its_area_and_fits_gdsii(radius, grid):
 
 def test_a_die_without_room_is_refused_with_what_it_needs():
     with pytest.raises(ProcessError, match=r"\d+ um are needed"):
-        layout.plan(disc_map(101), dataclasses.replace(PLAIN, die=Die(margin_um=60)))
+        layout.plan(
+            disc_map(101), dataclasses.replace(PLAIN, die=DieSettings(margin_um=60))
+        )
 
 
 def test_the_orientation_mark_is_like_none_of_its_images():
@@ -296,18 +311,18 @@ def test_the_orientation_mark_is_like_none_of_its_images():
 
 
 def test_letters_are_upright_and_unknown_ones_are_refused():
-    shapes = font.text("L", x=0, y=0, square=10)
+    shapes = font.text_rectangles("L", x=0, y=0, square=10)
     heights = {
         (int(s[:, 0].min()), int(s[:, 0].max())) for s in shapes if s[:, 1].min() == 0
     }
     assert heights == {(0, 50)}  # the foot of an L is at the bottom
     assert max(int(s[:, 1].max()) for s in shapes) == 70
     with pytest.raises(ProcessError, match="font"):
-        font.text("Ä", x=0, y=0, square=10)
+        font.text_rectangles("Ä", x=0, y=0, square=10)
 
 
 def test_dose_test_layers_keep_clear_of_the_others():
-    layers = Layers(marks=(5, 3))  # the dose array uses 5/0 to 5/8
+    layers = LayerTable(marks=(5, 3))  # the dose array uses 5/0 to 5/8
     with pytest.raises(ProcessError, match="5/3"):
         layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=layers))
 
@@ -315,7 +330,7 @@ def test_dose_test_layers_keep_clear_of_the_others():
 def test_doses_of_the_test_array_are_datatypes_of_one_layer():
     """From 0.8 in steps of 0.05, on 16/20 and the eight that follow."""
     plan = layout.plan(
-        disc_map(101), dataclasses.replace(PLAIN, layers=Layers(dose=(16, 20)))
+        disc_map(101), dataclasses.replace(PLAIN, layers=LayerTable(dose=(16, 20)))
     )
     found = {made.layer: made.dose for made in plan.classes if made.layer[0] == 16}
     assert found == pytest.approx({(16, 20 + k): 0.8 + 0.05 * k for k in range(9)})

@@ -5,7 +5,7 @@ import pytest
 
 from layout.mask import cells
 from layout.process import isolation, process
-from metalens.ground.errors import LensError, ProcessError
+from metalens.core.errors import LensError, ProcessError
 from metalens.lens import DiameterMap
 
 PLAIN = "[rules]\ngrid_nm = 1\ndiameter_step_nm = 4\n"
@@ -32,7 +32,7 @@ def test_classes_are_the_drawn_sizes_thinnest_first(tmp_path, monkeypatch, sites
         [0, 0, 102.2],
         [237.9, 300, 0],
     ]
-    found = cells.quantise(lens(sizes), rules(tmp_path, PLAIN))
+    found = cells.quantise_diameters(lens(sizes), rules(tmp_path, PLAIN))
     assert found.diameters_nm.tolist() == [100, 104, 196, 200, 236, 240, 300]
     drawn = np.rint(np.asarray(sizes) / 4) * 4
     classes = np.searchsorted(found.diameters_nm, drawn) + 1
@@ -47,7 +47,7 @@ def test_classes_are_the_drawn_sizes_thinnest_first(tmp_path, monkeypatch, sites
 def test_more_than_255_classes_take_two_bytes(tmp_path):
     text = PLAIN.replace("= 4", "= 1")
     for count, kind in ((255, np.uint8), (256, np.uint16)):
-        found = cells.quantise(
+        found = cells.quantise_diameters(
             lens([np.arange(100, 100 + count)], 0.5), rules(tmp_path, text)
         )
         assert (len(found.diameters_nm), found.classes.dtype) == (count, kind)
@@ -67,8 +67,8 @@ def test_pillars_that_lack_neighbours_are_drawn_for_what_they_lack(
         RNG.uniform(size=(31, 9)) < 0.4, RNG.uniform(120, 260, (31, 9)), 0.0
     )
     design = lens(sizes)
-    found = cells.quantise(design, made)
-    alone = isolation.isolation(sizes > 0, design.steps_um, 0.9, centred=False)
+    found = cells.quantise_diameters(design, made)
+    alone = isolation.isolation_map(sizes > 0, design.steps_um, 0.9, centred=False)
     want = np.zeros(sizes.shape)
     for at in zip(*np.nonzero(sizes), strict=True):
         want[at] = made.written_diameter_nm(sizes[at][None], alone[at][None])[0]
@@ -93,19 +93,22 @@ def test_what_cannot_be_drawn_is_named_in_its_row_of_the_map(
         ProcessError,
         match=r"row 5, column 2 is 0\.4 um, need less than the pitch of 0\.4 um",
     ):
-        cells.quantise(lens(sizes), made)
+        cells.quantise_diameters(lens(sizes), made)
     sizes[5, 2] = 397.0
-    assert cells.quantise(lens(sizes), made).diameters_nm.tolist() == [200, 396]
+    assert cells.quantise_diameters(lens(sizes), made).diameters_nm.tolist() == [
+        200,
+        396,
+    ]
     sizes[4, 1] = 1.9
     with pytest.raises(
         ProcessError,
         match=r"row 4, column 1, 0\.0019 um wide, would be drawn with diameter 0",
     ):
-        cells.quantise(lens(sizes), made)
+        cells.quantise_diameters(lens(sizes), made)
 
 
 def test_a_map_that_is_emptied_is_refused(tmp_path):
     made = lens(np.full((2, 2), 200.0))
     made.diameter_um[:] = 0
     with pytest.raises(LensError, match="holds no pillar"):
-        cells.quantise(made, rules(tmp_path, PLAIN))
+        cells.quantise_diameters(made, rules(tmp_path, PLAIN))

@@ -5,7 +5,7 @@ with its own pillar.
 import numpy as np
 import pytest
 
-from layout.mask import Lattice, symmetry
+from layout.mask import PillarLattice, symmetry
 
 
 def lens(count, *, x0=None):
@@ -15,7 +15,7 @@ def lens(count, *, x0=None):
     kinds = np.maximum(kinds, kinds.T)
     classes = kinds[across[:, None], across].astype(np.uint8)
     half = (count - 1) * 430 // 2
-    return Lattice.of(
+    return PillarLattice.of(
         "LENS", classes, pitch=430, x0=-half if x0 is None else x0, y0=half
     )
 
@@ -39,7 +39,7 @@ def test_the_placed_pieces_are_the_lens(count):
     """
     whole = lens(count)
     assert symmetry.is_square_symmetric(whole)
-    made = symmetry.pieces(whole)
+    made = symmetry.symmetry_pieces(whole)
     placed = []
     for piece in made:
         for quarters, mirrored in piece.placed:
@@ -56,7 +56,7 @@ def test_what_is_moved_or_turned_or_mirrored_into_something_else_is_no_such_lens
     good = lens(8)
     assert not symmetry.is_square_symmetric(lens(8, x0=good.x0 + 430))
     assert not symmetry.is_square_symmetric(
-        Lattice.of("LENS", good.whole(), pitch=430, x0=good.x0, y0=good.y0 - 430)
+        PillarLattice.of("LENS", good.whole(), pitch=430, x0=good.x0, y0=good.y0 - 430)
     )
     for change in (
         (0, 1),
@@ -69,11 +69,11 @@ def test_what_is_moved_or_turned_or_mirrored_into_something_else_is_no_such_lens
         for row in (y, 7 - y):
             for column in (x, 7 - x):
                 classes[row, column] = 9
-        moved = Lattice.of("LENS", classes, pitch=430, x0=good.x0, y0=good.y0)
+        moved = PillarLattice.of("LENS", classes, pitch=430, x0=good.x0, y0=good.y0)
         assert symmetry.is_square_symmetric(moved) is (x == y or 7 - y == x)
     for half in (np.s_[:4], np.s_[:, :4]):  # other above than below, or left than right
         classes = good.whole().copy()
         classes[half] = 0
         assert not symmetry.is_square_symmetric(
-            Lattice.of("LENS", classes, pitch=430, x0=good.x0, y0=good.y0)
+            PillarLattice.of("LENS", classes, pitch=430, x0=good.x0, y0=good.y0)
         )

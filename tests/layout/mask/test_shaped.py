@@ -23,9 +23,9 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
+from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
-from metalens.ground.errors import ProcessError
-from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.pillars import Proxy
 
 PROXY = Proxy(
@@ -182,7 +182,7 @@ def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, sh
         for low, high in ((45, 140), (60, 150))
     )
     axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
-    table = Pairs(
+    table = TwoSizeTable(
         np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf)
     )
     sizes = DiameterMap(size, 0.4, length_um=length)
@@ -289,7 +289,7 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
 )
 def test_what_is_not_drawn_is_refused_by_name(made, change, words):
     with pytest.raises(ProcessError, match=words):
-        build.prepare(made, dataclasses.replace(PROCESS, **change))
+        build.prepare_mask(made, dataclasses.replace(PROCESS, **change))
 
 
 LONE = dataclasses.replace(PROCESS, bias=Bias(isolated_nm=-14.0, range_um=0.6))
@@ -297,7 +297,7 @@ LONE = dataclasses.replace(PROCESS, bias=Bias(isolated_nm=-14.0, range_um=0.6))
 
 def drawn_of(made, process):
     """(y, x) class of every site, 0 for none."""
-    found = build.prepare(made, process)
+    found = build.prepare_mask(made, process)
     return found.cells.classes, (None, *found.plan.classes)
 
 
@@ -352,7 +352,7 @@ def test_a_round_pillar_of_a_hexagonal_lattice_lacks_what_is_missing_of_that_lat
 def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
     there = np.zeros((9, 12), bool)
     axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
-    pairs = Pairs(
+    pairs = TwoSizeTable(
         np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf)
     )
     there[::3, 1::3] = True  # 1.2 um apart: 6 ranges
@@ -389,7 +389,7 @@ def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
 
 def test_a_step_of_turns_divides_half_a_turn():
     with pytest.raises(ProcessError, match="angle_step_deg"):
-        processes.Rules(angle_step_deg=7.0)
+        processes.DesignRules(angle_step_deg=7.0)
 
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])
@@ -478,7 +478,7 @@ def test_a_class_is_as_wide_as_its_widest_corners_whatever_the_unit(unit_nm):
     """Corners of 240 by 132 nm lie 273.9 apart, turned or not; sizes are met to half a
     step of 2 nm.
     """
-    made, drawn = shaped.classes(lens(), PROCESS, unit_nm=unit_nm)
+    made, drawn = shaped.shape_classes(lens(), PROCESS, unit_nm=unit_nm)
     across, found, within = (
         getattr(made, f.name) for f in dataclasses.fields(made)[1:]
     )
@@ -656,7 +656,7 @@ def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
     x, y = made.diameters.x_um[column], made.diameters.y_um[row]
     plan = build.plan(made, PROCESS, furnished=False)
     for side, pillars in ((0.06, 0), (0.14, 1)):
-        zone = processes.Zone(x - side / 2, y - side / 2, side, side)
+        zone = processes.KeepOutZone(x - side / 2, y - side / 2, side, side)
         rules = dataclasses.replace(PROCESS.rules, exclusion=(zone,))
         assert check_plan(plan, rules).counts["exclusion"] == pillars
 
@@ -743,7 +743,7 @@ def test_sizes_are_rounded_by_no_more_than_is_told():
     made = dataclasses.replace(
         lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4)
     )
-    found = build.prepare(made, PROCESS)
+    found = build.prepare_mask(made, PROCESS)
     drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[
         found.cells.classes
     ]

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.mask.plan import Lattice
-from layout.mask.symmetry import is_square_symmetric, least, pieces
+from layout.mask.plan import PillarLattice
+from layout.mask.symmetry import is_square_symmetric, least_of_images, symmetry_pieces
 
 PITCH = 350
 
@@ -14,12 +14,12 @@ PITCH = 350
 def symmetric(n, seed=5):
     """(n, n) class numbers, unlike but for the eight symmetries, with empty sites."""
     values = np.random.default_rng(seed).integers(0, 200, (n, n)).astype(np.uint8)
-    return least(values)
+    return least_of_images(values)
 
 
 def lattice_of(values, pitch=PITCH):
     span = (values.shape[1] - 1) * pitch
-    return Lattice.of("LENS", values, pitch=pitch, x0=-span // 2, y0=span // 2)
+    return PillarLattice.of("LENS", values, pitch=pitch, x0=-span // 2, y0=span // 2)
 
 
 def places(lattice):
@@ -41,7 +41,7 @@ def test_pieces_turned_and_mirrored_cover_every_pillar_once(n):
     whole = lattice_of(symmetric(n))
     assert is_square_symmetric(whole)
     found, count = {}, 0
-    for piece in pieces(whole):
+    for piece in symmetry_pieces(whole):
         for quarter, flip in piece.placed:
             for (x, y), kind in places(piece.lattice).items():
                 at = x, -y if flip else y
@@ -51,7 +51,7 @@ def test_pieces_turned_and_mirrored_cover_every_pillar_once(n):
                 count += 1
     assert found == places(whole)
     assert count == len(found)
-    assert [piece.lattice.name[-2:] for piece in pieces(whole)] == [
+    assert [piece.lattice.name[-2:] for piece in symmetry_pieces(whole)] == [
         "_8",
         "_D",
         *(["_A", "_C"] if n % 2 else []),
@@ -61,7 +61,7 @@ def test_pieces_turned_and_mirrored_cover_every_pillar_once(n):
 def test_what_is_missing_of_a_piece_is_no_piece():
     values = np.zeros((5, 5), np.uint8)
     values[2, 2] = 7
-    (centre,) = pieces(lattice_of(values))
+    (centre,) = symmetry_pieces(lattice_of(values))
     assert centre.placed == ((0, False),)
     assert places(centre.lattice) == {(0, 0): 7}
 
@@ -97,7 +97,7 @@ def test_lattices_off_the_middle_small_or_of_unlike_rows_are_left_whole():
 
 def test_the_least_of_eight_images():
     values = np.arange(16.0).reshape(4, 4)[::-1]
-    found = least(values)
+    found = least_of_images(values)
     assert found == pytest.approx(
         np.array([[0, 1, 1, 0], [1, 5, 5, 1], [1, 5, 5, 1], [0, 1, 1, 0]])
     )

@@ -11,10 +11,10 @@ import layout
 from layout.drc import check_plan
 from layout.formats import flatten
 from layout.mask import tone
-from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
-from layout.process.process import Die, Exposure, Process, Rules
+from layout.mask.plan import FigureCell, MaskPlan, PillarLattice, pillar_classes
+from layout.process.process import DesignRules, DieSettings, ExposureSettings, Process
 from layout.shapes import rectilinear
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
 
 STEP_ONE = (
@@ -24,7 +24,7 @@ STEP_ONE = (
     5,
     6,
 )  # layer numbers of the exposure of the pillars: pillars, marks, label, dose test, witness
-FINE, COARSE = Rules(), Rules(grid_nm=5, diameter_step_nm=5)
+FINE, COARSE = DesignRules(), DesignRules(grid_nm=5, diameter_step_nm=5)
 
 
 def with_empty_rows(pitch):
@@ -80,7 +80,7 @@ def region_of(path):
 def test_both_tones_together_are_the_die_and_share_nothing(
     make, pitch, rules, tmp_path
 ):
-    process = Process(rules=rules, die=Die(label="R8 O"))
+    process = Process(rules=rules, die=DieSettings(label="R8 O"))
     _, positive = written(make(pitch), process, tmp_path, "positive")
     plan, negative = written(make(pitch), process, tmp_path, "negative")
     stays, die, _ = region_of(positive)
@@ -117,7 +117,7 @@ def test_every_point_of_the_lens_is_a_pillar_or_drawn_once(tmp_path):
     content = layout.read_gdsii(path)
     polygons = [
         shape.outline + np.array([x, y])
-        for shape in flatten.shapes(content, "METALENS")
+        for shape in flatten.flatten_shapes(content, "METALENS")
         for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True)
     ]
     points = np.random.default_rng(0).uniform((-4598, -3798), (4598, 3798), (4000, 2))
@@ -146,10 +146,12 @@ def bare(figures=(), pitch=400, diameter=200):
         vertices=16,
         shape="round",
     )
-    lattice = Lattice.of("LENS", np.ones((2, 3), np.uint8), pitch=pitch, x0=0, y0=0)
-    outline = Figure(
+    lattice = PillarLattice.of(
+        "LENS", np.ones((2, 3), np.uint8), pitch=pitch, x0=0, y0=0
+    )
+    outline = FigureCell(
         "OUTLINE",
-        {(10, 0): (rectilinear.corners(np.array([-40000, -40000, 50000, 50000])),)},
+        {(10, 0): (rectilinear.box_corners(np.array([-40000, -40000, 50000, 50000])),)},
     )
     return MaskPlan("TOP", made, (lattice,), figures=(*figures, outline))
 
@@ -163,17 +165,17 @@ def test_thin_marks_and_narrow_gaps_of_a_negative_mask_are_seen(arm, gap, broken
         np.array([0, 9000, 5000, 9000 + arm]),
         np.array([0, 9000 + arm + gap, 5000, 12000]),
     ]
-    marks = Figure("MARKS", {(3, 0): tuple(map(rectilinear.corners, bars))})
-    negative = tone.inverted(
-        bare([marks]), Process(tone="negative", exposure=Exposure())
+    marks = FigureCell("MARKS", {(3, 0): tuple(map(rectilinear.box_corners, bars))})
+    negative = tone.reverse_tone(
+        bare([marks]), Process(tone="negative", exposure=ExposureSettings())
     )
-    found = check_plan(negative, Rules())
+    found = check_plan(negative, DesignRules())
     assert {rule for rule, count in found.counts.items() if count} == set(broken)
 
 
 def test_a_pillar_wider_than_its_square_is_refused():
     with pytest.raises(ProcessError, match=r"wider than the lattice square of 400"):
-        tone.inverted(bare(diameter=412), Process(tone="negative"))
+        tone.reverse_tone(bare(diameter=412), Process(tone="negative"))
 
 
 def test_a_full_lattice_without_a_die_is_framed_by_one_pitch_and_has_nothing_to_clear():
@@ -181,7 +183,7 @@ def test_a_full_lattice_without_a_die_is_framed_by_one_pitch_and_has_nothing_to_
     1000, and from -600 to 200.
     """
     plan = bare()
-    negative = tone.inverted(plan.replace(figures=()), Process(tone="negative"))
+    negative = tone.reverse_tone(plan.replace(figures=()), Process(tone="negative"))
     (rim,) = negative.figures
     assert rim.name == "RIM"
     ((layer, shapes),) = rim.polygons.items()
@@ -199,13 +201,15 @@ def test_a_full_lattice_without_a_die_is_framed_by_one_pitch_and_has_nothing_to_
 @pytest.mark.parametrize("way", [(-1, 0), (1, 0), (0, -1), (0, 1)])
 def test_a_pillar_beyond_any_side_of_its_square_is_refused(way):
     """200 wide on 400: up to 100 to either side stays inside."""
-    plan, pillar = bare(), rectilinear.corners(np.array([-100, -100, 100, 100]))
+    plan, pillar = bare(), rectilinear.box_corners(np.array([-100, -100, 100, 100]))
     for share, stands in ((100, True), (101, False)):
         moved = dataclasses.replace(
             plan.classes[0], outline=pillar + np.array(way) * share
         )
         if stands:
-            tone.inverted(plan.replace(classes=(moved,)), Process(tone="negative"))
+            tone.reverse_tone(plan.replace(classes=(moved,)), Process(tone="negative"))
         else:
             with pytest.raises(ProcessError, match="200 by 200 units"):
-                tone.inverted(plan.replace(classes=(moved,)), Process(tone="negative"))
+                tone.reverse_tone(
+                    plan.replace(classes=(moved,)), Process(tone="negative")
+                )

@@ -5,9 +5,9 @@ sites, windows, what is left.
 import numpy as np
 import pytest
 
-from layout.mask import Figure, Lattice, MaskPlan, PillarClass, tone
+from layout.mask import FigureCell, MaskPlan, PillarClass, PillarLattice, tone
 from layout.process.process import Process
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 SITES = np.array(
     [[1, 0, 0, 1, 0], [0, 0, 0, 2, 0], [0, 0, 0, 2, 2], [1, 0, 0, 0, 0]], np.uint8
@@ -17,7 +17,7 @@ SITES = np.array(
 def lattice(sites=SITES, **more):
     rows, columns = sites.shape
     about = {"row_pitch": 300} | more
-    return Lattice(
+    return PillarLattice(
         "LENS", rows, columns, 412, -8, 1008, lambda a, b: sites[a:b], sites, **about
     )
 
@@ -131,7 +131,7 @@ def test_of_a_hexagonal_lattice_a_brick_covers_two_columns():
 
 
 def test_without_a_die_a_rim_of_one_pitch_goes_around():
-    made = tone.inverted(plan(), Process())
+    made = tone.reverse_tone(plan(), Process())
     rim, clear = made.figures
     assert (rim.name, clear.name, list(rim.polygons), list(clear.polygons)) == (
         "RIM",
@@ -151,13 +151,13 @@ def test_without_a_die_a_rim_of_one_pitch_goes_around():
     assert (made.standing.figures, made.name) == ((), "TOP")
 
 
-DIE = Figure("OUTLINE", {(10, 0): (box(-20_000, -16_000, 24_000, 18_000),)})
-MARKS = Figure(
+DIE = FigureCell("OUTLINE", {(10, 0): (box(-20_000, -16_000, 24_000, 18_000),)})
+MARKS = FigureCell(
     "MARKS",
     {(3, 0): (box(-18_000, 8000, -13_000, 10_000), box(-10_500, 9000, -9000, 9500))},
 )
-LABEL = Figure("LABEL", {(4, 0): (box(12_000, -15_000, 15_000, -14_000),)})
-APERTURE = Figure("APERTURE", {(2, 0): (box(-900, -900, 900, 900),)})
+LABEL = FigureCell("LABEL", {(4, 0): (box(12_000, -15_000, 15_000, -14_000),)})
+APERTURE = FigureCell("APERTURE", {(2, 0): (box(-900, -900, 900, 900),)})
 
 
 def test_windows_of_5_um_are_cut_at_the_die_and_at_each_other():
@@ -167,7 +167,7 @@ def test_windows_of_5_um_are_cut_at_the_die_and_at_each_other():
     process = Process()
     made = {
         f.name: f
-        for f in tone.inverted(plan(MARKS, LABEL, DIE, APERTURE), process).figures
+        for f in tone.reverse_tone(plan(MARKS, LABEL, DIE, APERTURE), process).figures
     }
     assert set(made) == {"MARKS", "LABEL", "OUTLINE", "APERTURE", "FRAME", "CLEAR"}
     first = (20_000 - 10_500) * 7000
@@ -186,15 +186,17 @@ def test_two_figures_share_no_window_and_lattices_stay_as_they_are():
     """The second figure's window, 3000 units to the right of the first's bar, begins
     where the first's ends.
     """
-    one = Figure("MARKS", {(3, 0): (box(-12_000, 8000, -11_000, 9000),)})
-    two = Figure("LABEL", {(4, 0): (box(-8000, 8000, -7000, 9000),)})
-    made = {f.name: f for f in tone.inverted(plan(one, two, DIE), Process()).figures}
+    one = FigureCell("MARKS", {(3, 0): (box(-12_000, 8000, -11_000, 9000),)})
+    two = FigureCell("LABEL", {(4, 0): (box(-8000, 8000, -7000, 9000),)})
+    made = {
+        f.name: f for f in tone.reverse_tone(plan(one, two, DIE), Process()).figures
+    }
     assert total(made["MARKS"].polygons[3, 0]) == 6000 * 6000 - 1000 * 1000
     assert total(made["LABEL"].polygons[4, 0]) == 4000 * 6000 - 1000 * 1000
-    near = Figure(
+    near = FigureCell(
         "MARKS", {(3, 0): (box(-1000, 1600, 1000, 2000),)}
     )  # its window reaches over the lens from above
-    made = {f.name: f for f in tone.inverted(plan(near, DIE), Process()).figures}
+    made = {f.name: f for f in tone.reverse_tone(plan(near, DIE), Process()).figures}
     over = (1848 + 212) * (1160 + 40)
     window = 7000 * (4500 + 900)
     assert total(made["MARKS"].polygons[3, 0]) == window - 2000 * 400 - over
@@ -202,7 +204,7 @@ def test_two_figures_share_no_window_and_lattices_stay_as_they_are():
 
 def test_lattices_of_two_pitches_are_refused():
     two = plan().replace(
-        lattices=(lattice(), Lattice.of("MORE", SITES, pitch=500, x0=9000, y0=0))
+        lattices=(lattice(), PillarLattice.of("MORE", SITES, pitch=500, x0=9000, y0=0))
     )
     with pytest.raises(ProcessError, match=r"lattices of pitches \[412, 500\]"):
-        tone.inverted(two, Process())
+        tone.reverse_tone(two, Process())

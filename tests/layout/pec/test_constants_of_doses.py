@@ -7,8 +7,8 @@ import pytest
 
 from layout.pec import fracture
 from layout.pec.bodies import PillarArray
-from layout.pec.nodes import Axis, Grid, gather, spread
-from layout.pec.psf import PointExposure, fit
+from layout.pec.nodes import NodeAxis, NodeGrid, gather_to_nodes, interpolate_from_nodes
+from layout.pec.psf import PointExposure, fit_point_spread
 
 RNG = np.random.default_rng(8)
 NOTHING = np.empty((0, 4))
@@ -55,7 +55,9 @@ def test_a_table_that_begins_far_inside_its_second_radius_is_fitted_as_finely_as
     """
     radius = np.r_[0.01, np.geomspace(4.0, 60.0, 40)]
     width = 17.3
-    found = fit(radius, np.exp(-((radius / width) ** 2)) / (np.pi * width**2) + 1e-7)
+    found = fit_point_spread(
+        radius, np.exp(-((radius / width) ** 2)) / (np.pi * width**2) + 1e-7
+    )
     assert found.widths_um.min() > 0
     steps = np.log2(found.widths_um / 0.01)
     spacing = np.log2(60.0 / 0.01) / np.ceil(4 * np.log2(60.0 / 0.01))
@@ -65,8 +67,8 @@ def test_a_table_that_begins_far_inside_its_second_radius_is_fitted_as_finely_as
 @pytest.mark.parametrize("tall", [True, False])
 def test_nodes_wider_than_tall_and_taller_than_wide_serve_alike(tall):
     """Sites by the compiled loops, against the interpolation at each place."""
-    short, long = Axis.over(-3.1, 4.9, 1.7), Axis.over(2.3, 41.5, 1.7)
-    grid = Grid(long, short) if tall else Grid(short, long)
+    short, long = NodeAxis.over(-3.1, 4.9, 1.7), NodeAxis.over(2.3, 41.5, 1.7)
+    grid = NodeGrid(long, short) if tall else NodeGrid(short, long)
     index = RNG.integers(0, 3, (23, 4) if tall else (4, 23)).astype(np.uint8)
     left, bottom = (-1.2, 5.0) if tall else (5.0, -1.2)
     body = PillarArray(
@@ -75,12 +77,12 @@ def test_nodes_wider_than_tall_and_taller_than_wide_serve_alike(tall):
     y, x = np.meshgrid(body.rows_um(0, len(index)), body.columns_um, indexing="ij")
     lines = *grid.y.at(body.rows_um(0, len(index))), *grid.x.at(body.columns_um)
     nodes, sites = RNG.normal(size=grid.shape), np.empty(index.shape, np.float32)
-    spread(nodes, *lines, sites)
+    interpolate_from_nodes(nodes, *lines, sites)
     assert sites.ravel() == pytest.approx(
         grid.sample(nodes, x.ravel(), y.ravel()), rel=1e-5, abs=1e-5
     )
     value, out = np.array([[0.0, 1.3, 0.4]]), np.zeros((1, *grid.shape))
-    gather(index, value, *lines, out)
+    gather_to_nodes(index, value, *lines, out)
     assert out[0] == pytest.approx(
         grid.deposit(x.ravel(), y.ravel(), value[0][index].ravel()), abs=1e-9
     )

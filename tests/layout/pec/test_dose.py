@@ -10,8 +10,8 @@ import pytest
 from layout.pec import correct as dose
 from layout.pec.bodies import NONE
 from layout.pec.psf import PointExposure, point_exposure, rim_of_own_disc
-from layout.process.process import Exposure, Process
-from metalens.ground.errors import ProcessError
+from layout.process.process import ExposureSettings, Process
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
 from tests.referees.rims import at_edges
 
@@ -22,7 +22,9 @@ POINT = {"alpha_um": 0.01, "beta_um": 31.0, "eta": 0.6}  # a 100 kV beam on fuse
 
 
 def process(**options):
-    return Process(exposure=Exposure(**(({} if "csv" in options else POINT) | options)))
+    return Process(
+        exposure=ExposureSettings(**(({} if "csv" in options else POINT) | options))
+    )
 
 
 def ragged_patch(n=57, seed=1):

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import erf
 
-from layout.pec.drawn import Discs, Outlines
+from layout.pec.drawn import DrawnDiscs, DrawnOutlines
 from layout.pec.psf import PointExposure
 
 POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))
@@ -21,7 +21,7 @@ def round_ones(count=256):
     turn = 2 * math.pi * np.arange(count) / count
     swell = math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
     corners = swell * D / 2 * np.stack([np.cos(turn), np.sin(turn)], -1)
-    return Outlines([(), [corners + OFF]]), Discs(np.array([0.0, D]))
+    return DrawnOutlines([(), [corners + OFF]]), DrawnDiscs(np.array([0.0, D]))
 
 
 def test_the_polygon_of_a_circle_exposes_as_the_disc_does():
@@ -45,7 +45,7 @@ def test_a_rectangle_and_its_hole_are_products_of_error_functions():
     def box(a, b):
         return np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
 
-    shape = Outlines([(), [box(0.13, 0.06), box(0.05, 0.021)[::-1]]])
+    shape = DrawnOutlines([(), [box(0.13, 0.06), box(0.05, 0.021)[::-1]]])
     at, width = np.array([[0.13, 0.03], [0.01, 0.02], [0.2, -0.07]]), 0.03
 
     def plain(a, b):
@@ -110,13 +110,13 @@ def test_a_turn_leaves_the_level_of_a_shape_as_it_is(sides, turn_deg):
         [[c, s], [-s, c]]
     )
     want = level_of_a_rectangle(a, b)
-    assert Outlines([(), [corners + OFF]]).edges(ONE, POINT)[0][1] == pytest.approx(
-        want, rel=5e-4
-    )
+    assert DrawnOutlines([(), [corners + OFF]]).edges(ONE, POINT)[0][
+        1
+    ] == pytest.approx(want, rel=5e-4)
 
 
 def test_edges_are_seen_from_places_that_divide_them():
-    discs = Discs(np.array([0.0, 0.31, D]))
+    discs = DrawnDiscs(np.array([0.0, 0.31, D]))
     around = discs.edge_um(2)
     assert np.hypot(*around.T) == pytest.approx(D / 2)
     steps = np.linalg.norm(around - np.roll(around, -1, axis=0), axis=1)
@@ -124,7 +124,7 @@ def test_edges_are_seen_from_places_that_divide_them():
         D * math.sin(math.pi / len(around))
     )  # of a regular polygon
     assert discs.edge_um(1) == pytest.approx(around * 0.31 / D)
-    box = Outlines(
+    box = DrawnOutlines(
         [(), [np.array([[1.0, 2.0], [1.3, 2.0], [1.3, 2.1], [1.0, 2.1]])]]
     ).edge_um(1)
     assert len(box) == 48  # 18 along each long side, 6 along each short one
@@ -143,9 +143,9 @@ def test_the_widest_reach_farthest_along_the_steps_of_those_used():
         np.array([False, True, True, False, True]),
         np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]]),
     )
-    assert Outlines([(), *outlines]).widest(used, steps) == [1, 2]
-    assert Outlines([(), *outlines]).widest(used, steps[:1]) == [1]
-    assert Discs(np.array([0.0, 0.2, 0.3, 0.4])).widest(
+    assert DrawnOutlines([(), *outlines]).widest(used, steps) == [1, 2]
+    assert DrawnOutlines([(), *outlines]).widest(used, steps[:1]) == [1]
+    assert DrawnDiscs(np.array([0.0, 0.2, 0.3, 0.4])).widest(
         np.array([False, True, True, False]), steps
     ) == [2]
 

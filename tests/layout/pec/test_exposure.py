@@ -6,14 +6,14 @@ import pytest
 from layout.pec.psf import (
     PointExposure,
     _fit_error,
-    disc,
-    fit,
+    disc_exposure,
+    fit_point_spread,
     point_exposure,
     rim_of_own_disc,
     slope_at_rim,
 )
-from layout.process.process import Exposure
-from metalens.ground.errors import ProcessError
+from layout.process.process import ExposureSettings
+from metalens.core.errors import ProcessError
 from tests.referees.rims import at_edges
 
 GOLD = np.pi * (3 - np.sqrt(5))
@@ -37,7 +37,7 @@ def test_exposure_by_a_disc_is_the_integral_of_the_point_exposure(distance, widt
     points = disc_points(0.1)
     r2 = (points[:, 0] - distance) ** 2 + points[:, 1] ** 2
     want = np.exp(-r2 / width**2).mean() * 0.1**2 / width**2
-    assert disc(distance, 0.2, width) == pytest.approx(
+    assert disc_exposure(distance, 0.2, width) == pytest.approx(
         want, rel=1e-3
     )  # the sum over 40 000 points: 5e-4
 
@@ -45,10 +45,12 @@ def test_exposure_by_a_disc_is_the_integral_of_the_point_exposure(distance, widt
 @pytest.mark.parametrize("width", [0.002, 0.01, 0.1, 1.0, 30.0])
 def test_own_rim_and_its_slope_are_the_disc_seen_at_its_radius(width):
     assert rim_of_own_disc(0.2, width) == pytest.approx(
-        float(disc(0.1, 0.2, width)), rel=1e-9
+        float(disc_exposure(0.1, 0.2, width)), rel=1e-9
     )
     h = 1e-4 * min(width, 0.1)
-    slope = (disc(0.1 - h, 0.2, width) - disc(0.1 + h, 0.2, width)) / (2 * h)
+    slope = (
+        disc_exposure(0.1 - h, 0.2, width) - disc_exposure(0.1 + h, 0.2, width)
+    ) / (2 * h)
     assert slope_at_rim(0.2, width) == pytest.approx(float(slope), rel=1e-5)
 
 
@@ -59,7 +61,7 @@ def test_a_wide_disc_clears_at_one_half():
 
 
 def test_the_double_gaussian_holds_all_energy_in_the_asked_ratio():
-    point = point_exposure(Exposure(alpha_um=0.01, beta_um=31.0, eta=0.6))
+    point = point_exposure(ExposureSettings(alpha_um=0.01, beta_um=31.0, eta=0.6))
     assert point.within(np.array([1.0, 1e4])) == pytest.approx(
         [1 / 1.6 + 0.6 / 1.6 * -np.expm1(-(31.0**-2)), 1]
     )
@@ -73,7 +75,7 @@ def test_the_double_gaussian_holds_all_energy_in_the_asked_ratio():
 def test_a_table_of_a_double_gaussian_is_fitted_to_its_energy():
     truth = PointExposure(np.array([0.012, 9.0]), np.array([1.0, 0.7]) / 1.7)
     radius = np.geomspace(0.003, 30, 120)
-    found = fit(radius, 17.0 * truth.density(radius))
+    found = fit_point_spread(radius, 17.0 * truth.density(radius))
     probe = np.array([0.02, 0.1, 1.0, 5.0, 9.0, 20.0])
     assert found.weights.sum() == pytest.approx(1)
     assert abs(found.within(probe) - truth.within(probe)).max() < 0.01
@@ -85,7 +87,7 @@ def test_a_power_law_tail_is_fitted_where_two_gaussians_fail():
     # form
     core = 0.01
     radius = np.geomspace(0.002, 50, 150)
-    found = fit(radius, (1 + (radius / core) ** 2) ** -1.5)
+    found = fit_point_spread(radius, (1 + (radius / core) ** 2) ** -1.5)
     probe = np.array([0.01, 0.03, 0.1, 1.0, 10.0])
     want = 1 - 1 / np.sqrt(1 + (probe / core) ** 2)
     assert abs(found.within(probe) - want).max() < 0.01
@@ -106,7 +108,7 @@ def test_a_power_law_tail_is_fitted_where_two_gaussians_fail():
 )
 def test_an_impossible_table_is_refused(radius, density):
     with pytest.raises(ProcessError, match="at least 4 rising radii"):
-        fit(np.array(radius, float), np.array(density, float))
+        fit_point_spread(np.array(radius, float), np.array(density, float))
 
 
 def test_edges_of_two_pillars_see_each_other():
@@ -117,7 +119,7 @@ def test_edges_of_two_pillars_see_each_other():
     )
     angle = np.linspace(0, 2 * np.pi, 2001)[:-1]
     distance = np.hypot(0.1 * np.cos(angle) - 0.4, 0.1 * np.sin(angle))
-    want = rim_of_own_disc(0.2, 0.3) + 2 * disc(distance, 0.1, 0.3).mean()
+    want = rim_of_own_disc(0.2, 0.3) + 2 * disc_exposure(distance, 0.1, 0.3).mean()
     assert got[0] == pytest.approx(float(want), rel=1e-9)
 
 

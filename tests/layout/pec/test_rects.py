@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from layout.pec import rects
-from layout.pec.bodies import Rects
+from layout.pec.bodies import ExposedRectangles
 from layout.pec.psf import PointExposure
 
 ALPHA_UM = 0.05
@@ -35,8 +35,10 @@ def test_edges_of_letters_are_even_where_rows_end_over_a_piece():
             )
         ]
     )
-    cut = Rects(boxes * 1e-3, np.zeros(len(boxes), int), np.ones(len(boxes)))
-    own, points, piece = rects.own(
+    cut = ExposedRectangles(
+        boxes * 1e-3, np.zeros(len(boxes), int), np.ones(len(boxes))
+    )
+    own, points, piece = rects.self_exposure(
         cut, PointExposure(np.array([ALPHA_UM]), np.array([1.0]))
     )
     assert set(piece.tolist()) == set(range(len(boxes)))
@@ -74,8 +76,10 @@ def test_a_row_that_ends_over_the_middle_of_a_side_leaves_its_free_half(off):
     boxes = np.array(
         [[0.1, 0.2, 1.3, 0.9], [0.7 + off, 0.9, 2.0, 1.5], [1.3, 0.2, 2.0, 0.9]]
     )
-    cut = Rects(boxes, np.zeros(3, int), np.ones(3))
-    _, points, piece = rects.own(cut, PointExposure(np.array([0.02]), np.array([1.0])))
+    cut = ExposedRectangles(boxes, np.zeros(3, int), np.ones(3))
+    _, points, piece = rects.self_exposure(
+        cut, PointExposure(np.array([0.02]), np.array([1.0]))
+    )
     first = sorted(map(tuple, points[piece == 0].round(9).tolist()))
     # below, the side runs on to 2.0: of its 0.1 to 1.3 two ranges at the corner count
     # for nothing
@@ -94,8 +98,8 @@ def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
     ]  # an arm 1.3 wide in slabs, then a foot of 0.2 at its side
     boxes = np.array([[0.3, low, 1.6, high] for low, high in itertools.pairwise(ends)])
     boxes = np.vstack([boxes, [[1.6, 0.3, 1.8, 0.5]]])
-    cut = Rects(boxes, np.zeros(4, int), np.ones(4))
-    _, points, piece = rects.own(
+    cut = ExposedRectangles(boxes, np.zeros(4, int), np.ones(4))
+    _, points, piece = rects.self_exposure(
         cut, PointExposure(np.array([0.05, 40.0]), np.array([0.6, 0.4]))
     )
     found = [sorted(map(tuple, points[piece == n].round(9).tolist())) for n in range(4)]
@@ -108,7 +112,7 @@ def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
     ]  # the top runs on over the foot, the right one to it
     assert found[3] == [(1.65, 0.5)]
     core = PointExposure(np.array([0.05]), np.array([0.6]))
-    assert rects.own(cut, core)[0][1] == pytest.approx(
+    assert rects.self_exposure(cut, core)[0][1] == pytest.approx(
         0.6 * (0.5 * erf(0.13 / 0.05) / 2 + 0.25), abs=1e-4
     )
 
@@ -116,7 +120,9 @@ def test_a_dose_at_the_end_of_an_arm_is_judged_where_the_edge_is_straight():
 def test_samples_of_rectangles_stand_in_the_middle_of_cells_no_longer_than_a_step():
     """The first in 4 by 2 cells of a quarter, the second, 0.6 by 0.2, in 3 by 1."""
     boxes = np.array([[0.0, 1.0, 1.0, 1.5], [5.0, 5.0, 5.6, 5.2]])
-    points, area, of = rects.samples(Rects(boxes, np.zeros(2, int), np.ones(2)), 0.25)
+    points, area, of = rects.rectangle_samples(
+        ExposedRectangles(boxes, np.zeros(2, int), np.ones(2)), 0.25
+    )
     first = [(0.125 + 0.25 * i, 1.125 + 0.25 * j) for j in range(2) for i in range(4)]
     assert points == pytest.approx(
         np.array([*first, (5.1, 5.1), (5.3, 5.1), (5.5, 5.1)]), abs=1e-12
@@ -197,8 +203,8 @@ def test_a_piece_within_others_has_the_exposure_of_its_middle_less_half(interpre
     boxes, middle = nine()
     point = PointExposure(np.array([0.1, 1.7]), np.array([0.6, 0.4]))
     more = np.vstack([boxes, [[5.0, 0.2, 6.0, 2.9]]])
-    exposure, at, of = rects.own(
-        Rects(more, np.r_[np.zeros(9, int), 1], np.ones(10)), point
+    exposure, at, of = rects.self_exposure(
+        ExposedRectangles(more, np.r_[np.zeros(9, int), 1], np.ones(10)), point
     )
     ((x, y),) = at[of == middle]
     assert (x, y) == pytest.approx((1.85, 1.6))
@@ -215,8 +221,12 @@ def test_a_piece_within_others_has_the_exposure_of_its_middle_less_half(interpre
 def test_pieces_in_another_order_have_the_same_points(interpreted):
     boxes, _ = nine()
     point = PointExposure(np.array([0.1]), np.array([1.0]))
-    first = rects.own(Rects(boxes, np.zeros(9, int), np.ones(9)), point)
-    turned = rects.own(Rects(boxes[::-1], np.zeros(9, int), np.ones(9)), point)
+    first = rects.self_exposure(
+        ExposedRectangles(boxes, np.zeros(9, int), np.ones(9)), point
+    )
+    turned = rects.self_exposure(
+        ExposedRectangles(boxes[::-1], np.zeros(9, int), np.ones(9)), point
+    )
     assert turned[0][::-1] == pytest.approx(first[0])
     assert sorted(map(tuple, turned[1])) == sorted(map(tuple, first[1]))
 
@@ -227,7 +237,9 @@ def test_without_a_gaussian_there_is_no_exposure_and_an_edge_is_straight_to_its_
     """Two boxes that abut: three free sides each, judged in their middles."""
     boxes = np.array([[0.0, 0.0, 2.0, 1.0], [2.0, 0.0, 3.0, 1.0]])
     none = PointExposure(np.empty(0), np.empty(0))
-    exposure, at, of = rects.own(Rects(boxes, np.zeros(2, int), np.ones(2)), none)
+    exposure, at, of = rects.self_exposure(
+        ExposedRectangles(boxes, np.zeros(2, int), np.ones(2)), none
+    )
     assert exposure.tolist() == [0.0, 0.0]
     assert sorted(map(tuple, at[of == 0])) == [(0.0, 0.5), (1.0, 0.0), (1.0, 1.0)]
     assert sorted(map(tuple, at[of == 1])) == [(2.5, 0.0), (2.5, 1.0), (3.0, 0.5)]
@@ -235,13 +247,18 @@ def test_without_a_gaussian_there_is_no_exposure_and_an_edge_is_straight_to_its_
 
 def test_one_box_alone_has_four_sides(interpreted):
     point = PointExposure(np.array([0.05]), np.array([1.0]))
-    exposure, at, of = rects.own(
-        Rects(np.array([[0.0, 0.0, 3.0, 2.0]]), np.zeros(1, int), np.ones(1)), point
+    exposure, at, of = rects.self_exposure(
+        ExposedRectangles(
+            np.array([[0.0, 0.0, 3.0, 2.0]]), np.zeros(1, int), np.ones(1)
+        ),
+        point,
     )
     assert sorted(map(tuple, at)) == [(0.0, 1.0), (1.5, 0.0), (1.5, 2.0), (3.0, 1.0)]
     assert of.tolist() == [0] * 4
     assert exposure == pytest.approx([0.5])
-    nothing = rects.own(Rects(np.empty((0, 4)), np.empty(0, int), np.empty(0)), point)
+    nothing = rects.self_exposure(
+        ExposedRectangles(np.empty((0, 4)), np.empty(0, int), np.empty(0)), point
+    )
     assert [part.shape for part in nothing] == [(0,), (0, 2), (0,)]
 
 
@@ -281,7 +298,9 @@ def test_what_neighbours_leave_of_a_side_are_its_free_parts(interpreted):
         ]
     )
     none = PointExposure(np.empty(0), np.empty(0))
-    _, at, of = rects.own(Rects(boxes, np.zeros(4, int), np.ones(4)), none)
+    _, at, of = rects.self_exposure(
+        ExposedRectangles(boxes, np.zeros(4, int), np.ones(4)), none
+    )
     top = [(0.5, 2.0), (2.5, 2.0), (4.45, 2.0)]
     assert sorted(map(tuple, at[of == 0].round(9))) == sorted(
         [(0.0, 1.0), (2.5, 0.0), (5.0, 0.25), *top]

@@ -9,7 +9,7 @@ import pytest
 
 from layout.pec import correct
 from layout.pec.psf import THRESHOLD
-from layout.pec.uniformity import Tally
+from layout.pec.uniformity import ErrorTally
 
 RNG = np.random.default_rng(13)
 SHAPE = (4, 5)
@@ -96,7 +96,7 @@ def test_worst_and_rms_are_over_all_that_was_taken_in_and_become_a_diameter_by_t
     """Errors of -0.03 and 0.02 in two parts, squares over 7 edges; a background that is
     off by 0.004; 9.1 per um.
     """
-    tally = Tally()
+    tally = ErrorTally()
     tally.merge(np.array([-0.03, 0.01, 0.0019, 3.0]))
     tally.merge(np.array([-0.01, 0.02, 0.0008, 4.0]))
     assert tally.worst == pytest.approx(0.03)
@@ -104,4 +104,4 @@ def test_worst_and_rms_are_over_all_that_was_taken_in_and_become_a_diameter_by_t
     assert found.worst == pytest.approx(0.034)
     assert found.rms == pytest.approx((0.0027 / 7) ** 0.5 + 0.004)
     assert found.diameter_nm == pytest.approx(2 * 0.034 / 9.1 * 1e3)  # both edges, nm
-    assert Tally().worst == 0
+    assert ErrorTally().worst == 0

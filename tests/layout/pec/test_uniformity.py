@@ -5,11 +5,11 @@ follows from the slope.
 import numpy as np
 import pytest
 
-from layout.pec.uniformity import Tally
+from layout.pec.uniformity import ErrorTally
 
 
 def test_the_worst_error_may_lie_below():
-    tally = Tally()
+    tally = ErrorTally()
     tally.merge(np.array([-0.03, 0.01, 0.0011, 3.0]))
     tally.merge(np.array([-0.02, 0.004, 0.0005, 2.0]))
     assert tally.worst == 0.03
@@ -21,7 +21,7 @@ def test_the_worst_error_may_lie_below():
 
 
 def test_or_above():
-    tally = Tally()
+    tally = ErrorTally()
     tally.merge(np.array([-0.01, 0.07, 0.0049, 1.0]))
     assert tally.worst == 0.07
     assert tally.result(slope=2.0, shift=0.001).rms == pytest.approx(
@@ -30,5 +30,5 @@ def test_or_above():
 
 
 def test_nothing_taken_in_is_no_error():
-    assert Tally().worst == 0.0
-    assert Tally().result(2.0, 0.0).rms == 0.0
+    assert ErrorTally().worst == 0.0
+    assert ErrorTally().result(2.0, 0.0).rms == 0.0

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from layout.process.isolation import isolation
-from metalens.ground.errors import ProcessError
+from layout.process.isolation import isolation_map
+from metalens.core.errors import ProcessError
 
 
 @pytest.mark.parametrize(("pitch_um", "range_um"), [(0.41, 0.37), (0.3, 0.83)])
@@ -19,21 +19,21 @@ def test_isolation_is_the_share_of_weight_that_is_missing(pitch_um, range_um):
     weight = np.exp(-(step[:, None] ** 2 + step**2) / range_um**2)
     weight[reach, reach] = 0.0
     around = np.pad(present, reach).astype(float)
-    got = isolation(present, (pitch_um, pitch_um), range_um)
+    got = isolation_map(present, (pitch_um, pitch_um), range_um)
     for y, x in ((0, 0), (5, 8), (12, 95), (13, 97), (22, 109), (7, 3)):
         stood = (around[y : y + 2 * reach + 1, x : x + 2 * reach + 1] * weight).sum()
         assert got[y, x] == pytest.approx(1 - stood / weight.sum(), abs=2e-6)  # float32
     assert (
-        isolation(np.ones((40, 40), bool), (pitch_um, pitch_um), range_um)[
+        isolation_map(np.ones((40, 40), bool), (pitch_um, pitch_um), range_um)[
             15:25, 15:25
         ].max()
         < 1e-6
     )
     alone = np.zeros((31, 31), bool)
     alone[14, 17] = True
-    assert isolation(alone, (pitch_um, pitch_um), range_um)[14, 17] == pytest.approx(
-        1.0
-    )
+    assert isolation_map(alone, (pitch_um, pitch_um), range_um)[
+        14, 17
+    ] == pytest.approx(1.0)
 
 
 def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
@@ -47,7 +47,7 @@ def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
     present = site & (rng.uniform(size=site.shape) > 0.3)
     present[20, 56] = present[40, 116] = True
     y, x = np.nonzero(np.ones_like(present))
-    got = isolation(present, (pitch / 2, row), reach, centred=True)
+    got = isolation_map(present, (pitch / 2, row), reach, centred=True)
     full = [
         (i * pitch / 2, j * row)
         for i in range(-40, 41)
@@ -62,7 +62,7 @@ def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
         # out, about twice that of a plane
         assert got[j, i] == pytest.approx(1 - stood / whole, abs=1e-4)
     assert (
-        isolation(site, (pitch / 2, row), reach, centred=True)[10:-10, 10:-10][
+        isolation_map(site, (pitch / 2, row), reach, centred=True)[10:-10, 10:-10][
             site[10:-10, 10:-10]
         ].max()
         < 1e-5
@@ -75,10 +75,12 @@ def test_rows_of_a_rectangular_lattice_count_by_their_own_distance():
     far = [(0.3 * i, 0.7 * j) for i in range(-9, 10) for j in range(-4, 5) if i or j]
     weights = [np.exp(-(x * x + y * y) / 0.9**2) for x, y in far]
     want = 1 - np.exp(-((0.7 / 0.9) ** 2)) / sum(weights)
-    assert isolation(present, (0.3, 0.7), 0.9)[10, 10] == pytest.approx(want, abs=1e-5)
+    assert isolation_map(present, (0.3, 0.7), 0.9)[10, 10] == pytest.approx(
+        want, abs=1e-5
+    )
 
 
 def test_a_range_at_which_nobody_has_neighbours_is_refused_by_name():
     with pytest.raises(ProcessError, match="range_um"):
-        isolation(np.ones((9, 9), bool), (0.4, 0.4), 0.12)
-    assert isolation(np.ones((9, 9), bool), (0.4, 0.4), 0.14)[4, 4] < 0.01
+        isolation_map(np.ones((9, 9), bool), (0.4, 0.4), 0.12)
+    assert isolation_map(np.ones((9, 9), bool), (0.4, 0.4), 0.14)[4, 4] < 0.01

@@ -7,8 +7,8 @@ import pytest
 
 import layout
 from layout.process import process
-from layout.process.limits import printable
-from metalens.ground.errors import ProcessError
+from layout.process.limits import printable_limits
+from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
 
 COARSE = "[rules]\nminimum_feature_nm = 100\nminimum_gap_nm = 90\ngrid_nm = 5\ndiameter_step_nm = 5\n"
@@ -23,7 +23,7 @@ BIASED = (
 def test_designs_at_the_limits_are_drawn_within_the_rules(tmp_path, text):
     path = tmp_path / "process.toml"
     path.write_text(text)
-    least, gap = printable(path, pitch_um=0.4, height_um=0.7)
+    least, gap = printable_limits(path, pitch_um=0.4, height_um=0.7)
     rules = process.load(path)
     sizes = np.random.default_rng(1).uniform(least, 400 - gap, (30, 30)) * 1e-3
     sizes[0, :3] = np.array([least, 400 - gap, 400 - gap]) * 1e-3
@@ -72,7 +72,7 @@ def test_a_tenth_of_a_step_beyond_the_limits_the_mask_breaks_a_rule(
     path = tmp_path / "process.toml"
     path.write_text(text)
     rules = process.load(path)
-    least, gap = printable(path, pitch_um=0.4, height_um=0.7)
+    least, gap = printable_limits(path, pitch_um=0.4, height_um=0.7)
     for one in (False, True):
         assert drawn_well(least + 0.05, rules, alone=one)
         assert drawn_well(400 - gap - 0.05, rules, alone=one)
@@ -86,4 +86,4 @@ def test_a_process_that_prints_nothing_on_this_pitch_is_refused(tmp_path):
     path = tmp_path / "process.toml"
     path.write_text(COARSE)
     with pytest.raises(ProcessError, match="widen the pitch"):
-        printable(path, pitch_um=0.18, height_um=0.7)
+        printable_limits(path, pitch_um=0.18, height_um=0.7)

@@ -7,7 +7,7 @@ import pytest
 
 from layout.process import limits
 from layout.shapes import polygon
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 RULES = "[rules]\nminimum_feature_nm = {feature}\nminimum_gap_nm = {gap}\nminimum_foot_gap_nm = {foot}\ngrid_nm = {grid}\n"
 RULES += 'diameter_step_nm = {step}\nvertices = 32\nshape = "round"\n[etch]\ncorner_radius_nm = 0\nsidewall_deg = {wall}\n'
@@ -17,12 +17,15 @@ PLAIN = {"feature": 103.0, "gap": 87.0, "foot": 10.0, "grid": 1, "step": 4, "wal
 def printable(tmp_path, *, pitch_um=0.405, height_um=0.7, more="", **about):
     path = tmp_path / "p.toml"
     path.write_text(RULES.format(**PLAIN | about) + more)
-    return limits.printable(path, pitch_um=pitch_um, height_um=height_um)
+    return limits.printable_limits(path, pitch_um=pitch_um, height_um=height_um)
 
 
 def across(diameter, grid=1):
     """Width along x of the polygon of a pillar."""
-    return int(np.ptp(polygon.pillar(diameter / grid, vertices=32).points[:, 0])) * grid
+    return (
+        int(np.ptp(polygon.pillar_polygon(diameter / grid, vertices=32).points[:, 0]))
+        * grid
+    )
 
 
 def test_the_thinnest_is_the_first_step_that_is_wide_enough_less_what_rounds_to_it(
@@ -42,7 +45,7 @@ def polygon_width(diameter):
     """Least distance of parallel lines with all corners between them, along the normal
     of each edge.
     """
-    points = polygon.pillar(diameter, vertices=32).points
+    points = polygon.pillar_polygon(diameter, vertices=32).points
     edge = np.roll(points, -1, axis=0) - points
     normal = np.column_stack([edge[:, 1], -edge[:, 0]]) / np.hypot(*edge.T)[:, None]
     return float(np.ptp(points @ normal.T, axis=0).min())

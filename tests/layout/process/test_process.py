@@ -10,17 +10,17 @@ import pytest
 
 from layout.process import process
 from layout.process.process import (
-    Die,
-    Etch,
-    Exposure,
-    Layers,
+    DesignRules,
+    DieSettings,
+    EtchProfile,
+    ExposureSettings,
+    LayerTable,
     Process,
-    Rules,
     WriteField,
 )
+from metalens.core import config
+from metalens.core.errors import ConfigError, ProcessError
 from metalens.fabrication import Spread
-from metalens.ground import config
-from metalens.ground.errors import ConfigError, ProcessError
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "process.toml"
 DESIGN = np.arange(80, 340, 2.0)
@@ -28,13 +28,13 @@ DESIGN = np.arange(80, 340, 2.0)
 
 def test_the_example_says_what_the_defaults_say_but_for_the_bias_and_the_wall():
     example = process.load(EXAMPLE)
-    assert example.rules == Rules()
-    assert example.layers == Layers()
-    assert example.exposure == Exposure(
+    assert example.rules == DesignRules()
+    assert example.layers == LayerTable()
+    assert example.exposure == ExposureSettings(
         alpha_um=0.010, beta_um=31.0, eta=0.6, correct=True
     )
     assert example.write_field == WriteField()
-    assert example.die == Die()
+    assert example.die == DieSettings()
     assert example.spread == Spread()
 
 
@@ -51,7 +51,9 @@ def test_the_drawn_pillar_makes_the_designed_one():
 
 
 def test_corner_rounding_takes_the_area_between_corner_and_arc():
-    octagon = Process(rules=Rules(vertices=8), etch=Etch(corner_radius_nm=20.0))
+    octagon = Process(
+        rules=DesignRules(vertices=8), etch=EtchProfile(corner_radius_nm=20.0)
+    )
     side_angle = math.pi / 8
     lost = 8 * 400 * (math.tan(side_angle) - side_angle)
     area = math.pi / 4 * 200**2 - lost
@@ -62,7 +64,7 @@ def test_corner_rounding_takes_the_area_between_corner_and_arc():
 
 
 def test_sidewall_spreads_top_and_foot_about_half_height():
-    top, foot = Process(etch=Etch(sidewall_deg=1.0)).top_foot_nm(200.0, 700.0)
+    top, foot = Process(etch=EtchProfile(sidewall_deg=1.0)).top_foot_nm(200.0, 700.0)
     assert (foot - top) / 2 == pytest.approx(700 * math.tan(math.radians(1)))
     assert top + foot == pytest.approx(400)
 

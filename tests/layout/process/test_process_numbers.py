@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from layout.process import process
-from layout.process.process import Etch, Exposure, Process, Rules
+from layout.process.process import DesignRules, EtchProfile, ExposureSettings, Process
 from metalens.fabrication import Bias
 
 
 def octagon(corner_nm, **more):
     return Process(
-        rules=Rules(vertices=8), etch=Etch(corner_radius_nm=corner_nm), **more
+        rules=DesignRules(vertices=8),
+        etch=EtchProfile(corner_radius_nm=corner_nm),
+        **more,
     )
 
 
@@ -56,7 +58,7 @@ def test_what_is_drawn_makes_the_design_to_a_millionth_of_a_picometre():
 def test_a_tilted_wall_takes_from_the_top_what_it_gives_to_the_foot():
     """45 deg would give the whole height; tan 26.565 deg is a half."""
     top, foot = Process(
-        etch=Etch(sidewall_deg=math.degrees(math.atan(0.5)))
+        etch=EtchProfile(sidewall_deg=math.degrees(math.atan(0.5)))
     ).top_foot_nm(np.array([500.0, 900.0]), 320.0)
     assert top == pytest.approx(np.array([340.0, 740.0]), rel=1e-12)
     assert foot == pytest.approx(np.array([660.0, 1060.0]), rel=1e-12)
@@ -76,11 +78,11 @@ def test_a_tilted_wall_takes_from_the_top_what_it_gives_to_the_foot():
 def test_an_exposure_is_known_by_three_numbers_or_a_table_and_then_corrected(
     given, known, missing
 ):
-    made = Exposure(**given)
+    made = ExposureSettings(**given)
     assert (made.known, made.corrected, made.missing) == (known, known, missing)
-    assert not Exposure(correct=False, **given).corrected
+    assert not ExposureSettings(correct=False, **given).corrected
     if known:
-        assert Exposure(correct=True, **given).corrected
+        assert ExposureSettings(correct=True, **given).corrected
 
 
 def test_the_defaults_of_a_process_are_those_of_its_docstring():

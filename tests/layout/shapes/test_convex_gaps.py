@@ -53,10 +53,10 @@ def test_a_gap_along_the_common_direction_of_turned_rectangles(turn):
     # side by side along the turned x axis: centres 40 + 31 + 9 apart in units of r, 8
     # along the other
     dx, dy = 80 * p - 8 * q, 80 * q + 8 * p
-    assert convex.gap(one, two, dx, dy) == pytest.approx(9 * r, rel=1e-14)
-    assert convex.gap(two, one, -dx, -dy) == pytest.approx(9 * r, rel=1e-14)
-    assert convex.gap(one, two, dx - 9 * p, dy - 9 * q) == 0.0
-    assert convex.gap(one, two, dx - 10 * p, dy - 10 * q) == -1.0
+    assert convex.convex_gap(one, two, dx, dy) == pytest.approx(9 * r, rel=1e-14)
+    assert convex.convex_gap(two, one, -dx, -dy) == pytest.approx(9 * r, rel=1e-14)
+    assert convex.convex_gap(one, two, dx - 9 * p, dy - 9 * q) == 0.0
+    assert convex.convex_gap(one, two, dx - 10 * p, dy - 10 * q) == -1.0
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -64,17 +64,17 @@ def test_a_corner_that_points_at_a_side(turn):
     p, q, r = turn
     still, turned = rectangle(200, 90 * r), rectangle(30, 17, turn)
     reach = 30 * p + 17 * q  # of the corner along x
-    assert convex.gap(still, turned, 200 + reach + 13, 5) == pytest.approx(13)
-    assert convex.gap(turned, still, -200 - reach - 13, -5) == pytest.approx(13)
+    assert convex.convex_gap(still, turned, 200 + reach + 13, 5) == pytest.approx(13)
+    assert convex.convex_gap(turned, still, -200 - reach - 13, -5) == pytest.approx(13)
 
 
 def test_a_corner_that_points_at_a_corner():
     one, two = rectangle(10, 20), rectangle(7, 5)
-    assert convex.gap(one, two, 10 + 7 + 60, 20 + 5 + 11) == pytest.approx(
+    assert convex.convex_gap(one, two, 10 + 7 + 60, 20 + 5 + 11) == pytest.approx(
         61
     )  # 11, 60, 61
-    assert convex.gap(one, two, -10 - 7 - 60, 20 + 5 + 11) == pytest.approx(61)
-    assert convex.gap(one, two, 17, 25) == 0.0  # corner on corner
+    assert convex.convex_gap(one, two, -10 - 7 - 60, 20 + 5 + 11) == pytest.approx(61)
+    assert convex.convex_gap(one, two, 17, 25) == 0.0  # corner on corner
 
 
 @pytest.mark.parametrize(
@@ -87,10 +87,10 @@ def test_a_corner_on_a_slanted_side_touches_exactly(step, count, at):
     """
     (p, q), corner = step, np.array([[0, 0], [40, -70], [90, -60]])
     side = np.array([[0, 0], [count * p, count * q], [0, count * q]])
-    assert convex.gap(side, corner, at * p, at * q) == 0.0
-    assert convex.gap(corner, side, -at * p, -at * q) == 0.0
-    assert convex.gap(side, corner, at * p - 1, at * q) == -1.0
-    assert 0 < convex.gap(side, corner, at * p + 1, at * q) < 1
+    assert convex.convex_gap(side, corner, at * p, at * q) == 0.0
+    assert convex.convex_gap(corner, side, -at * p, -at * q) == 0.0
+    assert convex.convex_gap(side, corner, at * p - 1, at * q) == -1.0
+    assert 0 < convex.convex_gap(side, corner, at * p + 1, at * q) < 1
 
 
 @given(
@@ -106,7 +106,7 @@ def test_any_convex_polygons_are_as_far_as_their_nearest_points(seed, sides, awa
     for count in sides:
         points = rng.integers(-900, 900, (count + 2, 2))
         shapes.append(points[ConvexHull(points).vertices])
-    found = convex.gap(*shapes, *away)
+    found = convex.convex_gap(*shapes, *away)
     moved = shapes[1] + np.array(away)
     if found > 0:
         assert found == pytest.approx(between(shapes[0], moved), rel=1e-12)
@@ -130,7 +130,7 @@ def test_polygons_of_circles_are_as_far_as_circles_less_their_flats():
             round(234_567 * math.cos(direction)),
             round(234_567 * math.sin(direction)),
         )
-        found = convex.gap(circle, circle, dx, dy)
+        found = convex.convex_gap(circle, circle, dx, dy)
         exact = math.hypot(dx, dy) - 2 * radius
         # corners lie on the circle to 0.71, flats radius (1 - cos(pi / 64)) = 120.5
         # within it
@@ -140,13 +140,13 @@ def test_polygons_of_circles_are_as_far_as_circles_less_their_flats():
 
 
 def test_width_is_the_least_height():
-    assert convex.width(rectangle(40, 23)) == 46
-    assert convex.width(rectangle(23, 40, (5, 12, 13))) == pytest.approx(46 * 13)
-    assert convex.width(np.array([[0, 0], [60, 0], [0, 11]])) == pytest.approx(
+    assert convex.least_width(rectangle(40, 23)) == 46
+    assert convex.least_width(rectangle(23, 40, (5, 12, 13))) == pytest.approx(46 * 13)
+    assert convex.least_width(np.array([[0, 0], [60, 0], [0, 11]])) == pytest.approx(
         60 * 11 / 61
     )
     hexagon = np.array(
         [[200, 0], [100, 173], [-100, 173], [-200, 0], [-100, -173], [100, -173]]
     )
-    assert convex.width(hexagon) == pytest.approx(2 * 173)
-    assert convex.reach(np.array([[3, -4], [1, 1], [-2, 0]])) == 5
+    assert convex.least_width(hexagon) == pytest.approx(2 * 173)
+    assert convex.farthest_vertex(np.array([[3, -4], [1, 1], [-2, 0]])) == 5

@@ -11,13 +11,13 @@ BOX = np.array([[-7, -3], [13, -3], [13, 9], [-7, 9]])
 
 
 def test_the_reach_is_that_of_the_farthest_corner():
-    assert convex.reach(np.array([[3, -4], [0, 1], [-12, 5]])) == 13.0
-    assert convex.reach(np.array([[3, -4], [-8, 15], [-12, 5]])) == 17.0
+    assert convex.farthest_vertex(np.array([[3, -4], [0, 1], [-12, 5]])) == 13.0
+    assert convex.farthest_vertex(np.array([[3, -4], [-8, 15], [-12, 5]])) == 17.0
 
 
 def test_the_hull_leaves_out_what_lies_within():
     points = np.array([[0, 0], [9, 2], [50, -10], [20, 10], [60, 40], [5, 30]])
-    got = convex.hull(points).tolist()
+    got = convex.convex_hull(points).tolist()
     start = got.index([0, 0])
     assert got[start:] + got[:start] == [[0, 0], [50, -10], [60, 40], [5, 30]]
 
@@ -27,11 +27,11 @@ def test_the_hull_leaves_out_what_lies_within():
     [(TRIANGLE, 24.0), (SLANTED, 15.0), (BOX, 12.0), (BOX[:, ::-1], 12.0)],
 )
 def test_the_width_is_the_least_of_all_directions(shape, want):
-    assert convex.width(shape) == pytest.approx(want, rel=1e-15)
-    assert convex.width(shape + np.array([1000, -300])) == pytest.approx(
+    assert convex.least_width(shape) == pytest.approx(want, rel=1e-15)
+    assert convex.least_width(shape + np.array([1000, -300])) == pytest.approx(
         want, rel=1e-15
     )
-    assert convex.width(shape[::-1]) == pytest.approx(want, rel=1e-15)
+    assert convex.least_width(shape[::-1]) == pytest.approx(want, rel=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -52,14 +52,14 @@ def test_the_width_is_the_least_of_all_directions(shape, want):
     ],
 )
 def test_the_gap_is_the_least_distance_of_any_two_points(first, second, dx, dy, want):
-    assert convex.gap(first, second, dx, dy) == pytest.approx(want, rel=1e-15)
-    assert convex.gap(second, first, -dx, -dy) == pytest.approx(want, rel=1e-15)
+    assert convex.convex_gap(first, second, dx, dy) == pytest.approx(want, rel=1e-15)
+    assert convex.convex_gap(second, first, -dx, -dy) == pytest.approx(want, rel=1e-15)
 
 
 def test_boxes_of_a_unit_lie_a_unit_apart():
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    assert convex.gap(unit, unit, 2, 0) == 1.0
-    assert convex.gap(unit, unit, 0, -1) == 0.0
+    assert convex.convex_gap(unit, unit, 2, 0) == 1.0
+    assert convex.convex_gap(unit, unit, 0, -1) == 0.0
 
 
 def test_gaps_agree_with_points_along_both_outlines():
@@ -74,7 +74,7 @@ def test_gaps_agree_with_points_along_both_outlines():
 
     for _ in range(4):
         move = rng.integers(45, 90, 2) * rng.choice([-1, 1], 2)
-        got = convex.gap(SLANTED, TRIANGLE, *move.tolist())
+        got = convex.convex_gap(SLANTED, TRIANGLE, *move.tolist())
         one, two = places(SLANTED), places(TRIANGLE + move)
         least = min(np.hypot(*(two - p).T).min() for p in one[::7])
         assert got <= least + 1e-9 <= got + 0.8  # a seventh of a side of 50 is 0.7

@@ -24,7 +24,7 @@ def boxed(left, bottom, right, top):
 
 
 def told(contours):
-    area, first, second = moments.moments(contours)
+    area, first, second = moments.polygon_moments(contours)
     return np.array([area, *first, second])
 
 
@@ -70,9 +70,9 @@ def test_places_lie_half_a_step_from_the_start_and_a_step_from_each_other():
         (2, 5),
     ]
     want += [(5, 7), (5, 15), (11.4, 10.2), (17.8, 5.4), (17, 3), (9, 3)]
-    got = moments.along([box, hole], 16)
+    got = moments.points_along_edges([box, hole], 16)
     order = {tuple(np.round(p, 9)) for p in got.tolist()}
     assert order == {(float(x), float(y)) for x, y in want}
     assert got[0] == pytest.approx([6, 1], rel=1e-14)
     assert got[4] == pytest.approx([32, 7], rel=1e-14)
-    assert moments.along([box], 1).tolist() == [[32.0, 11.0]]
+    assert moments.points_along_edges([box], 1).tolist() == [[32.0, 11.0]]

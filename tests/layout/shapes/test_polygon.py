@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from layout.shapes import polygon
-from metalens.ground.errors import ProcessError
+from metalens.core.errors import ProcessError
 
 
 def images(points):
@@ -27,7 +27,7 @@ def images(points):
     vertices=st.sampled_from([8, 12, 16, 20, 24, 32, 48, 64]),
 )
 def test_polygons_are_symmetric_convex_and_on_the_grid(diameter, vertices):
-    made = polygon.pillar(diameter, vertices=vertices)
+    made = polygon.pillar_polygon(diameter, vertices=vertices)
     assert made.points.dtype == np.int64
     assert len(made.points) <= vertices
     assert all(
@@ -41,7 +41,7 @@ def test_polygons_are_symmetric_convex_and_on_the_grid(diameter, vertices):
 
 @pytest.mark.parametrize("diameter", [80, 81, 99, 100, 151, 200, 255, 320])
 def test_area_of_32_vertices_is_the_circle_within_a_thousandth(diameter):
-    made = polygon.pillar(diameter)
+    made = polygon.pillar_polygon(diameter)
     assert abs(made.area / (math.pi * diameter**2 / 4) - 1) < 1e-3
     x, y = made.points.T.astype(float)
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y
@@ -59,12 +59,12 @@ def test_edge_error_of_an_equal_area_polygon_follows_the_closed_form():
     ideal = (
         diameter / 2 * (math.sqrt(math.pi / (n / 2 * math.sin(2 * math.pi / n))) - 1)
     )
-    made = polygon.pillar(diameter, vertices=n)
+    made = polygon.pillar_polygon(diameter, vertices=n)
     assert ideal - 0.8 < made.edge_error < 2 * ideal + 0.8
 
 
 def test_shot_shape_has_edges_along_axes_and_diagonals_only():
-    edges = np.diff(polygon.pillar(201, shape="shot").points, axis=0)
+    edges = np.diff(polygon.pillar_polygon(201, shape="shot").points, axis=0)
     assert all(dx == 0 or dy == 0 or abs(dx) == abs(dy) for dx, dy in edges.tolist())
 
 
@@ -80,7 +80,7 @@ def test_shoelace_of_the_unit_square_and_of_huge_numbers_is_exact():
 )
 def test_impossible_polygons_are_refused(diameter, vertices):
     with pytest.raises(ProcessError, match="need"):
-        polygon.pillar(diameter, vertices=vertices)
+        polygon.pillar_polygon(diameter, vertices=vertices)
 
 
 @pytest.mark.parametrize("shape", ["round", "shot"])
@@ -88,7 +88,7 @@ def test_impossible_polygons_are_refused(diameter, vertices):
 def test_widths_and_areas_never_fall_as_the_diameter_rises(shape, vertices):
     """Grid steps: 100, 105, 110, 120 nm on a grid of 5 nm are 20, 21, 22, 24."""
     made = [
-        polygon.pillar(float(d), vertices=vertices, shape=shape).points
+        polygon.pillar_polygon(float(d), vertices=vertices, shape=shape).points
         for d in range(4, 160)
     ]
     for axis in (0, 1):

@@ -8,7 +8,7 @@ TRIANGLE = np.array([[10, -20], [70, -10], [30, 50]])
 
 
 def test_a_triangle_stays():
-    (found,) = region.union([TRIANGLE])
+    (found,) = region.union_contours([TRIANGLE])
     assert len(found) == 3
     assert (
         abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10
@@ -18,7 +18,7 @@ def test_a_triangle_stays():
 def test_a_triangle_cut_off_a_square_is_left():
     square = np.array([[0, 0], [40, 0], [40, 40], [0, 40]])
     taken = np.array([[0, 0], [40, 0], [40, 30], [10, 40], [0, 40]])  # all but a corner
-    (found,) = region.difference([square], [taken])
+    (found,) = region.subtract_contours([square], [taken])
     assert len(found) == 3
     assert abs(polygon.twice_area(found)) == 30 * 10
 
@@ -29,7 +29,7 @@ def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
     """
     square = np.array([[-200, -200], [201, -200], [201, 200], [-200, 200]])
     hole = np.array([[-70, -31], [77, -62], [90, 10], [13, 101], [-3, 40]])
-    left = region.difference([square], [hole])
+    left = region.subtract_contours([square], [hole])
     pieces = region.without_holes(left)
     assert len(pieces) == 2
     corners = {tuple(p) for p in np.concatenate([square, hole]).tolist()}
@@ -40,14 +40,14 @@ def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
     assert sum(map(polygon.twice_area, pieces)) == 2 * 401 * 400 - polygon.twice_area(
         hole
     )
-    (whole,) = [c for c in region.union(pieces) if polygon.twice_area(c) > 0]
+    (whole,) = [c for c in region.union_contours(pieces) if polygon.twice_area(c) > 0]
     assert len(whole) == 4
 
 
 def test_a_hole_whose_middle_meets_flats_is_cut_upright():
     square = np.array([[-200, -200], [200, -200], [200, 200], [-200, 200]])
     hole = np.array([[-50, -60], [50, -60], [80, 0], [50, 60], [-50, 60], [-80, 0]])
-    pieces = region.without_holes(region.difference([square], [hole]))
+    pieces = region.without_holes(region.subtract_contours([square], [hole]))
     assert sorted(
         tuple(p[:, 0][[p[:, 0].argmin(), p[:, 0].argmax()]].tolist()) for p in pieces
     ) == [
@@ -63,7 +63,8 @@ def test_triangles_fill_an_outline_but_for_its_hole():
     hole = np.array([[10, 10], [10, 20], [80, 20], [80, 10]])
     points = np.concatenate([outline, hole])
     areas = [
-        polygon.twice_area(points[three]) for three in region.triangles([outline, hole])
+        polygon.twice_area(points[three])
+        for three in region.triangulate([outline, hole])
     ]
     assert min(areas) > 0
     assert sum(areas) == 2 * (90 * 70 - 30 * 40 - 70 * 10)

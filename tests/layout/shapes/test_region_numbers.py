@@ -46,13 +46,18 @@ def test_what_rounds_to_a_line_or_a_point_is_left_out():
 def test_unions_differences_and_overlaps_keep_holes():
     frame = [box(0, 0, 60, 40), box(11, 10, 24, 30)[::-1]]
     steps = [[0, 0], [20, 0], [20, 4], [31, 4], [31, 12], [15, 12], [15, 9], [0, 9]]
-    assert {same(p) for p in region.union([box(0, 0, 20, 9), box(15, 4, 31, 12)])} == {
-        same(steps)
-    }
+    assert {
+        same(p) for p in region.union_contours([box(0, 0, 20, 9), box(15, 4, 31, 12)])
+    } == {same(steps)}
     assert sorted(
-        map(twice_area, region.difference([box(0, 0, 60, 40)], [box(11, 10, 24, 30)]))
+        map(
+            twice_area,
+            region.subtract_contours([box(0, 0, 60, 40)], [box(11, 10, 24, 30)]),
+        )
     ) == [-520, 4800]
-    assert {same(p) for p in region.difference(frame, [box(-1, -1, 20, 41)])} == {
+    assert {
+        same(p) for p in region.subtract_contours(frame, [box(-1, -1, 20, 41)])
+    } == {
         same(
             [
                 [20, 0],
@@ -66,12 +71,12 @@ def test_unions_differences_and_overlaps_keep_holes():
             ]
         )
     }
-    assert {same(p) for p in region.overlap(frame, [box(5, 5, 20, 50)])} == {
+    assert {same(p) for p in region.overlap_contours(frame, [box(5, 5, 20, 50)])} == {
         same(
             [[5, 5], [20, 5], [20, 10], [11, 10], [11, 30], [20, 30], [20, 40], [5, 40]]
         )
     }
-    assert region.overlap(frame, [box(12, 11, 23, 29)]) == []
+    assert region.overlap_contours(frame, [box(12, 11, 23, 29)]) == []
 
 
 @pytest.mark.parametrize(
@@ -189,7 +194,7 @@ def test_a_way_is_free_that_touches_no_edge_but_at_its_own_ends():
 
 def test_triangles_fill_outlines_but_for_their_holes():
     corners = np.concatenate([OUTER, HOLE, OUTER + 300])
-    made = region.triangles([OUTER, HOLE, OUTER + 300])
+    made = region.triangulate([OUTER, HOLE, OUTER + 300])
     areas = [twice_area(corners[t]) for t in made]
     assert min(areas) > 0
     assert sum(areas) == 2 * twice_area(OUTER) + twice_area(HOLE)

@@ -10,9 +10,9 @@ import pytest
 from layout.mask import fields
 from layout.process.process import Process, WriteField
 from layout.study import focus, stitching, tolerance
-from layout.study.focus import Window, peak
-from layout.study.spread_model import reduce
-from layout.study.tolerance import Outcome
+from layout.study.focus import FocusWindow, interpolated_peak
+from layout.study.spread_model import reduce_spread
+from layout.study.tolerance import ToleranceOutcome
 from metalens.fabrication import Draw, ResponseError, Spread, draws, named, transmission
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 from tests.referees import plain_sum
@@ -25,10 +25,10 @@ DEPTHS_UM = np.array(
 @pytest.fixture(scope="module")
 def model():
     lens = hyperbolic(61, 60.0, 500.0)
-    where = Window(
+    where = FocusWindow(
         np.arange(-2, 3) * 0.6, np.arange(-1, 3) * 0.9, 60.0, 0.85, DEPTHS_UM
     )
-    return reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=3)
+    return reduce_spread(lens, SENS, focus.prepare_focus(lens, where), Spread(), seed=3)
 
 
 def test_numbers_of_draws_are_of_their_own_light_against_that_of_the_nominal_lens(
@@ -45,7 +45,9 @@ def test_numbers_of_draws_are_of_their_own_light_against_that_of_the_nominal_len
     assert np.ptp(found.strehl) > 0.01
     for n in (0, 1, 24, 25, 26):
         psf = np.abs(light[n]) ** 2
-        assert found.strehl[n] == pytest.approx(peak(psf[0]) / peak(nominal), rel=1e-5)
+        assert found.strehl[n] == pytest.approx(
+            interpolated_peak(psf[0]) / interpolated_peak(nominal), rel=1e-5
+        )
         assert found.efficiency[n] == pytest.approx(
             psf[0].sum() * 0.6 * 0.9 / incident, rel=1e-5
         )
@@ -61,11 +63,11 @@ def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(model):
     """Information is summed over the depths first; of the pillars phase and level each
     have their own worst sign.
     """
-    alone = Outcome(
+    alone = ToleranceOutcome(
         np.array([0.97, 0.91]), np.array([0.66, 0.63]), np.array([0.08, 0.05]),
         np.array([[2.0, 7.0], [4.0, 9.0]]), np.zeros((2, 3)),
     )  # fmt: skip
-    nominal = Outcome(
+    nominal = ToleranceOutcome(
         np.array([1.0]),
         np.array([0.6]),
         np.array([0.0]),
@@ -107,8 +109,8 @@ def test_fields_that_stand_off_are_the_sum_over_pillars_that_do():
         hyperbolic(61, 60.0, 500.0),
         Process(write_field=WriteField(9.0, "floating", 17.0)),
     )
-    plan = fields.split(lens.diameters, process)
-    found = stitching.stitching(lens, plan, process, draws=4, seed=6)
+    plan = fields.split_write_fields(lens.diameters, process)
+    found = stitching.simulate_stitching(lens, plan, process, draws=4, seed=6)
     held = [block for block in plan.blocks() if lens.diameters.diameter_um[block].any()]
     assert (found.fields, found.stitching_nm) == (len(held), 17.0)
     offsets = np.random.default_rng(6).uniform(-0.017, 0.017, (4, len(held), 2))
@@ -132,7 +134,7 @@ def test_fields_that_stand_off_are_the_sum_over_pillars_that_do():
     ]
     assert found.change == pytest.approx(change, rel=0.01)
     assert found.strehl == pytest.approx(
-        [peak(psf) / peak(perfect) for psf in moved], abs=1e-5
+        [interpolated_peak(psf) / interpolated_peak(perfect) for psf in moved], abs=1e-5
     )
     away = [1e3 * np.linalg.norm(middle(psf) - middle(perfect)) for psf in moved]
     assert found.moved_nm == pytest.approx(away, rel=0.01)

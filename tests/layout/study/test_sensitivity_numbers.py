@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.sensitivity import LogSensitivities, compute_sensitivities
 from metalens.cell.record import Cell, Index
 from metalens.fabrication import ResponseError, named
 from tests.layout.study.test_tolerance import hyperbolic
@@ -40,7 +40,7 @@ def test_slopes_are_the_finer_ones_and_the_error_is_what_the_coarser_differ_by()
     size: 0.2 of 1.2.
     """
     lens = dataclasses.replace(hyperbolic(21), cell=Cell(0.4, 0.61, Index(2.7)))
-    found = sensitivities(lens, count=5, solver=solver)
+    found = compute_sensitivities(lens, count=5, solver=solver)
     assert found.diameter_um == pytest.approx(np.linspace(0.1, 0.3, 5))
     for name, slope in SLOPES.items():
         want = slope * FINER[name] * found.diameter_um / 0.85
@@ -53,7 +53,7 @@ def test_slopes_are_the_finer_ones_and_the_error_is_what_the_coarser_differ_by()
 
 def test_between_the_diameters_rates_are_straight_lines_and_beyond_them_the_end_holds():
     diameter, rate = np.array([0.1, 0.14, 0.3]), np.array([1.0 - 2j, 3.0 + 1j, -1.0])
-    told = Sensitivities(diameter, np.array([rate, 2 * rate]), 0.1, edges=1j * rate)
+    told = LogSensitivities(diameter, np.array([rate, 2 * rate]), 0.1, edges=1j * rate)
     at = np.array([0.09, 0.13, 0.22, 0.35])
     want = np.array([1.0 - 2j, 2.5 + 0.25j, 1.0 + 0.5j, -1.0])
     assert told.at(at)[:2] == pytest.approx(np.array([want, 2 * want]))

@@ -11,7 +11,12 @@ import pytest
 from scipy import stats
 
 from layout.study import focus, spread_model
-from layout.study.spread_model import Model, _summed, missed, reduce
+from layout.study.spread_model import (
+    SpreadModel,
+    _summed,
+    reduce_spread,
+    reduction_error,
+)
 from metalens.fabrication import (
     Draw,
     ResponseError,
@@ -63,10 +68,14 @@ def test_no_fewer_functions_would_keep_the_variation_and_no_more_are_taken(scale
     spread = Spread(
         **{name: scale * value for name, value in Spread().values().items()}
     )
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )
-    rank = len(reduce(lens, SENS, focus.prepare(lens, where), spread, seed=seed).basis)
+    rank = len(
+        reduce_spread(
+            lens, SENS, focus.prepare_focus(lens, where), spread, seed=seed
+        ).basis
+    )
     power = np.linalg.eigvalsh(overlaps(lens, spread, seed))[::-1]
     left = np.sqrt(
         np.maximum(np.r_[power.sum(), power.sum() - np.cumsum(power)], 0) / power.sum()
@@ -87,10 +96,12 @@ AMOUNTS = {
 @pytest.fixture(scope="module")
 def reduced():
     lens = hyperbolic()
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 4), 150.0, 0.85, np.array([1500.0])
     )
-    return lens, reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=5)
+    return lens, reduce_spread(
+        lens, SENS, focus.prepare_focus(lens, where), Spread(), seed=5
+    )
 
 
 def test_functions_of_the_basis_are_orthonormal_over_the_pillars(reduced):
@@ -151,8 +162,8 @@ def test_what_a_basis_misses_is_what_least_squares_leave_at_the_worst_of_three_p
                 @ np.linalg.lstsq((fewer.basis * root).T, t, rcond=None)[0]
             )
             worst.append(np.linalg.norm(left) / np.linalg.norm(t))
-    assert missed(fewer, lenses) == pytest.approx(max(worst), rel=1e-6)
-    assert missed(fewer, lenses[1:]) == pytest.approx(max(worst[3:]), rel=1e-6)
+    assert reduction_error(fewer, lenses) == pytest.approx(max(worst), rel=1e-6)
+    assert reduction_error(fewer, lenses[1:]) == pytest.approx(max(worst[3:]), rel=1e-6)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -196,7 +207,7 @@ def one_function(turns_per_um):
         curve=lambda bias_um, state: np.exp(1j * turns_per_um * bias_um)[:, None]
     )
     moments = np.random.default_rng(4).normal(size=(1, 7, 18)).view(complex)
-    return Model(pillars, at, np.array([1.0]), np.ones((1, 1)), moments, 30.0)
+    return SpreadModel(pillars, at, np.array([1.0]), np.ones((1, 1)), moments, 30.0)
 
 
 def test_a_bias_is_followed_between_its_ends_as_chebyshev_s_points_allow():
@@ -249,10 +260,10 @@ def test_curves_of_a_basis_are_of_places_anywhere_in_the_lens(monkeypatch):
         spread_model, "draws", lambda spread, count, *, seed: [one] * count
     )
     lens = hyperbolic()
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )
-    reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=5)
+    reduce_spread(lens, SENS, focus.prepare_focus(lens, where), Spread(), seed=5)
     u, v = np.array(places).T
     assert len(u) == DRAWN
     assert stats.kstest(u**2 + v**2, "uniform").pvalue > 0.05

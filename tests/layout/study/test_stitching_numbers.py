@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.study import stitching
-from layout.study.focus import Window
+from layout.study.focus import FocusWindow
 
 RNG = np.random.default_rng(10)
 
@@ -33,7 +33,7 @@ def test_derivatives_of_a_quadratic_are_its_own():
 
 
 def test_the_centroid_of_a_window_is_the_mean_place_of_its_light():
-    where = Window(
+    where = FocusWindow(
         np.array([-1.0, 0.5, 3.0]), np.array([2.0, 7.0]), 500.0, 0.85, np.ones(1)
     )
     psf = np.array([[[1.0, 0.0, 3.0], [2.0, 4.0, 0.0]]])

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from layout.mask import fields
-from layout.process.process import Etch, Process, WriteField
+from layout.process.process import EtchProfile, Process, WriteField
 from layout.study import focus, stitching, tolerance
 from layout.study import page as study_page
-from layout.study.sensitivity import Sensitivities, sensitivities
-from layout.study.spread_model import missed, reduce
+from layout.study.sensitivity import LogSensitivities, compute_sensitivities
+from layout.study.spread_model import reduce_spread, reduction_error
 from metalens import modal
 from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Cross, Rectangle, Square
+from metalens.core.errors import ProcessError
+from metalens.core.report import Figure, Table
 from metalens.fabrication import ResponseError, Spread, draws, named, transmission
-from metalens.ground.errors import ProcessError
-from metalens.ground.report import Figure, Table
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 from tests.referees import plain_sum
@@ -33,7 +33,7 @@ PROXY = Proxy(
     0.0,
 )
 DIAMETERS = np.linspace(0.1, 0.3, 9)
-SENS = Sensitivities(
+SENS = LogSensitivities(
     DIAMETERS,
     np.array(
         [
@@ -100,14 +100,16 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
     lens = made()
     turn = lens.diameters.angle_rad
     swung = 1.0 if turn is None else np.exp(-2j * turn)
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3),
         np.linspace(-1, 4, 3),
         150.0,
         0.85,
         np.array([1500.0, 1200.0]),
     )
-    model = reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=0)
+    model = reduce_spread(
+        lens, SENS, focus.prepare_focus(lens, where), Spread(), seed=0
+    )
     lenses = draws(Spread(), 4, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
     x, y = (
@@ -134,13 +136,13 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
         ) * np.exp(change)
         exact = plain_sum.field(lens, np.where(d > 0, t * swung, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
-    assert missed(model, lenses) < 2e-3
+    assert reduction_error(model, lenses) < 2e-3
     assert len(model.basis) <= 12
 
 
 def test_no_spread_leaves_the_lens_as_it_is():
     still = Process(spread=Spread.only())
-    report = tolerance.analyse(
+    report = tolerance.analyse_tolerance(
         hyperbolic(), still, sens=SENS, depths_um=(1200.0,), draws=10
     )
     assert report.draws.strehl == pytest.approx(np.ones(10), abs=1e-5)
@@ -149,7 +151,7 @@ def test_no_spread_leaves_the_lens_as_it_is():
 
 
 def test_effects_and_bands_of_a_lens():
-    report = tolerance.analyse(
+    report = tolerance.analyse_tolerance(
         hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3
     )
     assert [effect.cause for effect in report.effects] == list(Spread().stated)
@@ -170,7 +172,9 @@ def test_effects_and_bands_of_a_lens():
 def test_the_effect_of_a_bias_on_the_phase_is_the_slope_of_the_proxy():
     lens = hyperbolic()
     small = Process(spread=dataclasses.replace(Spread(), bias_nm=0.1))
-    report = tolerance.analyse(lens, small, sens=SENS, depths_um=(1200.0,), draws=10)
+    report = tolerance.analyse_tolerance(
+        lens, small, sens=SENS, depths_um=(1200.0,), draws=10
+    )
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     slope = PROXY.dphase_ddiameter(d, 0.85)
     assert report.effects[0].phase_rad == pytest.approx(1e-4 * slope.std(), rel=0.02)
@@ -178,7 +182,7 @@ def test_the_effect_of_a_bias_on_the_phase_is_the_slope_of_the_proxy():
 
 def test_axial_information_is_equation_11_of_the_direct_psf():
     lens = hyperbolic()
-    report = tolerance.analyse(
+    report = tolerance.analyse_tolerance(
         lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10
     )
     near = 1 / (
@@ -193,7 +197,7 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
     t = lens.transmission() * np.exp(1j * lens.phase_rad())
     few = dataclasses.replace(where, x_um=where.x_um[::2], y_um=where.y_um[::2])
     psf = abs(plain_sum.field(lens, t, few)) ** 2
-    ready = focus.prepare(lens, where)
+    ready = focus.prepare_focus(lens, where)
     fast = abs(ready.light(ready.project(t[None]))[0]) ** 2
     assert abs(fast[:, ::2, ::2] - psf).max() < 1e-4 * psf.max()
     unit = fast / fast.sum((1, 2), keepdims=True)
@@ -230,7 +234,7 @@ def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, sha
     film = Cell(0.3, pillar="air", substrate="air", shape=shape, lattice=lattice)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
     lens = dataclasses.replace(hyperbolic(), cell=film, proxy=narrow)
-    found = sensitivities(lens, count=5)
+    found = compute_sensitivities(lens, count=5)
     assert found.rates[0] == pytest.approx(np.full(5, 2j * np.pi / 0.85), abs=1e-6)
     assert found.rates[2] == pytest.approx(np.zeros(5), abs=1e-6)
     # an index change counts by the area of the pillar, to first order in the contrast
@@ -248,7 +252,7 @@ def test_sensitivities_of_a_layered_film_of_air_are_the_optical_path_of_its_own_
     layers = (Layer(0.3), Layer(0.2, material=Index(1.0)), Layer(0.2))
     film = Cell(0.3, pillar="air", substrate="air", layers=layers)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
-    found = sensitivities(
+    found = compute_sensitivities(
         dataclasses.replace(hyperbolic(), cell=film, proxy=narrow), count=2
     )
     assert found.rates[0] == pytest.approx(np.full(2, 2j * np.pi / 0.85), abs=1e-6)
@@ -260,7 +264,7 @@ def test_sensitivities_of_a_layered_film_of_air_are_the_optical_path_of_its_own_
 
 def test_too_few_draws_are_refused():
     with pytest.raises(ProcessError, match="10 or more"):
-        tolerance.analyse(hyperbolic(), Process(), sens=SENS, draws=5)
+        tolerance.analyse_tolerance(hyperbolic(), Process(), sens=SENS, draws=5)
 
 
 def _drawn(study, most, *given, **more):
@@ -278,8 +282,8 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
         )
     lens = hyperbolic(31)
     process = Process(write_field=WriteField(size_um=6.0))
-    made = study_page.sections(
-        lens, process, fields.split(lens.diameters, process), {"": SENS}
+    made = study_page.study_sections(
+        lens, process, fields.split_write_fields(lens.diameters, process), {"": SENS}
     )
     assert [section.title for section in made] == [
         "Stitching",
@@ -311,8 +315,8 @@ def test_a_turned_lens_has_its_study(monkeypatch):
             module, name, functools.partial(_drawn, getattr(module, name), most)
         )
     lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
-    made = study_page.sections(
-        lens, process, fields.split(lens.diameters, process), {"": SENS}
+    made = study_page.study_sections(
+        lens, process, fields.split_write_fields(lens.diameters, process), {"": SENS}
     )
     assert [section.title for section in made] == ["Stitching", "Tolerance"]
     assert "what keeps its hand has no focus" in made[1].text
@@ -328,17 +332,21 @@ def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
 ):
     """The spread of a wall is 0.5 deg."""
     monkeypatch.setattr(
-        tolerance, "analyse", functools.partial(_drawn, tolerance.analyse, 10)
+        tolerance,
+        "analyse_tolerance",
+        functools.partial(_drawn, tolerance.analyse_tolerance, 10),
     )
     lens, process = (
         hyperbolic(31),
-        Process(etch=Etch(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)),
+        Process(
+            etch=EtchProfile(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)
+        ),
     )
     lens = dataclasses.replace(
         lens,
         cell=dataclasses.replace(lens.cell, sidewall_rad=math.radians(designed_deg)),
     )
-    text = study_page.tolerances(lens, process, SENS).text
+    text = study_page.tolerance_section(lens, process, SENS).text
     assert ("the process makes 0.6 deg" in text) is told
     assert ("sidewall_rad = 0.0105 in [cell]" in text) is told
     assert "keeps its hand" not in text
@@ -346,12 +354,12 @@ def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
 
 def test_fields_of_a_turned_lens_add_up_to_its_light():
     lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )
-    ready = focus.prepare(lens, where)
+    ready = focus.prepare_focus(lens, where)
     held, moments = stitching.field_moments(
-        lens, fields.split(lens.diameters, process), ready
+        lens, fields.split_write_fields(lens.diameters, process), ready
     )
     d = lens.diameters.diameter_um
     t = PROXY.transmission(np.where(d > 0, d, 0.2), 0.85) * np.exp(
@@ -372,7 +380,7 @@ def test_fields_of_a_turned_lens_add_up_to_its_light():
 def test_sensitivities_agree_with_an_independent_solver():
     cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
-    found = sensitivities(
+    found = compute_sensitivities(
         dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3
     )
 

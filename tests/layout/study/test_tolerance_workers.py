@@ -9,13 +9,13 @@ import pytest
 from layout.process.process import Process
 from layout.study import sensitivity, tolerance
 from metalens.cell.record import Index
-from metalens.ground import executor
+from metalens.core import executor
 from tests.layout.study.test_tolerance import SENS, hyperbolic
 
 
 def content(lens):
     """All numbers of a study with 26 draws, two batches, as bytes."""
-    found = tolerance.analyse(lens, Process(), sens=SENS, draws=26, seed=3)
+    found = tolerance.analyse_tolerance(lens, Process(), sens=SENS, draws=26, seed=3)
     rows = [
         getattr(found.draws, field.name).tobytes()
         for field in dataclasses.fields(found.draws)
@@ -44,10 +44,12 @@ def test_more_workers_than_batches_give_the_same_draws_and_answers_in_the_order_
     solved = dataclasses.replace(
         lens, cell=dataclasses.replace(lens.cell, pillar=Index(3.6))
     )
-    answers = sensitivity.sensitivities(solved, count=5, solver=unlike)
-    with executor.on(processes=3):  # two batches
+    answers = sensitivity.compute_sensitivities(solved, count=5, solver=unlike)
+    with executor.run_on(processes=3):  # two batches
         assert content(lens) == here
         assert (
-            sensitivity.sensitivities(solved, count=5, solver=unlike).rates.tobytes()
+            sensitivity.compute_sensitivities(
+                solved, count=5, solver=unlike
+            ).rates.tobytes()
             == answers.rates.tobytes()
         )

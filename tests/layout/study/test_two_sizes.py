@@ -13,9 +13,10 @@ from scipy import interpolate
 from layout.mask import fields
 from layout.process.process import Process, WriteField
 from layout.study import focus, page, pillars, stitching, tolerance
-from layout.study.spread_model import missed, reduce
+from layout.study.spread_model import reduce_spread, reduction_error
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Ellipse, Rectangle
+from metalens.core.report import Table
 from metalens.fabrication import (
     PairSensitivities,
     PairTable,
@@ -31,8 +32,7 @@ from metalens.fabrication import (
 from metalens.fabrication import (
     two_sizes as by_pairs,
 )
-from metalens.ground.report import Table
-from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum
 
@@ -83,7 +83,7 @@ def two_sizes(n=141):
     table = np.stack(
         [formula(*np.meshgrid(X_UM, Y_UM, indexing="ij"), light) for light in "xy"], -1
     )[None]
-    pairs = Pairs(np.array([0.85]), X_UM, Y_UM, table, (170.0, 1500.0))
+    pairs = TwoSizeTable(np.array([0.85]), X_UM, Y_UM, table, (170.0, 1500.0))
     cell = Cell(0.4, 0.6, Index(2.7), shape=Rectangle())
     diameters = DiameterMap(width, 0.4, length_um=length)
     return Lens(
@@ -108,14 +108,16 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
     """
     lens = two_sizes().seen(light)
     away = {"x": 150.0, "y": 170.0}[light]
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3),
         np.linspace(-1, 4, 3),
         away,
         0.85,
         np.array([1500.0, 1200.0]),
     )
-    model = reduce(lens, told(lens), focus.prepare(lens, where), Spread(), seed=0)
+    model = reduce_spread(
+        lens, told(lens), focus.prepare_focus(lens, where), Spread(), seed=0
+    )
     lenses = draws(Spread(), 3, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
     x, y = (
@@ -139,7 +141,7 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
         t = formula(wide + bias_um, long + bias_um, light) * np.exp(change)
         exact = plain_sum.field(lens, np.where(wide > 0, t, 0), where)
         assert abs(seen - exact).max() < 2.5e-3 * abs(exact).max()
-    assert missed(model, lenses) < 2e-3
+    assert reduction_error(model, lenses) < 2e-3
 
 
 def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
@@ -156,7 +158,9 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
         0.4,
         length_um=np.array([[0.12, 0.12], [0.0, 0.12]]),
     )
-    kind, count, made = pillars.kinds(dataclasses.replace(lens, diameters=few), corner)
+    kind, count, made = pillars.classify_pillars(
+        dataclasses.replace(lens, diameters=few), corner
+    )
     assert kind.tolist() == [[1, 1], [0, 1]]
     assert count.tolist() == [3]
     found = made.curve(np.array([-0.005, 0.0, 0.005]), State.of())[:, 0]
@@ -250,12 +254,12 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
 
 def test_fields_of_pairs_add_up_to_their_light():
     lens, process = two_sizes(51), Process(write_field=WriteField(size_um=10.0))
-    where = focus.Window(
+    where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )
-    ready = focus.prepare(lens, where)
+    ready = focus.prepare_focus(lens, where)
     _, moments = stitching.field_moments(
-        lens, fields.split(lens.diameters, process), ready
+        lens, fields.split_write_fields(lens.diameters, process), ready
     )
     wide, long = lens.diameters.diameter_um, lens.diameters.length_um
     exact = plain_sum.field(
@@ -284,8 +288,11 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
             return whole(lens, *args, draws=most, **about)
 
         monkeypatch.setattr(module, name, functools.wraps(whole)(few))
-    made = page.sections(
-        lens, process, fields.split(lens.diameters, process), page.answers_of(lens)
+    made = page.study_sections(
+        lens,
+        process,
+        fields.split_write_fields(lens.diameters, process),
+        page.answers_of(lens),
     )
     titles = [
         f"{what}, light along {light}"

@@ -14,12 +14,12 @@ import layout
 from layout.formats import doses
 from layout.mask import build
 from layout.pec import psf
-from layout.process.process import Etch, Exposure, Process
+from layout.process.process import EtchProfile, ExposureSettings, Process
 from layout.verify import LensRows, polygon_edges, verify_exposure
-from layout.verify.polygon_edges import Polygons
+from layout.verify.polygon_edges import ExposedPolygons
 from metalens.cell import Cell
+from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
-from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars import Proxy
 from tests.referees import rims
@@ -38,16 +38,16 @@ def lens_map(n=61, pitch=0.4):
 @functools.cache
 def written(process, furnished=True):
     """The mask as files: the plan, what a reader finds, and its dose table."""
-    plan = build.prepare(
+    plan = build.prepare_mask(
         lens_map(), process, furniture="die" if furnished else "none"
     ).plan
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
-        doses.write(plan, process, Path(folder) / "doses.csv")
+        doses.write_dose_table(plan, process, Path(folder) / "doses.csv")
         return (
             plan,
             layout.read_oasis(Path(folder) / "m.oas"),
-            doses.read(Path(folder) / "doses.csv"),
+            doses.read_dose_table(Path(folder) / "doses.csv"),
         )
 
 
@@ -61,7 +61,7 @@ def written(process, furnished=True):
     ],
 )
 def test_exposures_are_those_of_the_direct_sum(third):
-    process = Process(exposure=Exposure(**{**BEAM, **third}, correct=False))
+    process = Process(exposure=ExposureSettings(**{**BEAM, **third}, correct=False))
     plan, content, table = written(process, furnished=False)
     found = verify(plan, content, table, process)
     centres = np.stack([found.x_um, found.y_um], -1)
@@ -77,7 +77,7 @@ def test_exposures_are_those_of_the_direct_sum(third):
 
 
 def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
-    process = Process(exposure=Exposure(**BEAM, tolerance=0.008))
+    process = Process(exposure=ExposureSettings(**BEAM, tolerance=0.008))
     plan, content, table = written(process)
     found = verify(plan, content, table, process)
     assert len(found.drawn_nm) == plan.counts()[1:].sum()
@@ -92,10 +92,10 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
 
 
 def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
-    plain = Process(exposure=Exposure(**BEAM, correct=False))
+    plain = Process(exposure=ExposureSettings(**BEAM, correct=False))
     plan, content, table = written(plain)
     assert not verify(plan, content, table, plain).report.ok
-    process = Process(exposure=Exposure(**BEAM))
+    process = Process(exposure=ExposureSettings(**BEAM))
     plan, content, table = written(process)
     layer = max(k for k in table if k[0] == 1)
     more = verify(plan, content, {**table, layer: 1.05 * table[layer]}, process).report
@@ -112,7 +112,7 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     "third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)]
 )
 def test_the_edges_of_marks_and_labels_are_judged(third):
-    process = Process(exposure=Exposure(**BEAM, **third))
+    process = Process(exposure=ExposureSettings(**BEAM, **third))
     plan, content, table = written(process)
     found = verify(plan, content, table, process).report
     assert found.ok  # the tolerance of the correction is what a certificate wants
@@ -141,7 +141,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     alpha_um, beta_um, eta
 ):
     process = Process(
-        exposure=Exposure(
+        exposure=ExposureSettings(
             alpha_um=float(alpha_um), beta_um=float(beta_um), eta=float(eta)
         )
     )
@@ -165,7 +165,7 @@ def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
         [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
     )  # left, bottom, right, top
     corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
-    polygons = Polygons(corners, np.array([1.3, 0.7]), np.array([3, 3]))
+    polygons = ExposedPolygons(corners, np.array([1.3, 0.7]), np.array([3, 3]))
     points = np.random.default_rng(0).uniform(-1, 4, (40, 2))
     points[:3] = [
         [1.1, 0.0],
@@ -184,7 +184,7 @@ def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
                 * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a))
                 / 2
             )
-    assert polygon_edges.exposure(points, polygons, terms) == pytest.approx(
+    assert polygon_edges.exposure_at_edges(points, polygons, terms) == pytest.approx(
         want, abs=1e-9
     )
 
@@ -192,7 +192,9 @@ def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
 def test_samples_lie_on_the_outline_of_the_union_away_from_corners():
     boxes = [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
     corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
-    found = polygon_edges.samples(Polygons(corners, np.ones(2), np.array([3, 3])), 0.1)
+    found = polygon_edges.sample_edges(
+        ExposedPolygons(corners, np.ones(2), np.array([3, 3])), 0.1
+    )
     x, y = found.at_um.T
     inner = (np.abs(x - 3.0) < 1e-9) & (y < 0.8)
     assert not inner.any()  # the shared side is no edge
@@ -213,8 +215,8 @@ def test_the_raster_of_a_large_polygon_carries_its_mass():
     shape = np.array(
         [[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]]
     )
-    x, y, mass = polygon_edges.spots(
-        Polygons([shape], np.array([1.7]), np.array([3])), 0.5
+    x, y, mass = polygon_edges.equivalent_spots(
+        ExposedPolygons([shape], np.array([1.7]), np.array([3])), 0.5
     )
     assert mass.sum() == pytest.approx(1.7 * 23.0, rel=1e-12)
     assert (mass * x).sum() / mass.sum() == pytest.approx(
@@ -227,9 +229,9 @@ def test_the_raster_of_a_large_polygon_carries_its_mass():
 
 def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
     process = Process(
-        exposure=Exposure(**BEAM),
+        exposure=ExposureSettings(**BEAM),
         bias=Bias(isolated_nm=-12.0),
-        etch=Etch(sidewall_deg=1.0),
+        etch=EtchProfile(sidewall_deg=1.0),
     )
     source = lens_map()
     plan, content, table = written(process)
@@ -252,7 +254,7 @@ def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
 
 
 def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
-    process = Process(exposure=Exposure(**BEAM))
+    process = Process(exposure=ExposureSettings(**BEAM))
     plan, content, table = written(process)
     proxy = Proxy(
         np.array([[3.0, 3.0]]),

@@ -9,9 +9,9 @@ from matplotlib.path import Path as Outline
 import layout
 from layout.formats import doses
 from layout.mask import build
-from layout.process.process import Die, Exposure, Process
+from layout.process.process import DieSettings, ExposureSettings, Process
 from layout.verify import polygon_edges
-from layout.verify.polygon_edges import Polygons
+from layout.verify.polygon_edges import ExposedPolygons
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
 from tests.referees.verified import verify
@@ -62,10 +62,10 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
     """1 % and 1 nm; pixels of a quarter of the core, in sixteenths, and polygons for
     circles add 0.3 % and 0.1 nm.
     """
-    process = Process(exposure=Exposure(**beam))
-    plan = build.prepare(lens_map(*source), process, furniture="none").plan
+    process = Process(exposure=ExposureSettings(**beam))
+    plan = build.prepare_mask(lens_map(*source), process, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     assert len(drawn) == plan.counts()[1:].sum()
     terms = [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -103,12 +103,13 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     """
     beam = {"alpha_um": alpha_um, "beta_um": beta_um, "eta": eta}
     process = Process(
-        exposure=Exposure(**beam), die=Die(margin_um=330, mark_um=40, label="R4")
+        exposure=ExposureSettings(**beam),
+        die=DieSettings(margin_um=330, mark_um=40, label="R4"),
     )
     made = of_two_sizes(lens_map(29, 0.4, thinnest_um, 0.29, 0.7), thinnest_um, 0.29)
-    plan = build.prepare(made, process).plan
+    plan = build.prepare_mask(made, process).plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     resist = plain_exposure.Resist(
         drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -116,7 +117,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     found = verify(
         plan,
         layout.read_gdsii(tmp_path / "m.gds"),
-        doses.read(tmp_path / "doses.csv"),
+        doses.read_dose_table(tmp_path / "doses.csv"),
         process,
     ).report.edges
     assert set(found.layer.tolist()) == {
@@ -168,13 +169,13 @@ def test_the_slope_across_an_edge_is_that_of_an_error_function(alpha_um):
     less by (h / a)² / 3, 1.3 %.
     """
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    drawn = Polygons((square,), np.array([1.3]), np.array([4]))
+    drawn = ExposedPolygons((square,), np.array([1.3]), np.array([4]))
     middle = np.array([[1.0, 0.07], [-0.11, -1.0]])
-    points = polygon_edges.Samples(
+    points = polygon_edges.EdgeSamples(
         middle, np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([4, 4])
     )
     outside, inside = (
-        polygon_edges.exposure(at, drawn, [(alpha_um, 1.0)])
+        polygon_edges.exposure_at_edges(at, drawn, [(alpha_um, 1.0)])
         for at in polygon_edges.slope_aside(points)
     )
     want = 1.3 / (alpha_um * np.sqrt(np.pi))

@@ -10,7 +10,7 @@ import pytest
 import layout
 from layout.formats import doses
 from layout.mask import build
-from layout.process.process import Die, Exposure, Process
+from layout.process.process import DieSettings, ExposureSettings, Process
 from layout.verify import LensRows, verify_exposure
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
@@ -84,16 +84,16 @@ def test_every_shape_comes_out_with_its_area_and_the_certificate_says_how_nearly
     in quarters meet edges on the grid).
     """
     *made, beam = CASES[case]
-    exposure = Exposure(**dict(zip(NAMES, beam, strict=False)))
-    process = Process(exposure=exposure, die=Die(margin_um=300))
+    exposure = ExposureSettings(**dict(zip(NAMES, beam, strict=False)))
+    process = Process(exposure=exposure, die=DieSettings(margin_um=300))
     source = lens(*made)
-    plan = build.prepare(source, process, furniture="none").plan
+    plan = build.prepare_mask(source, process, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     found = certified(
         layout.read_gdsii(tmp_path / "m.gds"),
         plan,
-        doses.read(tmp_path / "doses.csv"),
+        doses.read_dose_table(tmp_path / "doses.csv"),
         process,
     )
     assert len(found) == plan.counts()[1:].sum()
@@ -128,16 +128,16 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     """
     corner = Polygon(((-0.4, -0.5), (0.6, -0.5), (0.1, 0.7)))
     assert np.mean(corner.corners, axis=0) == pytest.approx([0.1, -0.1])
-    process = Process(exposure=Exposure(alpha_um=0.019, beta_um=3.9, eta=0.75))
+    process = Process(exposure=ExposureSettings(alpha_um=0.019, beta_um=3.9, eta=0.75))
     source = lens(corner, lattice, (0.22, 0.226), turned=False)
-    plan = build.prepare(source, process, furniture="none").plan
+    plan = build.prepare_mask(source, process, furniture="none").plan
     layout.write_oasis(plan, tmp_path / "m.oas")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     rows = LensRows(plan)
     verify_exposure(
         layout.read_oasis(tmp_path / "m.oas"),
         plan,
-        doses.read(tmp_path / "doses.csv"),
+        doses.read_dose_table(tmp_path / "doses.csv"),
         process,
         keep=rows.take,
     )
@@ -176,19 +176,19 @@ def test_lone_pillars_of_any_shape_and_lattice_come_out_as_designed(tmp_path, ca
     by sums over the sites, and the
     certificate finds the designed sizes, by pixels over the mask."""
     *made, beam = CASES[case]
-    exposure = Exposure(**dict(zip(NAMES, beam, strict=False)))
+    exposure = ExposureSettings(**dict(zip(NAMES, beam, strict=False)))
     process = Process(
         exposure=exposure,
-        die=Die(margin_um=300),
+        die=DieSettings(margin_um=300),
         bias=Bias(isolated_nm=-12.0, range_um=1.1),
     )
     source = lens(*made, empty=0.0)
-    plan = build.prepare(source, process, furniture="none").plan
+    plan = build.prepare_mask(source, process, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write(plan, process, tmp_path / "doses.csv")
+    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
     content, table = (
         layout.read_gdsii(tmp_path / "m.gds"),
-        doses.read(tmp_path / "doses.csv"),
+        doses.read_dose_table(tmp_path / "doses.csv"),
     )
     found, d = verify(plan, content, table, process), source.diameters
     x, y, size = found.x_um, found.y_um, found.made_nm

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from metalens.aberrations import chief_ray
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import Stop
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, WAVE, made
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from metalens.aberrations import frequencies_per_mm, over_field
-from metalens.aberrations.angles import vignetting
-from metalens.ground.errors import PropagationError
+from metalens.aberrations.angles import vignetted_share
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Stop
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, RADIUS, WAVE, made
 
@@ -86,7 +86,7 @@ def test_vignetting_is_the_share_of_counted_rays_that_miss_the_pillars(case, ang
     it at random.
     """
     through, on = _counted(case, angle, 1.8)
-    got = vignetting(made(case), (math.radians(angle), 0.0), CASES[case][1])
+    got = vignetted_share(made(case), (math.radians(angle), 0.0), CASES[case][1])
     assert got == pytest.approx(1 - on / through, abs=0.008)
     assert got > 0.04
 

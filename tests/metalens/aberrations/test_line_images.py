@@ -12,9 +12,9 @@ from metalens.aberrations import over_field
 from metalens.aberrations.waves import (
     _directions,
     line_image,
+    line_mtf,
+    plane_waves_of_source,
     sharpness_per_um,
-    transfer,
-    waves,
 )
 from metalens.cell import Lattice
 from metalens.lens import DiameterMap
@@ -71,11 +71,13 @@ def test_transfer_and_sharpness_are_those_of_the_squared_field(case, angle, sens
     """Frequencies off the lattice of either; what is left is light that zone borders
     scatter: beyond the rays it is no
     detail here, and comes back over the lattice's ends there."""
-    light = waves(made(case), (math.radians(angle), 0.0), CASES[case][1])
+    light = plane_waves_of_source(
+        made(case), (math.radians(angle), 0.0), CASES[case][1]
+    )
     here = light.at(sensor_um)
     want, sharp = _squared(case, angle, sensor_um, PER_UM)
     for axis in (0, 1):
-        assert transfer(light, here, axis, PER_UM) == pytest.approx(
+        assert line_mtf(light, here, axis, PER_UM) == pytest.approx(
             want[axis], abs=3e-3
         )
         assert sharpness_per_um(light, here, axis) == pytest.approx(
@@ -104,7 +106,7 @@ def test_transfer_is_that_of_the_sum_over_pillars(case, angle):
         "map",
         layers=lens.layers,
     )
-    light = waves(lens, angles, depth)
+    light = plane_waves_of_source(lens, angles, depth)
     here = light.at(sensor)
     stack = from_lens(lens, View((depth,), (angles,), 150.0, 225), tolerance=1e-4)
     held = float(stack.energy_um2[0, 0] / passed_um2(lens, angles, (depth,))[0])
@@ -113,7 +115,7 @@ def test_transfer_is_that_of_the_sum_over_pillars(case, angle):
     ):
         place = (np.arange(225) - 112) * 150.0 / 225
         want = [held * abs(line @ np.exp(-2j * np.pi * v * place)) for v in PER_UM]
-        assert transfer(light, here, axis, PER_UM) == pytest.approx(want, abs=1e-3)
+        assert line_mtf(light, here, axis, PER_UM) == pytest.approx(want, abs=1e-3)
 
 
 def test_an_even_round_pupil_has_the_transfer_function_of_the_books():
@@ -121,22 +123,22 @@ def test_an_even_round_pupil_has_the_transfer_function_of_the_books():
     scattered by zone borders (0.8 %);
     rays of this lens are even over directions to NA²/2 = 0.02 at the rim, most of which
     the edge of s² has."""
-    light = waves(made("plain"), (0.0, 0.0), math.inf)
+    light = plane_waves_of_source(made("plain"), (0.0, 0.0), math.inf)
     share = np.array([0.07, 0.21, 0.4, 0.66, 0.9])
     sine = 62.0 / math.hypot(62.0, 310.0)
     want = 2 / math.pi * (np.arccos(share) - share * np.sqrt(1 - share**2))
-    found = transfer(light, light.at(310.0), 0, share * 2 * sine / WAVE)
+    found = line_mtf(light, light.at(310.0), 0, share * 2 * sine / WAVE)
     assert found == pytest.approx(want, abs=0.015)
     assert (
         float(
-            transfer(light, light.at(310.0), 1, np.array([1.04 * 2 * sine / WAVE]))[0]
+            line_mtf(light, light.at(310.0), 1, np.array([1.04 * 2 * sine / WAVE]))[0]
         )
         < 0.01
     )
 
 
 def test_a_line_image_holds_the_light_of_its_waves_and_lies_where_it_falls():
-    light = waves(made("plain"), (0.2, 0.0), math.inf)
+    light = plane_waves_of_source(made("plain"), (0.2, 0.0), math.inf)
     line, step = line_image(light, light.at(310.0), 1)
     assert line.sum() == pytest.approx(light.held, rel=1e-12)
     assert step < WAVE / (4 * 0.19)

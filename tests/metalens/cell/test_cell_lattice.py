@@ -10,7 +10,7 @@ import pytest
 
 from metalens import materials
 from metalens.cell import Cell, Lattice, Layer
-from metalens.cell.orders import check_subwavelength, propagating
+from metalens.cell.orders import check_subwavelength, propagating_orders
 from metalens.cell.record import Index
 from metalens.cell.shapes import (
     Circle,
@@ -21,8 +21,8 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
-from metalens.ground import config
-from metalens.ground.errors import CellError, MaterialError
+from metalens.core import config
+from metalens.core.errors import CellError, MaterialError
 
 LATTICES = (
     Lattice(),
@@ -200,7 +200,9 @@ def test_the_pitch_named_for_light_aslant_in_azimuth_is_the_limit():
     check_subwavelength(cell(true * 0.9999), wave, angle_rad=angle, azimuth_rad=azimuth)
     assert (
         len(
-            propagating(cell(true * 1.0001), wave, angle_rad=angle, azimuth_rad=azimuth)
+            propagating_orders(
+                cell(true * 1.0001), wave, angle_rad=angle, azimuth_rad=azimuth
+            )
         )
         == 3
     )

@@ -14,7 +14,7 @@ from metalens import library, rcwa
 from metalens.cell.orders import check_subwavelength
 from metalens.cli import main
 from metalens.commands.library import CellFile
-from metalens.ground import config
+from metalens.core import config
 from metalens.pillars import axes
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from metalens import materials
 from metalens.cell.materials import SPOKEN
 from metalens.cell.record import Blend, Index
-from metalens.ground.errors import MaterialError
+from metalens.core.errors import MaterialError
 
 ROUNDING = 1e-14  # of a few sums and products below 4: 4e-16 each
 
@@ -43,14 +43,14 @@ def test_rows_of_the_sources_come_back(name, wavelength_um, want):
 
 @given(st.sampled_from(["a-Si", "Si"]), st.floats(0.32, 1.44))
 def test_between_rows_the_table_is_a_straight_line(name, wavelength_um):
-    w, n, k = materials.material(name).table
+    w, n, k = materials.find_material(name).table
     want = np.interp(wavelength_um, w, n) + 1j * np.interp(wavelength_um, w, k)
     assert abs(materials.index(name, wavelength_um) - want) < 1e-12
     row = w[np.argmin(np.abs(w - wavelength_um))]
     chord = (materials.index(name, row) - materials.index(name, wavelength_um)) / (
         row - wavelength_um or 1
     )
-    rate = materials.slope(name, wavelength_um)
+    rate = materials.index_dispersion(name, wavelength_um)
     assert row == wavelength_um or abs(chord - rate) < 1e-12 / abs(
         row - wavelength_um
     ) + 1e-12 * abs(rate)
@@ -62,7 +62,7 @@ def test_slope_of_the_sellmeier_formula(wavelength_um):
     rise = materials.index("SiO2", wavelength_um + step) - materials.index(
         "SiO2", wavelength_um - step
     )
-    rate = materials.slope("SiO2", wavelength_um)
+    rate = materials.index_dispersion("SiO2", wavelength_um)
     assert (
         abs(rise / (2 * step) - rate) < 1e-4 * abs(rate) + 1e-9
     )  # third derivative / 6 step^2, and rounding
@@ -75,14 +75,14 @@ def test_absorption_is_never_negative(wavelength_um):
 
 def test_plain_numbers_hold_at_every_wavelength():
     assert materials.index(Index(3.6, 0.1), 0.85) == 3.6 + 0.1j
-    assert materials.slope(Index(3.6, 0.1), 0.85) == 0
+    assert materials.index_dispersion(Index(3.6, 0.1), 0.85) == 0
 
 
 @pytest.mark.parametrize(
     ("name", "wavelength_um"), [("a-Si", 2.07), ("Si", 0.2499), ("SiO2", 3.8)]
 )
 def test_outside_the_range_is_refused_and_the_range_is_named(name, wavelength_um):
-    low, high = materials.material(name).range_um
+    low, high = materials.find_material(name).range_um
     with pytest.raises(MaterialError, match=rf"{name} at .*from {low} to {high} um"):
         materials.index(name, wavelength_um)
 
@@ -122,7 +122,7 @@ def test_own_table_with_shuffled_columns_and_comments(tmp_path: Path):
         "# run 7, ellipsometer\nk, n, wavelength_um\n0.1,3.5,0.8\n\n0.0,3.3,0.9\n"
     )
     assert materials.index(str(file), 0.8) == 3.5 + 0.1j
-    assert materials.material(str(file)).source == "run 7, ellipsometer"
+    assert materials.find_material(str(file)).source == "run 7, ellipsometer"
     file.write_text("wavelength_um,n,k\n0.8,2,0\n0.9,2,0\n")
     assert (
         abs(materials.index(str(file), 0.85) - 2) < ROUNDING
@@ -206,10 +206,10 @@ def test_a_table_that_falls_in_nanometres_is_the_table_that_rises(tmp_path: Path
     assert materials.index(str(file), 0.855) == pytest.approx(
         3.425 + 0.0275j, abs=1e-12
     )  # a quarter on from 840 nm
-    assert materials.slope(str(file), 0.855) == pytest.approx(
+    assert materials.index_dispersion(str(file), 0.855) == pytest.approx(
         -5 + 0.5j, abs=1e-9
     )  # per um
-    assert materials.material(str(file)).range_um == pytest.approx((0.8, 0.9))
+    assert materials.find_material(str(file)).range_um == pytest.approx((0.8, 0.9))
 
 
 def test_missing_and_binary_files_are_refused(tmp_path: Path):
@@ -294,10 +294,10 @@ def test_every_formula_of_the_database_and_its_slope(
     w, step = 0.6328, 1e-5
     assert abs(materials.index(str(page), w) - plain(w)) < 1e-13
     rise = (plain(w + step) - plain(w - step)) / (2 * step)
-    assert abs(materials.slope(str(page), w) - rise) < 1e-7 * (
+    assert abs(materials.index_dispersion(str(page), w) - rise) < 1e-7 * (
         1 + abs(rise)
     )  # third derivative / 6 step²
-    assert materials.material(str(page)).source == "A. B"
+    assert materials.find_material(str(page)).source == "A. B"
     with pytest.raises(MaterialError, match=r"from 0.4 to 0.9 um"):
         materials.index(str(page), 0.95)
 
@@ -324,7 +324,7 @@ def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Pat
     page.write_text(
         "DATA:\n  - type: formula 2\n    wavelength_range: 0.9 0.4\n    coefficients: 0.2 0.7 0.36\n"
     )
-    assert materials.material(str(page)).range_um == (0.4, 0.9)
+    assert materials.find_material(str(page)).range_um == (0.4, 0.9)
     assert materials.index(str(page), 0.8) == pytest.approx(
         math.sqrt(1.2 + 0.7 * 0.64 / (0.64 - 0.36)), rel=1e-12
     )
@@ -351,12 +351,12 @@ def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
     assert (
         abs(materials.index(str(page), 0.6) - (1.5 + 0.01 / 0.36 + 1.5e-3j)) < ROUNDING
     )  # rows in any order
-    assert materials.material(str(page)).range_um == (0.5, 0.9)
+    assert materials.find_material(str(page)).range_um == (0.5, 0.9)
 
 
 @pytest.mark.parametrize("name", materials.NAMES)
 def test_every_shipped_material_says_its_source_and_is_a_material(name):
-    record = materials.material(name)
+    record = materials.find_material(name)
     low, high = record.range_um
     for share in (0.01, 0.37, 0.83):
         n = materials.index(name, low + share * (min(high, 20.0) - low))
@@ -518,7 +518,7 @@ def test_blends_and_offsets():
     rise = (materials.index(blend, 0.6 + step) - materials.index(blend, 0.6 - step)) / (
         2 * step
     )
-    assert abs(materials.slope(blend, 0.6) - rise) < 1e-6
+    assert abs(materials.index_dispersion(blend, 0.6) - rise) < 1e-6
 
 
 def write_page(folder: Path, rows: list[str]) -> str:

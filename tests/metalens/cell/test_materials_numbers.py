@@ -11,7 +11,7 @@ import pytest
 from metalens import materials
 from metalens.cell import materials as rooms
 from metalens.cell.record import Blend, Index
-from metalens.ground.errors import MaterialError
+from metalens.core.errors import MaterialError
 
 
 def test_fused_silica_is_malitsons_from_0_21_to_3_71_um():
@@ -28,7 +28,7 @@ def test_fused_silica_is_malitsons_from_0_21_to_3_71_um():
         ):
             materials.index("SiO2", wavelength)
     assert materials.index("air", 1e-9) == materials.index("air", 1e9) == 1
-    assert materials.slope("air", 0.5) == 0
+    assert materials.index_dispersion("air", 0.5) == 0
 
 
 @pytest.mark.parametrize("wavelength", [0.25, 0.7, 2.9])
@@ -36,7 +36,7 @@ def test_the_dispersion_of_fused_silica_is_its_difference(wavelength):
     step = 1e-4 * wavelength
     ends = [materials.index("SiO2", wavelength + s * step).real for s in (-2, -1, 1, 2)]
     want = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-    assert materials.slope("SiO2", wavelength) == pytest.approx(
+    assert materials.index_dispersion("SiO2", wavelength) == pytest.approx(
         want, rel=1e-8
     )  # step⁴, and ε / step
 
@@ -60,7 +60,9 @@ def test_a_table_is_straight_between_its_rows_and_holds_at_both_ends(
     wavelength, n, rate
 ):
     assert materials.index(table(), wavelength) == pytest.approx(n, rel=1e-12)
-    assert materials.slope(table(), wavelength) == pytest.approx(rate, rel=1e-10)
+    assert materials.index_dispersion(table(), wavelength) == pytest.approx(
+        rate, rel=1e-10
+    )
 
 
 def page(tmp_path, n_range, k_rows):
@@ -84,13 +86,13 @@ def page(tmp_path, n_range, k_rows):
 )
 def test_a_page_holds_where_both_of_its_parts_do(tmp_path, n_range, k_rows, want):
     found = page(tmp_path, n_range, k_rows)
-    assert materials.material(found).range_um == want
+    assert materials.find_material(found).range_um == want
     middle = sum(want) / 2
     k = 0.1 + (middle - 0.5) / 0.4 * 0.1
     assert materials.index(found, middle) == pytest.approx(
         1.5 + 0.01 / middle**2 + 1j * k, rel=1e-12
     )
-    assert materials.slope(found, middle) == pytest.approx(
+    assert materials.index_dispersion(found, middle) == pytest.approx(
         -0.02 / middle**3 + 0.25j, rel=1e-9
     )
 
@@ -100,7 +102,7 @@ def test_parts_that_share_no_wavelength_are_refused(tmp_path):
         MaterialError,
         match=r"n holds from 0\.3 to 0\.5 um, and k at no wavelength of these",
     ):
-        materials.material(page(tmp_path, "0.3 0.5", [(0.5, 0.1), (0.9, 0.2)]))
+        materials.find_material(page(tmp_path, "0.3 0.5", [(0.5, 0.1), (0.9, 0.2)]))
 
 
 def bruggeman(a, b, share):
@@ -129,7 +131,7 @@ def test_blends_of_absorbing_materials_are_bruggemans(blend):
     want = bruggeman(a, b, blend.share) + complex(blend.n_offset, blend.k_offset)
     assert materials.index(blend, 0.7) == pytest.approx(want, rel=1e-12)
     ends = [materials.index(blend, 0.7 + s * 1e-5) for s in (-1, 1)]
-    assert materials.slope(blend, 0.7) == pytest.approx(
+    assert materials.index_dispersion(blend, 0.7) == pytest.approx(
         (ends[1] - ends[0]) / 2e-5, rel=1e-5
     )
 
@@ -139,7 +141,9 @@ def test_offsets_alone_leave_the_slope_and_may_not_turn_loss_to_gain():
     assert materials.index(shifted, 0.7) == pytest.approx(
         materials.index("a-Si", 0.7) - 0.2 + 0.01j, rel=1e-12
     )
-    assert materials.slope(shifted, 0.7) == materials.slope("a-Si", 0.7)
+    assert materials.index_dispersion(shifted, 0.7) == materials.index_dispersion(
+        "a-Si", 0.7
+    )
     with pytest.raises(MaterialError, match=r"n \+ ik = .*need n > 0 and k >= 0"):
         materials.index(Blend("SiO2", k_offset=-1e-6), 0.7)
     with pytest.raises(MaterialError, match="blend of SiO2"):
@@ -148,8 +152,8 @@ def test_offsets_alone_leave_the_slope_and_may_not_turn_loss_to_gain():
 
 
 def test_kin_that_hold_at_their_very_ends_are_named():
-    low, high = materials.material("Ge-infrared").range_um
-    assert materials.material("Ge").range_um[1] < high
+    low, high = materials.find_material("Ge-infrared").range_um
+    assert materials.find_material("Ge").range_um[1] < high
     for wavelength in (high,):
         with pytest.raises(
             MaterialError, match=r"another material \('Ge-infrared' holds there\)"
@@ -162,7 +166,7 @@ def test_kin_that_hold_at_their_very_ends_are_named():
 
 def test_plain_numbers_have_no_slope_and_absorb_as_they_say():
     assert materials.index(Index(1.7, 0.03), 123.0) == 1.7 + 0.03j
-    assert materials.slope(Index(1.7, 0.03), 123.0) == 0
+    assert materials.index_dispersion(Index(1.7, 0.03), 123.0) == 0
 
 
 @pytest.mark.parametrize("metal", ["Au", "Ag", "Al"])

@@ -6,13 +6,13 @@ import pytest
 
 from metalens import rcwa
 from metalens.cell.orders import (
-    Order,
+    DiffractionOrder,
     check_subwavelength,
-    propagating,
+    propagating_orders,
     substrate_orders,
 )
 from metalens.cell.record import Cell, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 GLASS = Index(1.45)
 
@@ -27,17 +27,17 @@ def immersed(pitch_um):
 
 
 def test_only_the_zero_orders_below_cutoff():
-    assert propagating(cell(0.4), 0.85) == (
-        Order("substrate", 0, 0),
-        Order("cover", 0, 0),
+    assert propagating_orders(cell(0.4), 0.85) == (
+        DiffractionOrder("substrate", 0, 0),
+        DiffractionOrder("cover", 0, 0),
     )
     check_subwavelength(cell(0.4), 0.85)
 
 
 def test_exactly_at_cutoff_four_orders_graze_in_the_substrate():
     at_cutoff = cell(1.0)
-    assert len(propagating(at_cutoff, 1.45)) == 6
-    assert len(propagating(at_cutoff, 1.45 * (1 + 1e-12))) == 2
+    assert len(propagating_orders(at_cutoff, 1.45)) == 6
+    assert len(propagating_orders(at_cutoff, 1.45 * (1 + 1e-12))) == 2
     with pytest.raises(CellError, match=r"\(0, -1\).* in the cover; need pitch_um < 1"):
         check_subwavelength(immersed(1.0), 1.45)
     check_subwavelength(at_cutoff, 1.45)  # orders of the substrate are a loss
@@ -51,7 +51,7 @@ def test_orders_are_those_that_carry_power_in_the_solver(pitch_um, angle_deg):
     propagate.
     """
     angle_rad = math.radians(angle_deg)
-    orders = propagating(cell(pitch_um), 0.85, angle_rad=angle_rad)
+    orders = propagating_orders(cell(pitch_um), 0.85, angle_rad=angle_rad)
     got = rcwa.solve(
         cell(pitch_um), 0.25, 0.85, harmonics=4, angle_rad=angle_rad, polarization="s"
     )

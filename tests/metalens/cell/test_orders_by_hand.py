@@ -7,9 +7,13 @@ import re
 import pytest
 
 from metalens.cell.lattice import Lattice
-from metalens.cell.orders import check_subwavelength, no_resonance_um, propagating
+from metalens.cell.orders import (
+    check_subwavelength,
+    no_resonance_um,
+    propagating_orders,
+)
 from metalens.cell.record import Cell, Film, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 
 @pytest.mark.parametrize(
@@ -43,7 +47,9 @@ def test_orders_are_those_whose_wave_vector_fits_the_medium(
                     lattice.kind != "hexagonal" or (m + n) % 2 == 0
                 ):
                     want.add((side, m, n))
-    found = propagating(cell, wavelength, angle_rad=angle_rad, azimuth_rad=azimuth_rad)
+    found = propagating_orders(
+        cell, wavelength, angle_rad=angle_rad, azimuth_rad=azimuth_rad
+    )
     assert {(one.side, one.m, one.n) for one in found} == want
     assert len(found) == len(want) > 2
 
@@ -60,7 +66,9 @@ def test_below_the_pitch_without_resonances_the_densest_material_carries_no_othe
     cell = Cell(0.3, pillar=Index(2.7), substrate=Index(1.5), lattice=lattice)
     for above, count in ((0.999, 2), (1.001, None)):
         pitch = above * no_resonance_um(cell, 0.62)
-        found = propagating(Cell(pitch, substrate=Index(2.7), lattice=lattice), 0.62)
+        found = propagating_orders(
+            Cell(pitch, substrate=Index(2.7), lattice=lattice), 0.62
+        )
         assert (len(found) == count) if count else len(found) > 2
     film = Film(Index(3.1), 0.05)
     assert no_resonance_um(
@@ -93,5 +101,5 @@ def test_the_pitch_that_a_refusal_names_is_the_limit_for_any_lattice_and_light(
     fine, above = (
         dataclasses.replace(coarse, pitch_um=limit * (1 + off)) for off in (-1e-5, 1e-5)
     )
-    assert len(propagating(fine, 0.85, **light)) == 2
-    assert len(propagating(above, 0.85, **light)) > 2
+    assert len(propagating_orders(fine, 0.85, **light)) == 2
+    assert len(propagating_orders(above, 0.85, **light)) > 2

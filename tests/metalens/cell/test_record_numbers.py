@@ -7,7 +7,7 @@ import pytest
 from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Ellipse, Polygon, Ring, Square
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 SLOPE = 2 * math.tan(0.05)  # of the width, for each um that it is lower
 PEDESTAL = Layer(0.1, grow_um=0.05, material=Index(1.9))

@@ -12,8 +12,8 @@ from metalens import library, modal, rcwa
 from metalens.cell import Cell, Film, Index, Layer, index, substrate_orders
 from metalens.cli import main
 from metalens.commands.library import CellFile
-from metalens.ground import config
-from metalens.ground.errors import CellError
+from metalens.core import config
+from metalens.core.errors import CellError
 from metalens.pillars.record import Sweep
 
 COVER = Index(1.66)
@@ -135,7 +135,7 @@ def test_silicon_on_silicon_of_the_infrared_is_swept_designed_and_imaged(
     assert values["lost"]["mean"] == pytest.approx(lost.mean(), abs=1e-9)
     assert lost.max() > 0.05
     with pytest.raises(CellError, match=r"\(-1, 0\).* in the cover"):
-        library.check(replace(made.cell, cover=Index(3.4)), made.sweep)
+        library.check_sweep(replace(made.cell, cover=Index(3.4)), made.sweep)
     run = ["design", str(tmp_path / "lens.toml"), "-o", lens]
     assert main([*run, "--accept-partial-turn", "--skip-focus-check"]) in (0, 1)
     shown = capsys.readouterr().out
@@ -157,6 +157,6 @@ def test_silicon_on_silicon_of_the_infrared_is_swept_designed_and_imaged(
 
 def test_cells_that_are_refused_and_swept_differ_by_the_cover_alone():
     wanted = CellFile(SIC, Sweep(wavelengths_um=(WAVE,), diameters_um=(0.08, 0.17)))
-    library.check(wanted.cell, wanted.sweep)
+    library.check_sweep(wanted.cell, wanted.sweep)
     with pytest.raises(CellError, match="in the cover"):
-        library.check(replace(SIC, cover=Index(2.67)), wanted.sweep)
+        library.check_sweep(replace(SIC, cover=Index(2.67)), wanted.sweep)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import tables
-from metalens.ground.errors import MaterialError
+from metalens.core.errors import MaterialError
 
 WANT = np.array([[0.8, 0.9, 1.1], [3.5, 3.3, 3.2], [0.1, 0.0, 0.02]])
 
@@ -27,13 +27,13 @@ WANT = np.array([[0.8, 0.9, 1.1], [3.5, 3.3, 3.2], [0.1, 0.0, 0.02]])
     ],
 )
 def test_a_table_is_read_however_it_is_written(text):
-    found, said = tables.read(f"# grown at\n{text}# 300 C\n", "a.csv")
+    found, said = tables.parse_table(f"# grown at\n{text}# 300 C\n", "a.csv")
     assert found == pytest.approx(WANT, rel=1e-12)
     assert said == "grown at 300 C"
 
 
 def test_a_table_without_k_is_transparent():
-    assert tables.read("wl,n\n0.8,3.5\n0.9,3.3\n", "a")[0].tolist() == [
+    assert tables.parse_table("wl,n\n0.8,3.5\n0.9,3.3\n", "a")[0].tolist() == [
         [0.8, 0.9],
         [3.5, 3.3],
         [0, 0],
@@ -65,5 +65,5 @@ def test_a_table_without_k_is_transparent():
 )
 def test_what_cannot_be_is_refused_with_its_line(text, said):
     with pytest.raises(MaterialError) as caught:
-        tables.read(text, "a")
+        tables.parse_table(text, "a")
     assert said in str(caught.value)

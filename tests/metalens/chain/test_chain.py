@@ -15,23 +15,25 @@ from metalens.chain import module_view
 from metalens.chain import stages as chain
 from metalens.chain.stages import ChainFiles
 from metalens.commands import demo
-from metalens.commands.design import Design
-from metalens.ground import config, manifest
-from metalens.ground.errors import ConfigError
+from metalens.commands.design import DesignSettings
+from metalens.core import config, manifest
+from metalens.core.errors import ConfigError
 
 
 def _verbs(files):
-    return [stage.words[0] for stage in chain.stages(files)]
+    return [stage.words[0] for stage in chain.chain_stages(files)]
 
 
 def test_the_shipped_chain_runs_from_cell_to_retrained_network():
-    assert _verbs(chain.shipped()) == [
+    assert _verbs(chain.shipped_settings()) == [
         "library", "design", "psf", "layout", "codesign", "capture", "fit", "retrain",
     ]  # fmt: skip
-    assert {w for s in chain.stages(chain.shipped()) for w in s.words if w.endswith("lens.h5")} == {
+    assert {w for s in chain.chain_stages(chain.shipped_settings()) for w in s.words if w.endswith("lens.h5")} == {
         "lens.h5", "run/lens.h5",
     }  # fmt: skip
-    names = [demo._name(stage) for stage in chain.stages(chain.shipped())]
+    names = [
+        demo._name(stage) for stage in chain.chain_stages(chain.shipped_settings())
+    ]
     assert len(set(names)) == len(names)
 
 
@@ -40,18 +42,18 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
         (tmp_path / f"{name}.toml").write_text("")
     text = 'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n'
     (tmp_path / "chain.toml").write_text(text)
-    assert _verbs(chain.load(tmp_path / "chain.toml")) == [
+    assert _verbs(chain.load_chain(tmp_path / "chain.toml")) == [
         "library",
         "design",
         "psf",
         "layout",
     ]
     (tmp_path / "chain.toml").write_text(text + 'run = "r.toml"\npsf = "p.toml"\n')
-    stages = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    stages = list(chain.chain_stages(chain.load_chain(tmp_path / "chain.toml")))
     (tmp_path / "chain.toml").write_text(
         text + 'bench_design = "d.toml"\nbench_truth = "r.toml"\n'
     )
-    own = list(chain.stages(chain.load(tmp_path / "chain.toml")))
+    own = list(chain.chain_stages(chain.load_chain(tmp_path / "chain.toml")))
     assert [s.words[0] for s in own[-3:]] == ["design", "capture", "fit"]
     assert "bench_lens.h5" in own[-1].words
     assert stages[-1].words[0] == "codesign"
@@ -81,7 +83,7 @@ def test_incomplete_chains_are_refused(tmp_path, text, message):
     (tmp_path / "c.toml").write_text("")
     (tmp_path / "chain.toml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        chain.load(tmp_path / "chain.toml")
+        chain.load_chain(tmp_path / "chain.toml")
 
 
 def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_path):
@@ -93,7 +95,7 @@ def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_pa
     )
     for name in ("c", "p"):
         (source / f"{name}.toml").write_text(f"# {name}\n")
-    laid = chain.laid(
+    laid = chain.lay_out_inputs(
         ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")),
         source,
         aperture_mm=0.25,
@@ -102,7 +104,7 @@ def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_pa
     assert laid.files == ChainFiles(
         Path("cell.toml"), Path("design.toml"), Path("process.toml")
     )
-    made = config.load(target / "design.toml", Design)
+    made = config.load(target / "design.toml", DesignSettings)
     assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (
         0.25,
         "cubic",
@@ -119,7 +121,7 @@ def laid_out(tmp_path, **texts):
         folder.mkdir(parents=True, exist_ok=True)
     for name, text in ({"c.toml": "", "d.toml": "", "p.toml": ""} | texts).items():
         (source / name).write_text(text)
-    chain.laid(
+    chain.lay_out_inputs(
         ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")),
         source,
         aperture_mm=None,
@@ -168,16 +170,19 @@ def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path):
     with pytest.raises(
         ConfigError, match=r"s\.toml: 'table\.csv' is not the file of that name"
     ):
-        chain.laid(files, tmp_path, aperture_mm=None)
+        chain.lay_out_inputs(files, tmp_path, aperture_mm=None)
     (tmp_path / "b" / "table.csv").write_text("x")
-    assert chain.laid(files, tmp_path, aperture_mm=None).contents["table.csv"] == b"x"
+    assert (
+        chain.lay_out_inputs(files, tmp_path, aperture_mm=None).contents["table.csv"]
+        == b"x"
+    )
 
 
 def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
     for name, content in (("c", b'n = "\xff"\n'), ("d", b""), ("p", b"")):
         (tmp_path / f"{name}.toml").write_bytes(content)
     with pytest.raises(ConfigError, match=r"c\.toml"):
-        chain.laid(
+        chain.lay_out_inputs(
             ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")),
             tmp_path,
             aperture_mm=None,
@@ -185,9 +190,11 @@ def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
 
 
 def test_the_shipped_settings_are_laid_out(tmp_path):
-    chain.laid(chain.shipped(), None, aperture_mm=0.25).write(tmp_path)
+    chain.lay_out_inputs(chain.shipped_settings(), None, aperture_mm=0.25).write(
+        tmp_path
+    )
     assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
-    assert config.load(tmp_path / "design.toml", Design).aperture_mm == 0.25
+    assert config.load(tmp_path / "design.toml", DesignSettings).aperture_mm == 0.25
     assert (
         (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")
     )
@@ -195,7 +202,8 @@ def test_the_shipped_settings_are_laid_out(tmp_path):
 
 def test_the_drawn_module_needs_nothing_from_outside_and_grows_with_the_lens():
     small, large = (
-        module_view.view(aperture_mm=a, sensor_distance_mm=2.0).html for a in (0.5, 3.0)
+        module_view.draw_module(aperture_mm=a, sensor_distance_mm=2.0).html
+        for a in (0.5, 3.0)
     )
     assert not re.search(r"(?:src|href)=|https?:", small)
     parts = [
@@ -217,7 +225,7 @@ def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
     """It is not said to have refused its input, and nothing is noted as done."""
     monkeypatch.setattr(demo, "run_verb", lambda words: 130)
     with pytest.raises(KeyboardInterrupt):
-        list(demo._chain(tmp_path, chain.shipped()))
+        list(demo._chain(tmp_path, chain.shipped_settings()))
     assert not (tmp_path / demo.OUTCOMES).exists()
 
 
@@ -367,5 +375,5 @@ def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch
     [(6043.0, "6000 counts"), (7.13e-7, "7.1e-07 counts"), ({"a": [3, 5]}, "2 counts")],
 )
 def test_errors_of_the_page_have_no_power_of_ten_where_none_is_needed(found, told):
-    stage = chain.Stage("Captures", "", ("capture",), ("peak", "counts"))
-    assert demo._error(demo.Outcome(stage, 0, {"peak": found}, 1.5)) == told
+    stage = chain.ChainStage("Captures", "", ("capture",), ("peak", "counts"))
+    assert demo._error(demo.StageOutcome(stage, 0, {"peak": found}, 1.5)) == told

@@ -17,7 +17,9 @@ DIE = APERTURE + 0.5
 
 @pytest.fixture(scope="module")
 def parts():
-    text = str(module_view.view(aperture_mm=APERTURE, sensor_distance_mm=DISTANCE))
+    text = str(
+        module_view.draw_module(aperture_mm=APERTURE, sensor_distance_mm=DISTANCE)
+    )
     return json.loads(re.search(r"\[\{\"name\".*\}\]", text)[0])
 
 
@@ -86,7 +88,7 @@ def test_the_lens_is_a_disc_of_its_aperture_under_the_substrate(parts):
 
 
 def test_a_small_lens_still_has_a_die_of_one_and_a_half_millimetres():
-    text = str(module_view.view(aperture_mm=0.2, sensor_distance_mm=1.1))
+    text = str(module_view.draw_module(aperture_mm=0.2, sensor_distance_mm=1.1))
     found = json.loads(re.search(r"\[\{\"name\".*\}\]", text)[0])
     substrate = next(part for part in found if part["name"] == "substrate")
     assert volume(substrate) == pytest.approx(1.5**2 * 0.3)

@@ -57,7 +57,7 @@ def test_a_library_over_two_sizes_is_written_shown_and_right(
     i, j = 9, 17
     x, y = float(library.x_um[i]), float(library.y_um[j])
     exact = rcwa.jones(
-        axes.sized(library.cell, x, y), x, 0.71, harmonics=told["harmonics"] + 3
+        axes.cell_of_sizes(library.cell, x, y), x, 0.71, harmonics=told["harmonics"] + 3
     )
     assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
     assert (tmp_path / "axes.png").stat().st_size > 20_000
@@ -79,12 +79,12 @@ def test_bars_above_the_tolerance_fail_and_a_ratio_is_refused(tmp_path, capsys):
     found = axes.AxesLibrary(
         Cell(0.3), sweep, np.array([0.7]), axis, axis, t, bars, held, 9, 5
     )
-    assert [line.split(":")[0] for line in axes_library.failures(found)] == [
+    assert [line.split(":")[0] for line in axes_library.library_failures(found)] == [
         "error bars of 67% of the pairs of sizes are above the tolerance 0.03 (median 0.04)",
         "1 of 2 pairs held out lie above their error bar",
     ]
     assert (
-        axes_library.failures(
+        axes_library.library_failures(
             dataclasses.replace(found, t_error=bars / 2, held_out=held[1:])
         )
         == []

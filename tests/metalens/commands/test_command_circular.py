@@ -13,9 +13,9 @@ from metalens import library
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
-from metalens.ground.errors import PropagationError, SceneError
+from metalens.core.errors import PropagationError, SceneError
 from metalens.pillars import Proxy
-from metalens.pillars.circular import Turned
+from metalens.pillars.circular import GeometricPhase
 from tests.referees.turned_pillar import isolated
 
 T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)
@@ -50,7 +50,7 @@ def folder(tmp_path_factory):
     )
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
-    turned = Turned(
+    turned = GeometricPhase(
         0.23, 0.94, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None]
     )
     cell, sweep = (

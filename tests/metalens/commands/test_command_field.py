@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from metalens import rcwa
-from metalens.cell import Light
+from metalens.cell import Incidence
 from metalens.cli import main
 from metalens.commands import field
-from metalens.ground import store
+from metalens.core import store
 from metalens.view import artefacts
 
 CELL = """[cell]
@@ -56,8 +56,8 @@ def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
     assert held["xz/e"].shape == held["xz/h"].shape == (3, len(held["z_um"]), 12)
     assert held["yz/index"].shape == (len(held["z_um"]), 15)
     assert held["xy/e"].shape == (3, 2, 15, 12)
-    cell = field.asked(field.Options(here / "cell.toml", 0.2)).cell
-    light = Light(0.83, np.radians(12.0), "y")
+    cell = field.near_field_request(field.Options(here / "cell.toml", 0.2)).cell
+    light = Incidence(0.83, np.radians(12.0), "y")
     grid = {"x_um": held["x_um"], "y_um": held["y_um"], "z_um": [0.1, 0.3]}
     same = rcwa.near_field(cell, 0.2, light, **grid, tolerance=0.5)
     assert (

@@ -11,7 +11,7 @@ from metalens import library
 from metalens.cli import main
 from metalens.commands import library as command
 from metalens.commands.library import CellFile
-from metalens.ground import config
+from metalens.core import config
 from metalens.pillars.record import DEFAULT_CELL
 
 QUICK = """

@@ -12,9 +12,9 @@ from scipy import integrate, special
 from metalens import lens, propagate, psf
 from metalens.cell.record import Cell
 from metalens.cli import main
-from metalens.commands.psf import Options, Settings
-from metalens.ground.errors import ConfigError
-from metalens.lens import Neighbours
+from metalens.commands.psf import Options, PsfSettings
+from metalens.core.errors import ConfigError
+from metalens.lens import NeighbourRows
 from metalens.pillars.proxy import Proxy
 from metalens.psf import of_lens
 
@@ -121,7 +121,7 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
     asked = []
 
     factor = np.full((2, 2), 0.9 + 0j)
-    known = Neighbours(
+    known = NeighbourRows(
         np.array([0.4, 0.2]), np.zeros(2, bool), factor, factor, np.zeros(2), 0.85
     )
 
@@ -141,7 +141,7 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
     assert asked == [(6, 9, 12)]  # NA 0.11: 19 pillars in a zone, more than a row takes
     assert rough.budget.neighbours > 0
     made = small_lens()
-    edge = of_lens.aperture(made, (0.0, 0.0))
+    edge = of_lens.sine_aperture(made, (0.0, 0.0))
     kept = integrate.quad(
         lambda s: float(abs(known.mean(np.array(s))) ** 2) * 2 * s / edge**2, 0, edge
     )[0]
@@ -301,7 +301,7 @@ def test_depths_and_window_that_are_left_out_follow_the_lens():
     wavelength / NA of 120 um.
     """
     made = small_lens()
-    settings = Settings(angles_deg=(0.0,)).about(made)
+    settings = PsfSettings(angles_deg=(0.0,)).about(made)
     rim = made.diameters.radius_um
     most = 2 * 1.75 * 0.85 / rim**2
     near, far, step = settings.depths_mm
@@ -313,29 +313,29 @@ def test_depths_and_window_that_are_left_out_follow_the_lens():
     assert settings.window_um == pytest.approx(
         max(28 * 0.85 * 120 / rim, 8 * blur), rel=5e-3
     )
-    near_only = Settings(sources_mm=(0.05, 2.0)).about(made)
+    near_only = PsfSettings(sources_mm=(0.05, 2.0)).about(made)
     assert near_only.window_um == pytest.approx(
         8 * rim * 120 * (1 / 50 - 1 / 1300), rel=5e-3
     )
-    assert Settings(window_um=9.0, depths_mm=(1.0, 2.0, 0.5)).about(
+    assert PsfSettings(window_um=9.0, depths_mm=(1.0, 2.0, 0.5)).about(
         made
     ).view.window_um == (9.0, 9.0)
 
 
 def test_settings_that_wait_for_a_lens_say_so():
     with pytest.raises(ConfigError, match="depths_mm"):
-        _ = Settings(window_um=10.0).view
+        _ = PsfSettings(window_um=10.0).view
     with pytest.raises(ConfigError, match="window_um"):
-        _ = Settings(depths_mm=(1.0, 2.0, 1.0), angles_deg=(0.0,)).view
+        _ = PsfSettings(depths_mm=(1.0, 2.0, 1.0), angles_deg=(0.0,)).view
     with pytest.raises(ConfigError, match="need window_um"):
-        Settings(height_um=10.0)
+        PsfSettings(height_um=10.0)
 
 
 def test_every_setting_but_two_is_an_option():
     """As the page on lenses says; the light of two sizes was one of the file alone,
     where refusals name the option.
     """
-    names = {one.name for one in fields(Settings)} - {"layers", "own_cell"}
+    names = {one.name for one in fields(PsfSettings)} - {"layers", "own_cell"}
     assert names <= {one.name for one in fields(Options)}
     assert Options(Path("lens.h5"), light="y").settings.light == "y"
 

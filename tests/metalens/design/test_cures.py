@@ -38,6 +38,6 @@ def test_a_curve_that_reaches_what_is_printed_to_two_nanometres_is_ended_by_the_
         1e-6,
         1e-6,
     )
-    told = of_phase.cure(proxy, CELL, LIMITS, 0.8)
+    told = of_phase.phase_coverage_hint(proxy, CELL, LIMITS, 0.8)
     assert ("the process prints 0.0900-0.3400 um" in told) is (ended == "library")
     assert ("0.75" in told) is (ended == "process")  # um: 0.6 of 0.8 of a turn

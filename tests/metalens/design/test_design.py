@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from metalens import lens, profiles
 from metalens.cell.record import Cell, Index
+from metalens.core.errors import ConfigError, LensError
 from metalens.design import of_phase as design
 from metalens.design import phase_map
 from metalens.design.of_phase import Limits
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
-from metalens.ground.errors import ConfigError, LensError
 from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45))
@@ -47,7 +47,7 @@ def _make(proxy, phase=None, *, aperture_um=60.0, cell=CELL, **options):
 def test_hyperbolic_phase_makes_all_paths_equal():
     x = np.linspace(-500, 500, 41)
     path = np.hypot(x, 2000.0) + np.hypot(x, 20_000.0)
-    phase = profiles.hyperbolic(x, np.zeros(1), FOCUS)
+    phase = profiles.hyperbolic_phase(x, np.zeros(1), FOCUS)
     total = phase + 2 * np.pi / 0.85 * (path - 22_000.0)
     assert (
         np.abs(total).max() < 1e-8
@@ -74,23 +74,23 @@ def test_double_helix_winds_one_three_five_times():
     for ring in (1, 2, 3):
         radius = 30.0 * math.sqrt((ring - 0.5) / 3)
         x, y = radius * np.cos(angle), radius * np.sin(angle)
-        phase = profiles.double_helix(x, y, FOCUS, shape, radius_um=30.0)
+        phase = profiles.double_helix_phase(x, y, FOCUS, shape, radius_um=30.0)
         turns = np.diff(np.unwrap(np.r_[phase, phase[0]])).sum() / (2 * np.pi)
         assert round(turns) == 2 * ring - 1
 
 
 def test_cubic_phase_is_odd_in_x_and_y():
     x = np.array([7.0, -7.0])
-    extra = profiles.cubic(
+    extra = profiles.cubic_phase(
         x, np.zeros(1), FOCUS, Cubic(50.0), radius_um=10.0
-    ) - profiles.hyperbolic(x, np.zeros(1), FOCUS)
+    ) - profiles.hyperbolic_phase(x, np.zeros(1), FOCUS)
     assert extra == pytest.approx([50 * 0.343, -50 * 0.343])
 
 
 def test_every_pillar_makes_the_wanted_phase(proxy):
     made, quality = _make(proxy)
     d = made.diameters
-    wanted = profiles.hyperbolic(d.x_um, d.y_um[:, None], FOCUS)
+    wanted = profiles.hyperbolic_phase(d.x_um, d.y_um[:, None], FOCUS)
     error = np.angle(np.exp(1j * (made.phase_rad() - wanted)))[d.diameter_um > 0]
     assert (
         np.abs(error).max() < 2e-5
@@ -125,7 +125,7 @@ def test_map_with_focus_from_csv(proxy, tmp_path):
     shape = PhaseMap(tmp_path / "p.csv", 1.0, add_focus=True)
     x = np.linspace(-20, 20, 5)
     got = design.phase_of(shape, FOCUS, radius_um=20.0)(x, x)
-    assert got == pytest.approx(0.7 + profiles.hyperbolic(x, x[:, None], FOCUS))
+    assert got == pytest.approx(0.7 + profiles.hyperbolic_phase(x, x[:, None], FOCUS))
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_bad_maps_are_refused(tmp_path, array, message):
 
 def test_missing_map_and_bad_settings_are_refused(tmp_path):
     with pytest.raises(LensError, match="no such file"):
-        phase_map.read(PhaseMap(tmp_path / "absent.npy", 1.0))
+        phase_map.read_phase_map(PhaseMap(tmp_path / "absent.npy", 1.0))
     with pytest.raises(ConfigError, match="zones"):
         DoubleHelix(zones=0)
     with pytest.raises(LensError, match="source_distance_um"):
@@ -212,7 +212,7 @@ def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):
     )
     with pytest.raises(LensError, match=r"phase of shape \(20,\) .*need \(20, 20\)"):
         make(
-            lambda x, y: profiles.hyperbolic(x, y, focus)
+            lambda x, y: profiles.hyperbolic_phase(x, y, focus)
         )  # positions along the diagonal alone
     with pytest.raises(LensError, match=r"phase of shape \(\) "):
         make(lambda x, y: 0.0)
@@ -299,16 +299,18 @@ def test_profiles_at_a_site_off_both_axes():
         math.hypot(x, y, z) - z for z in (210.0, 930.0)
     )  # 0.15 um of 210: 13 digits are left
     focal = -2 * math.pi / 0.94 * paths
-    assert float(profiles.hyperbolic(np.array(x), np.array(y), focus)) == pytest.approx(
-        focal, abs=1e-10
-    )
+    assert float(
+        profiles.hyperbolic_phase(np.array(x), np.array(y), focus)
+    ) == pytest.approx(focal, abs=1e-10)
     cubed = float(
-        profiles.cubic(np.array(x), np.array(y), focus, Cubic(37.0), radius_um=radius)
+        profiles.cubic_phase(
+            np.array(x), np.array(y), focus, Cubic(37.0), radius_um=radius
+        )
     )
     assert cubed - focal == pytest.approx(37 * (343 - 64) / 1331, abs=1e-9)
     # ring: ceil(3 (sqrt 65 / 11)^(1 / 0.7)) = ceil(1.92) = 2, of charge 3
     helix = float(
-        profiles.double_helix(
+        profiles.double_helix_phase(
             np.array(x), np.array(y), focus, DoubleHelix(3, 0.7), radius_um=radius
         )
     )

@@ -10,7 +10,7 @@ import pytest
 from metalens import design
 from metalens.cell.record import Cell, Index
 from metalens.design.focus_check import check_focus
-from metalens.design.profiles import Focus, hyperbolic
+from metalens.design.profiles import Focus, hyperbolic_phase
 from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45))
@@ -55,7 +55,9 @@ def test_a_lens_that_focuses_to_the_side_is_told_which_side(proxy):
     tilt = 0.4 / FOCUS.sensor_distance_um
     lens = _lens(
         proxy,
-        lambda x, y: hyperbolic(x, y[:, None], FOCUS) + 2 * np.pi / 0.85 * tilt * x,
+        lambda x, y: (
+            hyperbolic_phase(x, y[:, None], FOCUS) + 2 * np.pi / 0.85 * tilt * x
+        ),
     )
     found = check_focus(lens, axial=False)
     assert found.x_um == pytest.approx(0.4, abs=0.05)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from metalens.core.errors import ConfigError, LensError
 from metalens.design import phase_map
 from metalens.design.profiles import PhaseMap
-from metalens.ground.errors import ConfigError, LensError
 
 STEP = 0.3
 X = (np.arange(41) - 20) * STEP
@@ -16,7 +16,7 @@ WRAPPED = PHASE % (2 * np.pi)
 
 
 def read(path, pitch=STEP, **settings):
-    return phase_map.read(PhaseMap(path, pitch, **settings))
+    return phase_map.read_phase_map(PhaseMap(path, pitch, **settings))
 
 
 def phasor_error(samples, phase):
@@ -78,7 +78,7 @@ def test_nan_outside_the_aperture_is_no_data(tmp_path, ending):
         savemat(path, {"phi": phase})
     samples = read(path)
     at = np.linspace(-4.85, 4.85, 52)
-    got = phase_map.interpolate(samples, at, at, radius_um=radius)
+    got = phase_map.interpolate_phase(samples, at, at, radius_um=radius)
     inside = at**2 + at[:, None] ** 2 <= radius**2
     want = -0.11 * (at**2 + (at[:, None] - 0.4) ** 2) + 0.07 * at
     off = np.abs(np.angle(np.exp(1j * (got - want))))
@@ -88,7 +88,9 @@ def test_nan_outside_the_aperture_is_no_data(tmp_path, ending):
     phase[18, 22] = np.nan
     np.save(tmp_path / "hole.npy", phase)
     with pytest.raises(LensError, match=r"no data near row 17\.7, column 21"):
-        phase_map.interpolate(read(tmp_path / "hole.npy"), at, at, radius_um=radius)
+        phase_map.interpolate_phase(
+            read(tmp_path / "hole.npy"), at, at, radius_um=radius
+        )
 
 
 def test_rows_and_columns_that_count_are_no_phase(tmp_path):
@@ -123,7 +125,7 @@ def test_rows_of_x_y_and_phase_bring_their_grid(tmp_path, head, scale):
     assert samples.phase_rad == pytest.approx(PHASE, abs=1e-9)
     assert samples.step_um == pytest.approx((STEP, STEP), rel=1e-9)
     assert samples.centre_um == pytest.approx((1.5, -0.6), rel=1e-9)
-    assert phase_map.interpolate(samples, X[7:8] + 1.5, Y[30:31] - 0.6)[
+    assert phase_map.interpolate_phase(samples, X[7:8] + 1.5, Y[30:31] - 0.6)[
         0, 0
     ] == pytest.approx(np.angle(np.exp(1j * PHASE[30, 7])), abs=1e-9)
     with pytest.raises(LensError, match="leave pitch_um out"):

@@ -11,8 +11,8 @@ import pytest
 from metalens import design, lens, psf
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
+from metalens.core.errors import ConfigError, DomainError, LensError, PropagationError
 from metalens.design import Focus, Limits
-from metalens.ground.errors import ConfigError, DomainError, LensError, PropagationError
 from metalens.pillars import Sweep
 from metalens.pillars.axes import AxesLibrary
 from metalens.view import standing
@@ -53,7 +53,9 @@ def made(*, both=True, **about):
         "limits": Limits(100, 90),
     } | about
     second, focus = (phases[1], FAR) if both else (None, NEAR)
-    return design.make_paired((phases[0], second), (NEAR, focus), **arguments)
+    return design.assign_polarization_multiplexed(
+        (phases[0], second), (NEAR, focus), **arguments
+    )
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +157,7 @@ def test_one_phase_for_both_keeps_any_polarisation():
         )
         for v in "xy"
     )
-    mean = psf.unpolarised(one, other)
+    mean = psf.mean_over_polarizations(one, other)
     light = [s.intensity * s.energy_um2[..., None, None] for s in (one, other, mean)]
     assert np.allclose(
         light[2], (light[0] + light[1]) / 2, rtol=1e-5, atol=1e-9 * light[2].max()
@@ -211,20 +213,20 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
         again.proxy.phase_rad(np.array([0.2]), WAVELENGTH)
     with pytest.raises(LensError, match="two sizes"):
         dataclasses.replace(again, pairs=None)
-    drawing = standing.drawn(again)
+    drawing = standing.draw_pillars(again)
     sides = {
         tuple(np.rint(np.ptp(o.corners, axis=0)).astype(int)) for o in drawing.outlines
     }
     assert sides == {
         (o.notes["size / nm"], o.notes["length / nm"]) for o in drawing.outlines
     }
-    images = standing.phase(again)
+    images = standing.draw_phase(again)
     assert list(images.axes[0].values) == ["along x", "along y"]
     assert np.abs(images.values[0] - images.values[1]).max() > 0.4
 
 
 def test_targets_are_checked():
-    from metalens.commands.paired import Target
+    from metalens.commands.paired import YPolarizationTarget
 
     with pytest.raises(ConfigError, match=r"along_y\.map"):
-        Target(profile="map")
+        YPolarizationTarget(profile="map")

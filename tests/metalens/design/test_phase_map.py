@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from metalens.core.errors import ConfigError, LensError
 from metalens.design import phase_map
 from metalens.design.profiles import PhaseMap
-from metalens.ground.errors import ConfigError, LensError
 
 STEP = 2.0
 X = (np.arange(24) - 11.5) * STEP
@@ -81,11 +81,11 @@ def write(folder, kind):
 )
 def test_every_format_gives_the_same_samples(tmp_path, kind):
     path = write(tmp_path, kind)
-    samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))
+    samples = phase_map.read_phase_map(PhaseMap(path, None if kind == "dat" else STEP))
     assert samples.phase_rad == pytest.approx(PHASE, abs=1e-15)
     assert samples.step_um == pytest.approx((STEP, STEP))
     x, y = np.array([-7.3, 0.0, 12.1]), np.array([-15.2, 3.3])
-    got = phase_map.interpolate(samples, x, y)
+    got = phase_map.interpolate_phase(samples, x, y)
     want = 0.02 * x + 0.05 * y[:, None] + 0.001 * x * y[:, None]
     assert got == pytest.approx(
         want, abs=2e-4
@@ -97,12 +97,12 @@ def test_zemax_units_and_decentre(tmp_path):
         (tmp_path / "g.dat").write_text(
             zemax_text(PHASE, step_mm=STEP / um, unit=unit, dec=(4 / um, 6 / um))
         )
-        samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
+        samples = phase_map.read_phase_map(PhaseMap(tmp_path / "g.dat"))
         assert samples.step_um == pytest.approx((STEP, STEP), rel=1e-12)
         assert samples.centre_um == pytest.approx(
             (4.0, -6.0), rel=1e-9
         )  # up in the file is -y here
-        shifted = phase_map.interpolate(
+        shifted = phase_map.interpolate_phase(
             samples, np.array([4 + X[5]]), np.array([Y[3] - 6])
         )
         assert shifted[0, 0] == pytest.approx(PHASE[3, 5], abs=1e-9)
@@ -112,19 +112,19 @@ def test_points_without_data_matter_inside_the_aperture_alone(tmp_path):
     (tmp_path / "g.dat").write_text(
         zemax_text(PHASE, nodata={0, 1, 24})
     )  # the upper left corner
-    samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
+    samples = phase_map.read_phase_map(PhaseMap(tmp_path / "g.dat"))
     assert np.isnan(samples.phase_rad).sum() == 3
     x = np.linspace(-17, 17, 30)
     assert np.isfinite(
-        phase_map.interpolate(samples, x, x, radius_um=10.0)[10:20, 10:20]
+        phase_map.interpolate_phase(samples, x, x, radius_um=10.0)[10:20, 10:20]
     ).all()
     with pytest.raises(LensError, match="no data near row 0"):
-        phase_map.interpolate(samples, x - 5, x - 2, radius_um=60.0)
+        phase_map.interpolate_phase(samples, x - 5, x - 2, radius_um=60.0)
 
 
 def test_conjugate_turns_the_sign(tmp_path):
     path = write(tmp_path, "npy")
-    assert phase_map.read(
+    assert phase_map.read_phase_map(
         PhaseMap(path, STEP, conjugate=True)
     ).phase_rad == pytest.approx(-PHASE)
 
@@ -150,18 +150,18 @@ def test_broken_files_are_refused_by_name(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     pitch = None if name.endswith("dat") else 1.0
     with pytest.raises(LensError, match=message) as refusal:
-        phase_map.read(PhaseMap(tmp_path / name, pitch))
+        phase_map.read_phase_map(PhaseMap(tmp_path / name, pitch))
     assert name in str(refusal.value)
 
 
 def test_settings_that_do_not_fit_the_file_are_refused(tmp_path):
     path = write(tmp_path, "npy")
     with pytest.raises(LensError, match="give pitch_um"):
-        phase_map.read(PhaseMap(path))
+        phase_map.read_phase_map(PhaseMap(path))
     with pytest.raises(LensError, match=r"is for \.mat and \.npz files"):
-        phase_map.read(PhaseMap(path, 1.0, variable="phi"))
+        phase_map.read_phase_map(PhaseMap(path, 1.0, variable="phi"))
     with pytest.raises(LensError, match="leave pitch_um out"):
-        phase_map.read(PhaseMap(write(tmp_path, "dat"), 3.0))
+        phase_map.read_phase_map(PhaseMap(write(tmp_path, "dat"), 3.0))
     with pytest.raises(ConfigError, match="pitch_um"):
         PhaseMap(path, -1.0)
 
@@ -169,28 +169,28 @@ def test_settings_that_do_not_fit_the_file_are_refused(tmp_path):
 def test_a_matrix_is_chosen_by_name_where_there_are_several(tmp_path):
     savemat(tmp_path / "m.mat", {"phi": PHASE, "other": PHASE + 1})
     with pytest.raises(LensError, match=r"2 matrices \(other, phi\)"):
-        phase_map.read(PhaseMap(tmp_path / "m.mat", STEP))
+        phase_map.read_phase_map(PhaseMap(tmp_path / "m.mat", STEP))
     with pytest.raises(LensError, match="did you mean 'phi'"):
-        phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="ph"))
-    assert phase_map.read(
+        phase_map.read_phase_map(PhaseMap(tmp_path / "m.mat", STEP, variable="ph"))
+    assert phase_map.read_phase_map(
         PhaseMap(tmp_path / "m.mat", STEP, variable="phi")
     ).phase_rad == pytest.approx(PHASE)
 
 
 def test_an_archive_of_numpy_gives_its_only_matrix_or_the_named_one(tmp_path):
     np.savez(tmp_path / "one.npz", phase=PHASE, pitch_um=STEP, x_um=np.arange(9))
-    assert phase_map.read(
+    assert phase_map.read_phase_map(
         PhaseMap(tmp_path / "one.npz", STEP)
     ).phase_rad == pytest.approx(PHASE)
     np.savez_compressed(tmp_path / "two.npz", phase=PHASE, amplitude=PHASE + 1)
     with pytest.raises(LensError, match=r"2 matrices \(amplitude, phase\); name one"):
-        phase_map.read(PhaseMap(tmp_path / "two.npz", STEP))
-    assert phase_map.read(
+        phase_map.read_phase_map(PhaseMap(tmp_path / "two.npz", STEP))
+    assert phase_map.read_phase_map(
         PhaseMap(tmp_path / "two.npz", STEP, variable="phase")
     ).phase_rad == pytest.approx(PHASE)
     np.savez(tmp_path / "objects.npz", phase=np.array([{}], dtype=object))
     with pytest.raises(LensError, match=r"objects\.npz: not an NPZ file: ValueError"):
-        phase_map.read(PhaseMap(tmp_path / "objects.npz", STEP))
+        phase_map.read_phase_map(PhaseMap(tmp_path / "objects.npz", STEP))
 
 
 def test_every_flipped_bit_of_a_header_is_refused_or_read(tmp_path):
@@ -202,7 +202,7 @@ def test_every_flipped_bit_of_a_header_is_refused_or_read(tmp_path):
         broken[bit // 8] ^= 1 << bit % 8
         path.write_bytes(broken)
         with contextlib.suppress(LensError):
-            assert phase_map.read(PhaseMap(path, STEP)).phase_rad.ndim == 2
+            assert phase_map.read_phase_map(PhaseMap(path, STEP)).phase_rad.ndim == 2
 
 
 @settings(max_examples=160)
@@ -231,7 +231,9 @@ def damaged(tmp_path_factory, kind, data):
         )
     path.write_bytes(bytes(whole))
     try:
-        samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))
+        samples = phase_map.read_phase_map(
+            PhaseMap(path, None if kind == "dat" else STEP)
+        )
     except LensError:
         return
     assert samples.phase_rad.ndim == 2
@@ -246,9 +248,9 @@ def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
     x = (np.arange(count) - (count - 1) / 2) * 0.25
     x0, y0 = 0.31, -0.82
     phase = charge * np.arctan2(x[:, None] - y0, x - x0) + 0.03 * x * x[:, None]
-    samples = phase_map.Samples(phase, (0.25, 0.25))
+    samples = phase_map.PhaseSamples(phase, (0.25, 0.25))
     for at in (np.arange(-25, 26) * 0.3, np.arange(-25, 25) * 0.3 + 0.15):
-        found = phase_map.interpolate(samples, at + x0, at + y0, radius_um=8.0)
+        found = phase_map.interpolate_phase(samples, at + x0, at + y0, radius_um=8.0)
         want = charge * np.arctan2(at[:, None], at) + 0.03 * (at + x0) * (
             at[:, None] + y0
         )
@@ -268,9 +270,9 @@ def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():
     x = np.arange(-20, 21) * 0.5
     vortex = 2 * np.arctan2(x[:, None] + 0.1, x - 0.1)
     for more in (0.8 * np.pi / 0.5 * x, np.where(x > 0.2, np.pi, 0.0)):
-        samples = phase_map.Samples(vortex + more, (0.5, 0.5))
+        samples = phase_map.PhaseSamples(vortex + more, (0.5, 0.5))
         with pytest.raises(LensError, match="finer pitch"):
-            phase_map.interpolate(
+            phase_map.interpolate_phase(
                 samples, np.arange(-20, 20) * 0.3 + 0.25, np.arange(-20, 20) * 0.3
             )
 
@@ -289,8 +291,10 @@ def test_a_ring_about_a_vortex_lies_eight_samples_from_it_at_most():
 def test_no_more_than_256_places_stand_beside_vortices():
     """A quarter of a sample about one, where the phasor between samples is short."""
     phase = np.arctan2(x := (np.arange(16) - 7.5)[:, None], x.T)
-    samples = phase_map.Samples(phase, (1.0, 1.0))
+    samples = phase_map.PhaseSamples(phase, (1.0, 1.0))
     few = np.linspace(-0.11, 0.12, 256)
-    assert phase_map.interpolate(samples, few, np.array([0.07])).shape == (1, 256)
+    assert phase_map.interpolate_phase(samples, few, np.array([0.07])).shape == (1, 256)
     with pytest.raises(LensError, match="finer pitch"):
-        phase_map.interpolate(samples, np.linspace(-0.11, 0.12, 257), np.array([0.07]))
+        phase_map.interpolate_phase(
+            samples, np.linspace(-0.11, 0.12, 257), np.array([0.07])
+        )

@@ -24,7 +24,7 @@ def test_quality_is_that_of_the_sum_of_all_pillars():
     error[33] = -2.6
     wanted = RNG.uniform(-20, 20, 40)
     made_rad = wanted + error + 2 * math.pi * RNG.integers(-4, 5, 40)
-    sums = of_phase.Sums()
+    sums = of_phase.MetricSums()
     for part in (slice(0, 13), slice(13, 40)):
         sums.add(wanted[part], made_rad[part], level[part])
     focus = Focus(0.79, 1700.0, 23e3)

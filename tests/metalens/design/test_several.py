@@ -10,8 +10,8 @@ import pytest
 
 from metalens import cli, design
 from metalens.cell import Cell, Index
-from metalens.design import Focus, Limits, Wanted
-from metalens.ground.errors import DomainError, LensError
+from metalens.core.errors import DomainError, LensError
+from metalens.design import Focus, Limits, WavelengthTarget
 from metalens.pillars import Proxy
 
 CELL = Cell(0.35, 0.9, Index(2.4), Index(1.45))
@@ -30,13 +30,13 @@ def proxy(level=((0.9, 0.06), (0.03, 0.0))):
 
 def wanted(*focuses, weights=(1.0, 1.0, 1.0)):
     return [
-        Wanted(design.phase_of(None, focus, radius_um=5.0), focus, weight)
+        WavelengthTarget(design.phase_of(None, focus, radius_um=5.0), focus, weight)
         for focus, weight in zip(focuses, weights, strict=False)
     ]
 
 
 def made(lights, given=None, **about):
-    return design.make_several(
+    return design.assign_multi_wavelength(
         lights,
         **{
             "aperture_um": 10.0,

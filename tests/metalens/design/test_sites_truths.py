@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index, Lattice
+from metalens.core.errors import LensError
 from metalens.design import sites
-from metalens.ground.errors import LensError
 
 PITCH, GRID_NM = 0.43, 3.0
 ROW_UM = 0.372  # sqrt(3)/2 of the pitch, 0.37239, on the grid of 3 nm
@@ -66,7 +66,7 @@ def test_every_site_that_lies_half_a_pitch_inside_is_taken_once(
     monkeypatch, kind, aperture_um, block
 ):
     monkeypatch.setattr(sites, "_BLOCK_SITES", block)
-    made = sites.sites(cell(kind), aperture_um, grid_nm=GRID_NM)
+    made = sites.lattice_sites(cell(kind), aperture_um, grid_nm=GRID_NM)
     steps = {
         "square": (PITCH, PITCH),
         "rectangular": (PITCH, 1.31 * PITCH),
@@ -100,16 +100,16 @@ def test_every_site_that_lies_half_a_pitch_inside_is_taken_once(
 
 @pytest.mark.parametrize("kind", LATTICES)
 def test_an_aperture_of_one_pitch_holds_one_pillar(kind):
-    made = sites.sites(cell(kind), PITCH, grid_nm=GRID_NM)
+    made = sites.lattice_sites(cell(kind), PITCH, grid_nm=GRID_NM)
     assert made.shape == (1, 1)
     ((_, inside, _),) = made.blocks(phase)
     assert inside.tolist() == [[True]]
     with pytest.raises(LensError, match="holds no cell"):
-        sites.sites(cell(kind), 0.99 * PITCH, grid_nm=GRID_NM)
+        sites.lattice_sites(cell(kind), 0.99 * PITCH, grid_nm=GRID_NM)
 
 
 def test_a_phase_of_another_shape_is_refused():
-    made = sites.sites(cell("square"), 5.0, grid_nm=GRID_NM)
+    made = sites.lattice_sites(cell("square"), 5.0, grid_nm=GRID_NM)
     with pytest.raises(LensError, match="phase of shape"):
         next(iter(made.blocks(lambda x, y: x)))
 

@@ -11,9 +11,9 @@ import torch
 from metalens import design, modal
 from metalens.cell.record import Cell, Film, Index
 from metalens.cell.shapes import Square
+from metalens.core.errors import CellError
 from metalens.design import neighbours as supercell
 from metalens.design.profiles import Focus
-from metalens.ground.errors import CellError
 from metalens.pillars.proxy import Proxy
 from metalens.psf import among
 
@@ -316,8 +316,10 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
         )  # a third of the time
 
     monkeypatch.setattr("metalens.design.own_cell.neighbours", kept)
-    rows = design.rows(steep, radius_um=10.0)
-    found = design.unlike(dataclasses.replace(steep, neighbours=rows), radius_um=10.0)
+    rows = design.solve_coupling_rows(steep, radius_um=10.0)
+    found = design.neighbour_coupling_loss(
+        dataclasses.replace(steep, neighbours=rows), radius_um=10.0
+    )
     assert found.pillars == (
         2,
         3,
@@ -334,11 +336,11 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
         apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2
     )
     assert found.error < 0.4
-    rough = design.rough_unlike(steep, radius_um=10.0)
+    rough = design.estimate_neighbour_coupling_loss(steep, radius_um=10.0)
     assert (
         abs(rough.share - found.share) < rough.error
     )  # what is said without a solve covers it
-    flat = design.rough_unlike(
+    flat = design.estimate_neighbour_coupling_loss(
         dataclasses.replace(steep, sensor_distance_um=75.0), radius_um=10.0
     )
     assert flat.share > 0.98
@@ -361,7 +363,7 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     want = solved * np.array([(1 - sine**2) ** -0.25, (1 - sine**2) ** 0.25])
     along, down = np.indices((24, 24))[::-1]
     turns = 2 * np.pi / count * (along + down if diagonal else along)
-    got = among.jones(
+    got = among.apply_jones_coupling(
         torch.tensor(np.angle(np.exp(1j * turns))),
         torch.ones(24, 24).double(),
         rows,

@@ -11,11 +11,11 @@ import pytest
 from metalens import design, propagate, psf, rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Rectangle
+from metalens.core.errors import LensError
 from metalens.design import Focus, Limits
-from metalens.ground.errors import LensError
 from metalens.library import PillarLibrary, Sweep
 from metalens.pillars import Proxy
-from metalens.pillars.circular import Turned
+from metalens.pillars.circular import GeometricPhase
 from tests.referees.turned_pillar import isolated
 
 CELL = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))
@@ -38,7 +38,7 @@ def library():
     )
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
-    turned = Turned(
+    turned = GeometricPhase(
         SIZE, WAVELENGTH, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None]
     )
     sweep = Sweep((WAVELENGTH,), diameters_um=(0.2, 0.26), samples=20, light="circular")
@@ -56,7 +56,7 @@ def made(hand="right", **about):
         "limits": Limits(min_gap_nm=90),
     } | about
     phase = design.phase_of(None, FOCUS, radius_um=8.5)
-    return phase, design.make_turned(phase, FOCUS, **arguments)
+    return phase, design.assign_geometric_phase(phase, FOCUS, **arguments)
 
 
 @pytest.mark.parametrize(("hand", "sign"), [("right", 1), ("left", -1)])
@@ -91,7 +91,7 @@ def test_light_of_the_other_hand_is_spread_as_much_as_the_lens_would_focus():
     _, (lens, *_) = made("right")
     wrong = dataclasses.replace(lens, hand="left")
     at = np.zeros((1, 2))
-    case = propagate.case(
+    case = propagate.make_case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
         wavelength_um=WAVELENGTH,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from layout.process.isolation import isolation
+from layout.process.isolation import isolation_map
+from metalens.core.errors import ProcessError
 from metalens.fabrication.bias import Bias, read_csv
-from metalens.ground.errors import ProcessError
 
 DESIGN = np.linspace(60, 360, 301)
 TABLE = ((80.0, -6.0), (120.0, -3.5), (180.0, -1.0), (340.0, 1.0))
@@ -49,8 +49,8 @@ def test_isolation_is_zero_in_a_full_lattice_and_one_alone():
     full = np.ones((41, 41), bool)
     alone = np.zeros((41, 41), bool)
     alone[20, 20] = True
-    assert abs(isolation(full, (0.4, 0.4), 1.0)[20, 20]) < 1e-5
-    assert isolation(alone, (0.4, 0.4), 1.0)[20, 20] == pytest.approx(1, abs=1e-6)
+    assert abs(isolation_map(full, (0.4, 0.4), 1.0)[20, 20]) < 1e-5
+    assert isolation_map(alone, (0.4, 0.4), 1.0)[20, 20] == pytest.approx(1, abs=1e-6)
 
 
 def test_isolation_at_a_straight_edge_counts_the_missing_half():
@@ -61,7 +61,7 @@ def test_isolation_at_a_straight_edge_counts_the_missing_half():
     # with C the sum over the column and S = C^2 over the plane
     line = np.exp(-((np.arange(-8, 9) * 0.4) ** 2)).sum()
     want = (line**2 - line) / 2 / (line**2 - 1)
-    assert isolation(half, (0.4, 0.4), 1.0)[50, 50] == pytest.approx(want, rel=1e-5)
+    assert isolation_map(half, (0.4, 0.4), 1.0)[50, 50] == pytest.approx(want, rel=1e-5)
 
 
 def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
@@ -69,7 +69,7 @@ def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
     present = rng.random((150, 170)) < 0.97
     present[:, 100:] = True
     present[40:, :60] = False
-    got = isolation(present, (0.4, 0.4), 0.9)
+    got = isolation_map(present, (0.4, 0.4), 0.9)
     reach = 7  # ceil(3 range / pitch)
     steps = np.exp(-((np.arange(-reach, reach + 1) * 0.4 / 0.9) ** 2))
     weights = np.outer(steps, steps)

@@ -44,7 +44,7 @@ def lens(added_rad=0.0, levels=None, distance=DISTANCE):
     """251 x 251 pillars; of ``levels`` diameters where given."""
     x = (np.arange(251) - 125) * PITCH
     wanted = (
-        profiles.hyperbolic(x, x[:, None], Focus(WAVELENGTH, distance, math.inf))
+        profiles.hyperbolic_phase(x, x[:, None], Focus(WAVELENGTH, distance, math.inf))
         + added_rad
     )
     wanted = wanted + 2 * math.pi * np.ceil((6.0 - TURN - wanted) / (2 * math.pi))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, imager, plan
-from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.psf import Source, spectrum
 from tests.referees.true_image import Referee
@@ -85,7 +85,7 @@ def test_a_measured_curve_gets_the_wavelengths_of_the_diode_it_samples():
     """The same points and shares; what a curve leaves out beside the known range is
     added to the error, or refused.
     """
-    curve = spectrum.Measured(*spectrum.weight(DIODE))
+    curve = spectrum.MeasuredSpectrum(*spectrum.spectral_weight(DIODE))
     want, got = waves(DIODE, 5e-3), waves(curve, 5e-3)
     np.testing.assert_array_equal(got.wavelengths_um, want.wavelengths_um)
     np.testing.assert_array_equal(got.weights, want.weights)

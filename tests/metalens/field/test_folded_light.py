@@ -7,13 +7,13 @@ import math
 import pytest
 import torch
 
+from metalens.core.errors import PropagationError
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, plan
 from metalens.field.left_out import Judged, folded
 from metalens.field.points import SPARE, psfs
 from metalens.field.texture import texture_error
-from metalens.ground.errors import PropagationError
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 from tests.referees.true_image import Referee
 
 WAVE = SmoothWave(Focus(0.85, 240.0, 6000.0), 50.0)
@@ -69,7 +69,7 @@ def test_psfs_of_an_oblique_camera_hold_their_own_light_alone(true, aside):
 def test_what_is_folded_back_is_the_error_that_plane_waves_find(true):
     window = Window(SAMPLES, STEP_UM)
     at = tuple(torch.tensor(a, dtype=torch.float64) for a in ([PLACE], [DEPTH_UM]))
-    waves = Nodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0)
+    waves = SpectralNodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0)
     told, error = (
         folded(Judged(OPTICS, waves, window, at)),
         float(texture_error(_psf(window), true)),
@@ -115,7 +115,7 @@ def test_a_period_grows_no_further_than_beyond_four_windows():
     """However little may be folded back: nodes grow with its square."""
     window, waves = (
         Window(SAMPLES, STEP_UM),
-        Nodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0),
+        SpectralNodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0),
     )
     at = (
         torch.tensor([PLACE], dtype=torch.float64),

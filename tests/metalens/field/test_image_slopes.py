@@ -22,10 +22,10 @@ from metalens.field import (
 )
 from metalens.field.slopes import term
 from metalens.image import Frames
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 
 RADIUS = 40.0
-WAVES = Nodes(np.array([0.842, 0.867]), np.array([0.41, 0.59]), 0.0)
+WAVES = SpectralNodes(np.array([0.842, 0.867]), np.array([0.41, 0.59]), 0.0)
 
 
 def _optics(strength):

@@ -12,13 +12,13 @@ from metalens.design import Focus
 from metalens.field import Layers, Optics, SmoothWave, Window, psfs
 from metalens.field.left_out import Judged, folded, polarised, unpolarised
 from metalens.field.texture import texture_error
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 
 WAVE, DISTANCE = 0.85, 33.0
 FAST = Optics(
     SmoothWave(Focus(WAVE, DISTANCE, 5000.0), 25.0), Layers(), DISTANCE
 )  # NA 0.6
-WAVES = Nodes(np.array([WAVE, 0.9]), np.array([0.7, 0.3]), 0.0)
+WAVES = SpectralNodes(np.array([WAVE, 0.9]), np.array([0.7, 0.3]), 0.0)
 AT = (
     torch.tensor([[3.0, -4.0], [21.0, 9.0], [-14.0, 2.0]], dtype=torch.float64),
     torch.tensor([900.0, 4000.0]),

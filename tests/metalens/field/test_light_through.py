@@ -19,7 +19,7 @@ from metalens.field.points import psfs
 from metalens.field.through import through
 from metalens.lens import Layers, Stop
 from metalens.pillars import Proxy
-from metalens.psf import Nodes, View, from_lens
+from metalens.psf import SpectralNodes, View, from_lens
 
 GLASS = Layers(behind=(Film(Index(1.7), 110.0),))
 CELL = Cell(pitch_um=0.41, pillar=Index(3.6), substrate=Index(1.45))
@@ -167,7 +167,7 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         torch.zeros(1),
         x_um,
         depths,
-        Nodes(np.array([0.85]), np.ones(1), 0.0),
+        SpectralNodes(np.array([0.85]), np.ones(1), 0.0),
         Window(31, 2.0),
         folds=False,
     )

@@ -12,6 +12,7 @@ import torch
 
 from metalens.cell import Cell, Film, Index
 from metalens.cell.shapes.straight import Rectangle
+from metalens.core.errors import SceneError
 from metalens.design import Focus, profiles
 from metalens.field import (
     Grid,
@@ -24,9 +25,8 @@ from metalens.field import (
     psfs,
 )
 from metalens.field.texture import texture_error
-from metalens.ground.errors import SceneError
 from metalens.image import integrate
-from metalens.lens import DiameterMap, Lens, Neighbours
+from metalens.lens import DiameterMap, Lens, NeighbourRows
 from metalens.pillars import Proxy
 from metalens.psf import View, from_lens
 
@@ -45,7 +45,9 @@ PROXY = Proxy(
 def lens():
     x = (np.arange(251) - 125) * PITCH
     focus = Focus(0.85, DISTANCE, FOCUS)
-    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus) - 0.2, 2 * math.pi)
+    wanted = np.remainder(
+        profiles.hyperbolic_phase(x, x[:, None], focus) - 0.2, 2 * math.pi
+    )
     wanted += (
         2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
     )  # into the range of the proxy
@@ -93,7 +95,7 @@ def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
     )  # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
 
 
-ROWS = Neighbours(
+ROWS = NeighbourRows(
     np.array([0.1, 0.22, 0.16]),
     np.array([False, False, True]),
     np.array(
@@ -198,7 +200,9 @@ def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
     )
     focus = Focus(0.85, DISTANCE, FOCUS, films)
     x = (np.arange(251) - 125) * PITCH
-    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus) - 0.2, 2 * math.pi)
+    wanted = np.remainder(
+        profiles.hyperbolic_phase(x, x[:, None], focus) - 0.2, 2 * math.pi
+    )
     wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
     diameter = np.where(
         np.hypot(x, x[:, None]) <= 50.0,

@@ -12,14 +12,19 @@ import pytest
 import torch
 from scipy import special
 
+from metalens.core.errors import PropagationError
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
 from metalens.field.polarised import factors
 from metalens.field.rays import Rays
 from metalens.field.texture import texture_error
-from metalens.ground.errors import PropagationError
 from metalens.image import Frames
-from metalens.psf import Mixed, of_flux, strongest, turned
+from metalens.psf import (
+    VectorPupil,
+    dominant_components,
+    of_flux,
+    transmitted_polarization,
+)
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
@@ -144,7 +149,7 @@ def test_the_power_through_the_plane_is_what_left_the_lens(slope, towards):
         torch.tensor([x, y, math.sqrt(1 - x * x - y * y)], dtype=torch.float64)
         for x, y in (slope, towards)
     )
-    electric = turned(a, b)
+    electric = transmitted_polarization(a, b)
     fields = of_flux(electric, b)
     signs = torch.tensor(fields.signs, dtype=torch.float64)
     assert float(signs @ fields.pupils**2) == pytest.approx(2, rel=1e-12)
@@ -159,13 +164,13 @@ def test_the_flux_of_two_rays_is_poyntings():
     p, q = draw.uniform(-0.6, 0.6, (2, 4))
     b = np.stack([p, q, np.sqrt(1 - p**2 - q**2)])
     a = torch.tensor([0.2, -0.1, math.sqrt(0.95)], dtype=torch.float64)
-    electric = turned(a, torch.from_numpy(b)).numpy().reshape(2, 3, 4)
+    electric = transmitted_polarization(a, torch.from_numpy(b)).numpy().reshape(2, 3, 4)
     level, places = (
         draw.normal(size=4) + 1j * draw.normal(size=4),
         draw.uniform(-3, 3, (7, 2)),
     )
     fields = of_flux(torch.from_numpy(electric.reshape(6, 4)), torch.from_numpy(b))
-    made = strongest(fields, torch.from_numpy(np.abs(level)), 4)
+    made = dominant_components(fields, torch.from_numpy(np.abs(level)), 4)
     for place in places:
         wave = level * np.exp(2j * np.pi * (p * place[0] + q * place[1]))
         want = 0.0
@@ -237,11 +242,11 @@ def test_mixtures_of_the_components_image_as_the_components_do():
     p = torch.linspace(-0.5, 0.6, 11, dtype=torch.float64).expand(9, 11)
     q = torch.linspace(-0.6, 0.4, 9, dtype=torch.float64)[:, None].expand(9, 11)
     slope = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
-    parts = turned(
+    parts = transmitted_polarization(
         slope / slope.norm(), torch.stack([p, q, torch.sqrt(1 - p**2 - q**2)])
     )
     plain = (torch.fft.fft2(light * parts).abs() ** 2).sum(0)
-    made = strongest(Mixed(parts, (1.0,) * 6), weight, 6)
+    made = dominant_components(VectorPupil(parts, (1.0,) * 6), weight, 6)
     assert set(made.signs) == {1.0}
     mixed = (torch.fft.fft2(light * made.pupils).abs() ** 2).sum(0)
     assert torch.allclose(
@@ -250,7 +255,7 @@ def test_mixtures_of_the_components_image_as_the_components_do():
     assert float(mixed.sum()) == pytest.approx(
         99 * float((weight**2).sum()), rel=1e-12
     )  # Parseval
-    few = strongest(Mixed(parts, (1.0,) * 6), weight, 2)
+    few = dominant_components(VectorPupil(parts, (1.0,) * 6), weight, 2)
     assert float(((few.pupils * weight) ** 2).sum()) == pytest.approx(
         float((weight**2).sum()), rel=1e-12
     )
@@ -264,10 +269,13 @@ def test_turned_light_keeps_its_power_and_is_across_its_ray():
         torch.tensor([0.3, -0.2, math.sqrt(0.87)]),
         torch.tensor([-0.1, 0.4, math.sqrt(0.83)]),
     )
-    found = turned(a.double(), b.double()).reshape(2, 3)
+    found = transmitted_polarization(a.double(), b.double()).reshape(2, 3)
     assert float((found**2).sum() * b[2]) == pytest.approx(2, rel=1e-6)
     assert float((found @ b.double()).abs().max()) < 1e-6
-    straight = turned(a.double(), a.double()).reshape(2, 3) * float(a[2]) ** 0.5
+    straight = (
+        transmitted_polarization(a.double(), a.double()).reshape(2, 3)
+        * float(a[2]) ** 0.5
+    )
     assert float((straight @ a.double()).abs().max()) < 1e-6
     assert torch.allclose(
         straight @ straight.T, torch.eye(2, dtype=torch.float64), atol=1e-6

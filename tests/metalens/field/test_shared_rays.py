@@ -15,7 +15,7 @@ from metalens.field.plan import spectral
 from metalens.field.rays import rays, source_paths
 from metalens.field.texture import texture_error
 from metalens.lens import Stop
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 
 
 def test_the_light_on_the_nodes_is_its_formula():
@@ -79,7 +79,7 @@ def test_wavelengths_that_share_their_rays_are_those_alone():
         torch.tensor([3e3, 5e3, 9e3]).double(),
     )
     waves, window = (
-        Nodes(np.array([0.87, 0.83, 0.85]), np.array([0.3, 0.2, 0.5]), 0.0),
+        SpectralNodes(np.array([0.87, 0.83, 0.85]), np.array([0.3, 0.2, 0.5]), 0.0),
         Window(15, 4.8, curved=True),
     )
     got = spectral(optics, at, depths, waves, window)
@@ -105,7 +105,7 @@ def test_field_points_are_the_same_on_any_number_of_threads():
         torch.tensor([[20.0, -31.0], [3.0, 8.0], [-40.0, 5.0], [9.0, 44.0]]).double(),
         torch.tensor([5e3]).double(),
     )
-    waves = Nodes(np.array([0.84, 0.85]), np.array([0.4, 0.6]), 0.0)
+    waves = SpectralNodes(np.array([0.84, 0.85]), np.array([0.4, 0.6]), 0.0)
     before, found = torch.get_num_threads(), []
     try:
         for count in (1, 3):

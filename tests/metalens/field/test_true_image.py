@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from metalens.cell import Film, Index
+from metalens.core.errors import PropagationError, SceneError
 from metalens.design import Focus
 from metalens.field import (
     Grid,
@@ -24,15 +25,14 @@ from metalens.field import (
     with_psfs,
 )
 from metalens.field.texture import texture_error
-from metalens.ground.errors import PropagationError, SceneError
 from metalens.image import Frames
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
 
 DISTANCE, RADIUS, FOCUS, STEP, WINDOW = 240.0, 50.0, 6000.0, 4.8, 15
-WAVES = Nodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
+WAVES = SpectralNodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
 GRID = Grid((9, 7), STEP, (3000.0, 9000.0), margin=WINDOW // 2, window=WINDOW)
 MIDDLE = (math.radians(9.0), math.radians(-4.0))
 

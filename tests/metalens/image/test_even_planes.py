@@ -24,12 +24,12 @@ from metalens.field import (
 )
 from metalens.image import Frames
 from metalens.lens import Stop
-from metalens.psf import Nodes
+from metalens.psf import SpectralNodes
 
 DISTANCE, RADIUS, STEP, SAMPLES, MARGIN = 600.0, 90.0, 10.0, 14, 4
 FRAME, WINDOW = SAMPLES + 2 * MARGIN, 2 * MARGIN + 1
 NEAR, FAR = 3e3, 12e3
-WAVES = Nodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
+WAVES = SpectralNodes(np.array([0.838, 0.861]), np.array([0.37, 0.63]), 0.0)
 GLASS = Film(Index(1.5), 0.2 * DISTANCE)
 STOP = Stop(75.0, 60.0)
 WAVE = SmoothWave(Focus(0.85, DISTANCE, 7e3), RADIUS)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from metalens import fisher
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from metalens.image import pupil as pupils
 from metalens.image.information import pixel_information
 from metalens.image.pupil import Pupil

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from metalens.image import information as fisher
 
 RNG = np.random.default_rng(12)

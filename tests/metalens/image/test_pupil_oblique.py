@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.design.profiles import Focus, hyperbolic
+from metalens.design.profiles import Focus, hyperbolic_phase
 from metalens.image import pupil as pupils
 from metalens.image.pupil import Field, Pupil
 from metalens.psf import psf_stack
@@ -43,7 +43,7 @@ def test_a_lens_with_a_saddle_images_as_in_the_full_engine(turn):
     axis = (np.arange(sites) - (sites - 1) / 2) * 0.75
     u, v = axis / 300, axis[:, None] / 300
     phase = (
-        hyperbolic(axis, axis[:, None], Focus(0.85, 2000.0, 20e3))
+        hyperbolic_phase(axis, axis[:, None], Focus(0.85, 2000.0, 20e3))
         + 4 * u**2
         - 3 * v**2
         + 2 * u**3

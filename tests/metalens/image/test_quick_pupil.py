@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.special import j1
 
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.image import pupil as pupils
 from metalens.image.pupil import Pupil
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.peers import layered
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from metalens.image import scene
 from metalens.image.scene import Frames, Layers
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.ground.errors import SceneError
+from metalens.core.errors import SceneError
 from metalens.image import sensor as sensors
 from metalens.image.sensor import Sensor
 

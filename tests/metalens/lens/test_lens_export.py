@@ -8,8 +8,8 @@ from scipy.io import loadmat
 
 from metalens import cli, lens
 from metalens.cell import Cell
+from metalens.core.errors import LensError
 from metalens.design import phase_map
-from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap, Lens, export
 from metalens.profiles import PhaseMap
 from metalens.proxy import Proxy
@@ -44,7 +44,7 @@ def smooth(x, y):
 
 def test_unwrapping_finds_the_phase_up_to_a_constant():
     want = smooth(X, X[:, None])
-    found = export.unwrapped(made(want))
+    found = export.unwrap_phase(made(want))
     held = np.isfinite(found)
     assert held.sum() == (X**2 + X[:, None] ** 2 <= 19.3**2).sum()
     assert (
@@ -56,7 +56,9 @@ def test_a_grid_phase_is_read_back_as_the_same_function(tmp_path):
     """The reader of phase maps is held to files of OpticStudio's description elsewhere;
     +y up there, down here.
     """
-    error = export.write(tmp_path / "a.dat", made(smooth(X, X[:, None])), samples=161)
+    error = export.export_lens(
+        tmp_path / "a.dat", made(smooth(X, X[:, None])), samples=161
+    )
     head = (tmp_path / "a.dat").read_text().splitlines()[0].split()
     assert [int(head[0]), int(head[1]), int(head[4])] == [161, 161, 0]
     assert float(head[2]) == pytest.approx(
@@ -81,7 +83,7 @@ def test_a_grid_phase_is_read_back_as_the_same_function(tmp_path):
 def test_a_vortex_has_no_smooth_phase():
     x, y = np.meshgrid(X, X)
     with pytest.raises(LensError, match="have no smooth phase; write"):
-        export.unwrapped(made(np.arctan2(y - 0.13, x + 0.07)))
+        export.unwrap_phase(made(np.arctan2(y - 0.13, x + 0.07)))
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat"])
@@ -135,10 +137,10 @@ def test_bad_words_are_refused_by_name(tmp_path, capsys):
 
 def test_the_written_map_reads_in_as_the_same_phase(tmp_path):
     """Out as a grid phase and in again as an own map, at places between its points."""
-    export.write(tmp_path / "a.dat", made(smooth(X, X[:, None])), samples=161)
-    read = phase_map.read(PhaseMap(tmp_path / "a.dat"))
+    export.export_lens(tmp_path / "a.dat", made(smooth(X, X[:, None])), samples=161)
+    read = phase_map.read_phase_map(PhaseMap(tmp_path / "a.dat"))
     x, y = np.array([-7.31, 2.9, 9.02]), np.array([-11.7, 0.33, 8.6])
-    found = phase_map.interpolate(read, x, y)
+    found = phase_map.interpolate_phase(read, x, y)
     want = smooth(x, y[:, None]) - smooth(0, 0)
     # linear between pillars, then between points of 0.24 um: h²/8 of the curvatures
     # (0.1 + 0.086) rad/um² each time
@@ -150,11 +152,11 @@ def test_the_written_map_reads_in_as_the_same_phase(tmp_path):
 
 def test_every_pillar_up_to_the_rim_can_be_read_from_the_written_map(tmp_path):
     source = made(smooth(X, X[:, None]))
-    export.write(tmp_path / "a.dat", source, samples=161)
-    read = phase_map.read(PhaseMap(tmp_path / "a.dat"))
+    export.export_lens(tmp_path / "a.dat", source, samples=161)
+    read = phase_map.read_phase_map(PhaseMap(tmp_path / "a.dat"))
     d, held = source.diameters, slice(2, -2)  # 19.2 um to each side
     at = X[held]
-    found = phase_map.interpolate(read, at, at, radius_um=d.radius_um)
+    found = phase_map.interpolate_phase(read, at, at, radius_um=d.radius_um)
     error = np.abs(
         np.angle(np.exp(1j * (found - (smooth(at, at[:, None]) - smooth(0, 0)))))
     )

@@ -9,9 +9,9 @@ import pytest
 
 from metalens import design, lens, psf
 from metalens.cell.record import Cell, Film, Index
+from metalens.core import store
+from metalens.core.errors import LensError, PropagationError
 from metalens.design import Focus, check_focus
-from metalens.ground import store
-from metalens.ground.errors import LensError, PropagationError
 from metalens.lens import Layers, Stop
 from metalens.pillars.proxy import Proxy
 

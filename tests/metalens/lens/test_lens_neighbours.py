@@ -10,8 +10,8 @@ import pytest
 
 from metalens import lens as lenses
 from metalens.cell import Cell, Index
-from metalens.ground.errors import LensError
-from metalens.lens import DiameterMap, Lens, Neighbours
+from metalens.core.errors import LensError
+from metalens.lens import DiameterMap, Lens, NeighbourRows
 from metalens.pillars import Proxy
 
 SINE, ASIDE = np.array([0.5, 0.25, 0.6, 0.35]), np.array([False, False, True, True])
@@ -44,7 +44,7 @@ def rows(**more):
         coarse=0.9 * factor,
         scatter=np.array([0.1, 0.2, 0.3, 0.4]),
     )
-    return Neighbours(**(about | dict(wavelength_um=0.532, cover=COVER) | more))
+    return NeighbourRows(**(about | dict(wavelength_um=0.532, cover=COVER) | more))
 
 
 def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():

@@ -9,7 +9,7 @@ import pytest
 
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
-from metalens.lens import DiameterMap, Lens, Pairs
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.pillars import Proxy
 
 DRAW = np.random.default_rng(23)
@@ -29,7 +29,7 @@ def two_sizes(light):
     x, y = X[ROW], Y[COLUMN]
     x[GAP] = y[GAP] = 0
     diameters = DiameterMap(x, 0.4, length_um=y)
-    pairs = Pairs(WAVES, X, Y, T, (210.0, 900.0))
+    pairs = TwoSizeTable(WAVES, X, Y, T, (210.0, 900.0))
     cell = Cell(0.4, shape=Rectangle())
     return Lens(
         diameters,

@@ -10,7 +10,7 @@ import pytest
 from metalens import lens as lenses
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Rectangle
-from metalens.ground.errors import LensError
+from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, export
 from metalens.pillars import Proxy
 
@@ -121,10 +121,10 @@ def test_a_file_keeps_lattice_turns_and_hand(tmp_path, made):
     assert np.array_equal(read.phase_rad(), made.phase_rad())
     with pytest.raises(LensError, match="square lattice"):
         lenses.load_plain(tmp_path / "lens.h5")
-    export.write(tmp_path / "lens.npz", read)
+    export.export_lens(tmp_path / "lens.npz", read)
     told = np.load(tmp_path / "lens.npz")
     assert ("angle_rad" in told) == bool(made.hand)
     assert np.allclose(np.exp(1j * told["phase_rad"]), np.exp(1j * made.phase_rad()))
     if not made.hand:
         with pytest.raises(LensError, match="hexagonal"):
-            export.write(tmp_path / "lens.dat", read)
+            export.export_lens(tmp_path / "lens.dat", read)

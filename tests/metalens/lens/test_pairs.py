@@ -5,8 +5,8 @@ polarisation, and nothing between.
 import numpy as np
 import pytest
 
-from metalens.ground.errors import DomainError, LensError
-from metalens.lens.pairs import Pairs
+from metalens.core.errors import DomainError, LensError
+from metalens.lens.pairs import TwoSizeTable
 
 DRAW = np.random.default_rng(19)
 WAVES, X, Y = (
@@ -18,7 +18,7 @@ T = DRAW.normal(size=(2, 5, 3, 2)) + 1j * DRAW.normal(size=(2, 5, 3, 2))
 
 
 def pairs():
-    return Pairs(WAVES, X, Y, T, (210.0, 900.0))
+    return TwoSizeTable(WAVES, X, Y, T, (210.0, 900.0))
 
 
 @pytest.mark.parametrize("light", ["x", "y"])
@@ -53,7 +53,7 @@ def test_what_the_table_does_not_hold_is_refused_by_name(x, y, wave, word):
 
 
 def test_one_size_is_an_axis_too():
-    one = Pairs(WAVES, X[:1], Y, T[:, :1], (210.0, 900.0))
+    one = TwoSizeTable(WAVES, X[:1], Y, T[:, :1], (210.0, 900.0))
     assert one.amplitude(np.array([0.1]), Y[2:], 0.78, "y").tolist() == [T[0, 0, 2, 1]]
     with pytest.raises(DomainError, match=r"0\.18 um"):
         one.amplitude(np.array([0.18]), Y[2:], 0.78, "y")
@@ -62,11 +62,11 @@ def test_one_size_is_an_axis_too():
 def test_a_table_of_another_shape_or_not_finite_is_refused():
     for wrong in (T[:1], T[..., :1], np.where(T[0, 0, 0, 0] == T, np.nan, T)):
         with pytest.raises(LensError, match="need finite values"):
-            Pairs(WAVES, X, Y, wrong, (210.0, 900.0))
+            TwoSizeTable(WAVES, X, Y, wrong, (210.0, 900.0))
 
 
 def test_it_comes_back_from_arrays_and_stands_where_a_proxy_does():
-    back = Pairs.from_arrays(pairs().to_arrays())
+    back = TwoSizeTable.from_arrays(pairs().to_arrays())
     assert back.focus_y_um == (210.0, 900.0)
     for name in ("wavelength_um", "x_um", "y_um", "t"):
         assert np.array_equal(getattr(back, name), getattr(pairs(), name))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell
-from metalens.ground import report
+from metalens.core import report
 from metalens.lens import DiameterMap, Layers, Lens, Stop
-from metalens.lens.picture import _phase, mean_field, picture
+from metalens.lens.picture import _phase, lens_picture, mean_field
 from metalens.proxy import Proxy
 
 LINEAR = Proxy(
@@ -52,10 +52,10 @@ def test_a_slope_fades_as_the_mean_of_its_phases():
 def test_a_stop_is_drawn_at_its_radius():
     stopped = replace(lens(np.full((40, 40), 0.2)), layers=Layers(stop=Stop(5.5, 30.0)))
     for one, radii in ((stopped, [5.5]), (lens(np.full((40, 40), 0.2)), [])):
-        figure, axes = report.canvas(1, 2)
+        figure, axes = report.make_figure(1, 2)
         _phase(figure, axes[0], one)
         assert [patch.get_radius() for patch in axes[0].patches] == radii
-        report.png(figure)
+        report.figure_png(figure)
 
 
 def test_a_phase_that_turns_within_a_pixel_is_not_drawn_as_a_slow_one():
@@ -65,4 +65,4 @@ def test_a_phase_that_turns_within_a_pixel_is_not_drawn_as_a_slow_one():
     x = np.arange(840)
     diameter = 0.12 + 2 * np.pi / 70 * ((x / 21) % 1) + np.zeros((840, 1))
     assert np.abs(mean_field(lens(diameter), 21)).max() < 1e-12
-    assert picture(lens(diameter)).startswith(b"\x89PNG")
+    assert lens_picture(lens(diameter)).startswith(b"\x89PNG")

@@ -86,7 +86,7 @@ def test_films_count_as_the_air_that_bends_light_as_much():
 
 def test_a_lens_yet_to_be_made_reaches_as_it_will():
     made = lens(source_um=37e3)
-    wanted = reach.Aperture(made.diameters.radius_um, 0.85, 3000.0, 37e3)
+    wanted = reach.ApertureSummary(made.diameters.radius_um, 0.85, 3000.0, 37e3)
     for of in (reach.depth_range_um, reach.disc_um, reach.diffraction_um):
         assert of(made) == of(wanted)
     assert reach.blur_um(made, 8e3) == reach.blur_um(wanted, 8e3)
@@ -94,7 +94,9 @@ def test_a_lens_yet_to_be_made_reaches_as_it_will():
 
 @pytest.mark.parametrize(("depth_um", "radius_um"), [(16e3, 500.0), (9e3, 410.0)])
 def test_a_step_of_depth_moves_the_rim_by_an_eighth_of_a_wave(depth_um, radius_um):
-    step = reach.depth_step_um(reach.Aperture(radius_um, 0.85, 2000.0, 20e3), depth_um)
+    step = reach.depth_step_um(
+        reach.ApertureSummary(radius_um, 0.85, 2000.0, 20e3), depth_um
+    )
     waves = [(np.hypot(radius_um, z) - z) / 0.85 for z in (depth_um, depth_um + step)]
     assert waves[0] - waves[1] == pytest.approx(
         0.115, rel=0.05
@@ -106,7 +108,7 @@ def test_samples_show_the_finest_detail_of_any_lens():
     band; a quarter of a pixel.
     """
     for radius, sensor in ((2100.0, 1700.0), (310.0, 900.0), (55.0, 2000.0)):
-        found = reach.sample_um(reach.Aperture(radius, 0.633, sensor, 5e3), 4.3)
+        found = reach.sample_um(reach.ApertureSummary(radius, 0.633, sensor, 5e3), 4.3)
         limit = 0.633 / (4 * radius / np.hypot(radius, sensor))
         assert found <= min(limit, 1.05 * 4.3 / 4)
         assert found >= 0.8 * min(limit, 4.3 / 4)

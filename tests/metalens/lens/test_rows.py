@@ -6,7 +6,7 @@ import pytest
 
 from metalens import lens as lenses
 from metalens.cell import Cell
-from metalens.ground.errors import LensError, MetalensError
+from metalens.core.errors import LensError, MetalensError
 from metalens.lens import Layers, Stop, record
 from metalens.lens.record import DiameterMap, Lens
 from metalens.lens.rows import RowsOnDisk
@@ -70,11 +70,11 @@ def test_a_large_lens_stays_in_its_file(tmp_path, monkeypatch):
     d = np.random.default_rng(2).uniform(0.1, 0.3, (61, 43))
     write(tmp_path / "lens.h5", d)
     assert isinstance(
-        lenses.streamed(tmp_path / "lens.h5").diameters.diameter_um, np.ndarray
+        lenses.load_out_of_core(tmp_path / "lens.h5").diameters.diameter_um, np.ndarray
     )
     monkeypatch.setattr(record, "MOST_HELD_BYTES", 100)
     large, small = (
-        lenses.streamed(tmp_path / "lens.h5"),
+        lenses.load_out_of_core(tmp_path / "lens.h5"),
         lenses.load(tmp_path / "lens.h5"),
     )
     assert isinstance(large.diameters.diameter_um, RowsOnDisk)
@@ -90,9 +90,9 @@ def test_a_bad_diameter_and_a_damaged_file_are_refused(tmp_path, monkeypatch):
     with h5py.File(tmp_path / "lens.h5", "r+") as file:
         file["diameter_um"][5, 7] = 0.45
     with pytest.raises(LensError, match="row 5, column 7"):
-        lenses.streamed(tmp_path / "lens.h5")
+        lenses.load_out_of_core(tmp_path / "lens.h5")
     (tmp_path / "lens.h5").write_bytes(b"no lens")
     with pytest.raises(MetalensError, match=r"lens\.h5"):
-        lenses.streamed(tmp_path / "lens.h5")
+        lenses.load_out_of_core(tmp_path / "lens.h5")
     with pytest.raises(MetalensError, match="no such file"):
-        lenses.streamed(tmp_path / "none.h5")
+        lenses.load_out_of_core(tmp_path / "none.h5")

@@ -26,7 +26,7 @@ def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> Non
         return (height**2 + u) ** 0.5
 
     u = torch.linspace(0.2, 600.0, 3000, dtype=torch.float64) ** 2
-    found = smooth.over(root, u.reshape(3, 1, -1))
+    found = smooth.chebyshev_interpolant(root, u.reshape(3, 1, -1))
     assert sum(asked) == most
     assert found.shape == (3, 1, 1000)
     want = np.sqrt(np.longdouble(height) ** 2 + u.numpy().astype(np.longdouble))
@@ -36,9 +36,13 @@ def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> Non
 def test_what_no_polynomial_reaches_is_taken_as_it_is() -> None:
     u = np.linspace(0.0, 600.0, 2000) ** 2
     np.testing.assert_array_equal(
-        smooth.over(np.sqrt, u), np.sqrt(u)
+        smooth.chebyshev_interpolant(np.sqrt, u), np.sqrt(u)
     )  # singular at its end
     few = np.array([0.3, 7.1, 2.2])
-    np.testing.assert_array_equal(smooth.over(np.cbrt, few), np.cbrt(few))
+    np.testing.assert_array_equal(
+        smooth.chebyshev_interpolant(np.cbrt, few), np.cbrt(few)
+    )
     alike = np.full(2000, 2.7)
-    np.testing.assert_array_equal(smooth.over(np.cbrt, alike), np.cbrt(alike))
+    np.testing.assert_array_equal(
+        smooth.chebyshev_interpolant(np.cbrt, alike), np.cbrt(alike)
+    )

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from metalens.lens import Media, media, saddle
-from metalens.lens.waves import WAVES, Saddle, waves
+from metalens.lens import Media, media, saddle_correction
+from metalens.lens.waves import WAVES, SaddleCorrection, plane_wave_correction
 from tests.referees import films
 
 # media from pillars to sensor, wavelength, n sin θ of the ray in units of the rarest
@@ -60,7 +60,7 @@ def test_a_ray_with_its_series_is_the_sum_of_all_plane_waves(
     behind = Media(order, thickness)
     p = part * min(order)
     alone, out, turns = ray(behind, wavelength, p)
-    found = saddle(behind, 2 * math.pi / wavelength, 1.3 * out)
+    found = saddle_correction(behind, 2 * math.pi / wavelength, 1.3 * out)
     ahead, aside = found.at(p * p)
     got = alone * (1 + 1j * (ahead + 1j * aside) / turns)
     (want,) = films.point_wave(behind.layers, order, wavelength=wavelength, reach=[out])
@@ -73,7 +73,7 @@ def test_a_ray_with_its_series_is_the_sum_of_all_plane_waves(
 def test_one_medium_needs_no_series():
     """d/(2πr²)(1/r - ik) exp(ikr) is exact: by the definition, 1 + i/(kL)."""
     k, behind = 2 * math.pi / 0.85, Media((1.37,), (42.0,))
-    found = saddle(behind, k, 60.0)
+    found = saddle_correction(behind, k, 60.0)
     assert found.at(0.5) == (1.0, 0.0)
     assert (found.rarest, found.middle + found.half) == pytest.approx(
         (1.37, 1.37), rel=1e-14
@@ -85,7 +85,7 @@ def test_one_medium_needs_no_series():
     ]
     w = np.array([0.0, 0.2, 0.9])
     want = 1 + 1j / (k * 1.37**2 * 42.0 / np.sqrt(1.37**2 - w))
-    assert waves(behind, k, w) == pytest.approx(want, rel=1e-13)
+    assert plane_wave_correction(behind, k, w) == pytest.approx(want, rel=1e-13)
 
 
 def test_faces_between_equal_indices_change_nothing():
@@ -94,7 +94,9 @@ def test_faces_between_equal_indices_change_nothing():
         Media((1.3, 1.6), (10.0, 20.0)),
         Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0)),
     )
-    assert waves(one, k, w) == pytest.approx(waves(other, k, w), rel=1e-13)
+    assert plane_wave_correction(one, k, w) == pytest.approx(
+        plane_wave_correction(other, k, w), rel=1e-13
+    )
 
 
 def test_the_error_is_told_where_films_are_too_thin_for_it():
@@ -104,7 +106,7 @@ def test_the_error_is_told_where_films_are_too_thin_for_it():
     behind, wavelength = Media((1.0, 2.1, 1.72, 1.4), (1.0, 0.2, 0.6, 0.2)), 0.85
     p = 0.6
     alone, out, turns = ray(behind, wavelength, p)
-    found = saddle(behind, 2 * math.pi / wavelength, 1.2 * out)
+    found = saddle_correction(behind, 2 * math.pi / wavelength, 1.2 * out)
     ahead, aside = found.at(p * p)
     (want,) = films.point_wave(
         behind.layers, behind.order, wavelength=wavelength, reach=[out]
@@ -115,13 +117,16 @@ def test_the_error_is_told_where_films_are_too_thin_for_it():
 
 def test_the_series_is_the_waves_at_any_ray():
     behind, k = Media((1.0, 1.9), (9.0, 13.0)), 2 * math.pi / 0.633
-    found = saddle(behind, k, 30.0)
+    found = saddle_correction(behind, k, 30.0)
     w = np.linspace(0, float(media.square(behind.layers, 30.0**2)), 37)
     ahead, aside = found.at(w)
     got = 1 + 1j * (ahead + 1j * aside) / (k * media.whole_path(behind.layers, w))
-    assert np.abs(got - waves(behind, k, w)).max() < 1e-12 + found.error(w).max()
+    assert (
+        np.abs(got - plane_wave_correction(behind, k, w)).max()
+        < 1e-12 + found.error(w).max()
+    )
     # twice the reach asks for other nodes and finds the same
-    other = saddle(behind, k, 70.0).at(w[:20])
+    other = saddle_correction(behind, k, 70.0).at(w[:20])
     assert np.abs((other[0] - ahead[:20]) + 1j * (other[1] - aside[:20])).max() < 1e-8
 
 
@@ -141,9 +146,9 @@ def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(
     counts those that differ least.
     """
     behind, k = Media(order, thickness), 2 * math.pi / wavelength
-    found = saddle(behind, k, reach)
+    found = saddle_correction(behind, k, reach)
     w = found.rarest**2 - found.normal**2
-    every = np.stack([waves(behind, k, w, count) for count in WAVES])
+    every = np.stack([plane_wave_correction(behind, k, w, count) for count in WAVES])
     apart = np.abs(np.diff(every, axis=0))
     settled = every[apart.argmin(0) + 1, np.arange(len(w))]
     ahead, aside = found.at(w)
@@ -161,7 +166,7 @@ def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(
 
 
 def test_the_error_between_two_rays_is_their_geometric_mean():
-    found = Saddle(
+    found = SaddleCorrection(
         1.2,
         0.9,
         0.3,
@@ -191,7 +196,7 @@ def test_the_series_ends_at_a_quarter_power_of_two_beyond_the_steepest_ray():
         ((1.2, 1.9), (30.0, 13.0), 0.633, 0.1),
     ):
         behind, low = Media(order, thickness), min(order)
-        found = saddle(behind, 2 * math.pi / wavelength, reach)
+        found = saddle_correction(behind, 2 * math.pi / wavelength, reach)
         assert (found.rarest, found.middle + found.half) == pytest.approx(
             (low, low), rel=1e-14
         )
@@ -205,7 +210,7 @@ def test_the_series_ends_at_a_quarter_power_of_two_beyond_the_steepest_ray():
 
 
 def test_the_series_ends_before_a_ray_that_grazes_a_medium_of_no_thickness():
-    grazing = saddle(Media((1.1, 1.8), (0.0, 5.0)), 2 * math.pi / 0.85, 20.0)
+    grazing = saddle_correction(Media((1.1, 1.8), (0.0, 5.0)), 2 * math.pi / 0.85, 20.0)
     assert 1.8**2 - (grazing.middle - grazing.half) ** 2 == pytest.approx(
         (0.9999 * 1.1) ** 2, rel=1e-9
     )

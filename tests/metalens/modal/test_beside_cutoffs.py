@@ -9,8 +9,8 @@ import math
 
 import pytest
 
-from metalens.cell import Cell, Index, Light
-from metalens.modal import RUNGS, case_of, evaluate, ladder
+from metalens.cell import Cell, Incidence, Index
+from metalens.modal import RUNGS, case_of, ladder, solve_on_mesh
 from metalens.modal.case import RARER
 from metalens.modal.engine import homogeneous_basis
 from metalens.modal.match import NEAR, cutoff_proximity, lattice_wavenumbers
@@ -32,27 +32,27 @@ def cell(pitch_um, height_um, pillar, substrate, cover, between):
 AT = (
     cell(0.4, 0.78142774, 2.31689391, 1.44632102, 1.08787665, 1.29971763),
     0.15892082,
-    Light(0.58268293),
+    Incidence(0.58268293),
 )
 # 12 % beyond: as a cell far from cutoffs its bars were 0.84 ("good") and 1.02 ("even")
 # of the error
 BESIDE = (
     cell(0.4, 0.66523476, 2.38014848, 1.45833456, 1.2089043, 1.21492626),
     0.19357524,
-    Light(0.61779067),
+    Incidence(0.61779067),
 )
 # 22 % beyond: 0.82 of the error ("fair")
 BEYOND = (
     cell(0.4, 0.5900454, 1.96529053, 1.70223569, 1.16862997, 1.16257339),
     0.31643628,
-    Light(0.75273253),
+    Incidence(0.75273253),
 )
 # 39 % beyond, a wide disc of low index: 1.02 of the error ("fair"), half of it alike in
 # both forms
 LOW = (
     cell(0.4, 0.3914564, 2.00474304, 1.42257939, 1.28726576, 1.24767188),
     0.2840101,
-    Light(0.66311152),
+    Incidence(0.66311152),
 )
 DRAWN = [
     ("at", AT, 0.95575344 + 0.21896267j, 0.13220492 - 0.14530166j, 1.0),
@@ -71,7 +71,7 @@ DOUBT = 1.1e-6
 )
 def test_bars_hold_beside_a_cutoff_with_a_quarter_to_spare(drawn, t, r, near, rung):
     case = case_of(*drawn)
-    found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+    found = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     assert found.beside == pytest.approx(near, abs=0.01)
     assert 1.25 * (error - DOUBT) < rung.error(found, case.rho)
@@ -83,11 +83,11 @@ def test_bars_of_a_disc_of_the_rarer_medium_hold_at_a_cutoff_after_meshes_before
     error was told. Values of the mesh "reference", which moved by 7e-4 since "finest".
     """
     rarer = cell(0.75366427, 1.60735719, 1.87764143, 1.6191322, 1.4536532, 3.62984323)
-    case = case_of(rarer, 0.14232514, Light(1.09271256))
+    case = case_of(rarer, 0.14232514, Incidence(1.09271256))
     assert case.strange == RARER
     before: list = []
     for rung in RUNGS[:4]:
-        found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+        found = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
         error = abs(
             found.matrix[:, 0] - [-0.63707138 - 0.1831032j, -0.19628568 + 0.7121097j]
         ).max()
@@ -102,8 +102,11 @@ def test_an_order_beyond_a_tenth_of_its_cutoff_takes_its_exact_wavenumber():
     coarsest), which the estimate sees.
     """
     case = case_of(*BESIDE)
-    found = evaluate(case, RUNGS[0].choice(case.rho).plan, weak=RUNGS[0].weak)
-    assert abs(found.matrix - evaluate(case, ladder.FINER).matrix)[:, 0].max() < 4.3e-3
+    found = solve_on_mesh(case, RUNGS[0].choice(case.rho).plan, weak=RUNGS[0].weak)
+    assert (
+        abs(found.matrix - solve_on_mesh(case, ladder.FINER).matrix)[:, 0].max()
+        < 4.3e-3
+    )
     assert 1e-3 < found.grazing < 5e-3
 
 

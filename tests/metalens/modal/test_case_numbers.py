@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes.round import Circle
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.modal.case import (
     RARER,
     MeshSolution,
@@ -41,7 +41,7 @@ def test_lengths_are_in_half_pitches_and_indices_are_squared():
     """Half a pitch is 0.2: k0 = 2 pi 0.2 / 0.8, height 0.7 / 0.2, kx = k0 sin 30°, (3 +
     0.2i)² = 8.96 + 1.2i.
     """
-    case = case_of(CELL, 0.25, Light(0.8, math.pi / 6, "s"))
+    case = case_of(CELL, 0.25, Incidence(0.8, math.pi / 6, "s"))
     assert case.rho == pytest.approx(0.625, rel=1e-12)
     assert case.k0 == pytest.approx(math.pi / 2, rel=1e-12)
     assert case.height == pytest.approx(3.5, rel=1e-12)
@@ -53,7 +53,9 @@ def test_lengths_are_in_half_pitches_and_indices_are_squared():
 
 
 def test_light_from_the_other_side_has_the_same_phase():
-    there, back = (case_of(CELL, 0.25, Light(0.8, angle, "p")) for angle in (0.2, -0.2))
+    there, back = (
+        case_of(CELL, 0.25, Incidence(0.8, angle, "p")) for angle in (0.2, -0.2)
+    )
     assert (
         there.bloch
         == back.bloch
@@ -66,7 +68,7 @@ def test_light_from_the_other_side_has_the_same_phase():
 )
 def test_a_phase_below_a_millionth_is_normal_incidence(phase, kept):
     """k0 is pi / 2 in half pitches; of so small an angle the sine is the angle."""
-    case = case_of(CELL, 0.25, Light(0.8, phase / (math.pi / 2), "s"))
+    case = case_of(CELL, 0.25, Incidence(0.8, phase / (math.pi / 2), "s"))
     assert case.bloch == pytest.approx(abs(phase) if kept else 0.0, rel=1e-9)
 
 
@@ -87,9 +89,9 @@ def test_the_plane_of_incidence_turns_by_quarters(azimuth, axis):
     """azimuth: in parts of pi. The field along the axis of the plane is p, and across
     it s.
     """
-    assert plane_of_incidence(Light(0.8, 0.2, "s", azimuth * math.pi)) == axis
+    assert plane_of_incidence(Incidence(0.8, 0.2, "s", azimuth * math.pi)) == axis
     p = {
-        name: case_of(CELL, 0.25, Light(0.8, 0.2, name, azimuth * math.pi)).p
+        name: case_of(CELL, 0.25, Incidence(0.8, 0.2, name, azimuth * math.pi)).p
         for name in "xysp"
     }
     assert p == {axis: True, "xy".replace(axis, ""): False, "s": False, "p": True}
@@ -97,22 +99,22 @@ def test_the_plane_of_incidence_turns_by_quarters(azimuth, axis):
 
 def test_planes_off_the_axes_are_refused_where_there_is_an_angle():
     """From 1e-12 of a quarter turn on."""
-    assert plane_of_incidence(Light(0.8, 0.0, "x", 0.7)) == "x"  # 0.45 quarters
-    assert plane_of_incidence(Light(0.8, 0.0, "x", 0.9)) == "y"  # 0.57
-    assert plane_of_incidence(Light(0.8, 0.2, "x", 5e-13 * math.pi / 2)) == "x"
+    assert plane_of_incidence(Incidence(0.8, 0.0, "x", 0.7)) == "x"  # 0.45 quarters
+    assert plane_of_incidence(Incidence(0.8, 0.0, "x", 0.9)) == "y"  # 0.57
+    assert plane_of_incidence(Incidence(0.8, 0.2, "x", 5e-13 * math.pi / 2)) == "x"
     for off in (4e-12, -4e-12, 0.3):
         for angle in (0.2, -0.2):
             with pytest.raises(CellError, match=r"multiples of pi/2"):
-                plane_of_incidence(Light(0.8, angle, "x", (1 + off) * math.pi / 2))
+                plane_of_incidence(Incidence(0.8, angle, "x", (1 + off) * math.pi / 2))
 
 
 def test_half_spaces_have_their_indices_and_absorb_nothing():
-    assert half_spaces(CELL, Light(0.8, 1.5)) == (1.5, 1.2)
+    assert half_spaces(CELL, Incidence(0.8, 1.5)) == (1.5, 1.2)
     for name in ("substrate", "cover"):
         with pytest.raises(
             CellError, match=rf"{name} absorbs \(index \(1.4\+1e-06j\)\)"
         ):
-            half_spaces(replace(CELL, **{name: Index(1.4, 1e-6)}), Light(0.8))
+            half_spaces(replace(CELL, **{name: Index(1.4, 1e-6)}), Incidence(0.8))
 
 
 @pytest.mark.parametrize("name", ["substrate", "cover"])
@@ -120,12 +122,12 @@ def test_half_spaces_have_their_indices_and_absorb_nothing():
 def test_the_rarer_half_space_needs_a_zero_order(name, sign):
     """Index 0.5: up to 30 degrees, where the sine is 0.5 itself."""
     rare = replace(CELL, **{name: Index(0.5)})
-    half_spaces(rare, Light(0.8, sign * (math.pi / 6 - 1e-6)))
+    half_spaces(rare, Incidence(0.8, sign * (math.pi / 6 - 1e-6)))
     with pytest.raises(CellError, match=r"no zero order in a half-space of index 0.5"):
-        half_spaces(rare, Light(0.8, sign * (math.pi / 6 + 1e-6)))
+        half_spaces(rare, Incidence(0.8, sign * (math.pi / 6 + 1e-6)))
     exact = replace(CELL, **{name: Index(abs(math.sin(0.7)))})
     with pytest.raises(CellError, match="no zero order"):
-        half_spaces(exact, Light(0.8, sign * 0.7))
+        half_spaces(exact, Incidence(0.8, sign * 0.7))
 
 
 @pytest.mark.parametrize("diameter", [0.0, -0.1, 0.4, 0.41, math.nan, math.inf])
@@ -148,7 +150,7 @@ def test_diameters_end_above_zero_and_below_the_pitch(diameter):
 )
 def test_films_and_tilted_walls_are_no_case_of_the_elements(more):
     with pytest.raises(CellError, match="upright pillar without films"):
-        case_of(replace(CELL, **more), 0.2, Light(0.8))
+        case_of(replace(CELL, **more), 0.2, Incidence(0.8))
 
 
 def test_holes_and_layers_are_told_by_their_names():
@@ -157,7 +159,7 @@ def test_holes_and_layers_are_told_by_their_names():
             CellError,
             match="the modal engine takes round pillars on a square lattice, not",
         ):
-            case_of(replace(CELL, **more), 0.2, Light(0.8))
+            case_of(replace(CELL, **more), 0.2, Incidence(0.8))
 
 
 @pytest.mark.parametrize(

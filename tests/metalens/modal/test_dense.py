@@ -5,7 +5,7 @@ plain products and solves.
 import numpy as np
 import pytest
 
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal import dense
 from metalens.modal.assembly import assemble_disc
@@ -157,7 +157,7 @@ def test_blocks_diagonalised_in_part_are_those_of_the_layer(contrast):
         half_phase_rad=None,
     )
     case = case_of(
-        Cell(0.4, 0.7, Index(contrast), Index(1.6), Index(1.1)), 0.2, Light(0.85)
+        Cell(0.4, 0.7, Index(contrast), Index(1.6), Index(1.1)), 0.2, Incidence(0.85)
     )
     b, medium = (
         homogeneous_modes(symmetry_class),

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
 from metalens.modal import engine, match
 from metalens.modal.case import case_of
@@ -43,7 +43,7 @@ def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_ne
     case = case_of(
         Cell(0.4, 0.5, inside, Index(1.45), Index(1.1), around),
         0.21,
-        Light(0.85, 0.2, "p"),
+        Incidence(0.85, 0.2, "p"),
     )
     assert bool(case.strange) is hole
     plan, weak = RUNGS[0].choice(case.rho).plan, RUNGS[0].weak
@@ -51,7 +51,7 @@ def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_ne
         engine.solve_form(case, plan, magnetic=magnetic, weak=weak)
         for magnetic in (False, True)
     )
-    found = engine.evaluate(case, plan, weak=weak)
+    found = engine.solve_on_mesh(case, plan, weak=weak)
     pairs, left = [], set(range(len(second.q)))
     for k in range(len(first.q)):  # no two lie near each other here
         near = min(left, key=lambda n, k=k: abs(first.q[k] - second.q[n]), default=None)
@@ -122,7 +122,7 @@ def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_leas
         "first_rung",
         lambda tolerance, rho, size: 0 if (rho, size) == (0.42, 1.6) else 2,
     )
-    monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
+    monkeypatch.setattr(engine, "solve_on_mesh", lambda case, plan, *, weak: plan)
     usual = SimpleNamespace(**{**vars(CASE), "strange": 0.0})
     met = engine.refine_mesh(usual, 0.02)
     assert (met.solution, met.error, met.converged) == ("b", 0.02, True)
@@ -155,7 +155,7 @@ def test_cells_unlike_those_of_lenses_begin_two_meshes_before_and_are_judged_by_
     monkeypatch.setattr(
         engine, "first_rung", lambda tolerance, rho: 1 if tolerance > 3e-3 else 3
     )
-    monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
+    monkeypatch.setattr(engine, "solve_on_mesh", lambda case, plan, *, weak: plan)
     hole = SimpleNamespace(**{**vars(CASE), "strange": 1.0})
     for tolerance, name, judged in (
         (2.0, "c", [("c", "ab")]),

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from metalens import modal
-from metalens.cell import Cell, Index, Light
-from metalens.modal import case_of, evaluate, ladder
-from metalens.modal.ladder import DampedEstimate, ErrorFactors, MeshChoice, Rung
+from metalens.cell import Cell, Incidence, Index
+from metalens.modal import case_of, ladder, solve_on_mesh
+from metalens.modal.ladder import DampedEstimate, ErrorFactors, MeshChoice, MeshLevel
 
 THIN_PLAN, WIDE_PLAN = object(), object()
 THIN = ErrorFactors(0.3, 1.4, flat=2e-4, steep=7e-4, oblique=3e-4)
 WIDE = ErrorFactors(0.7, 0.9, flat=1e-4, at_cutoff=3.1, grazing=0.15)
 ALONE, AFTER = ErrorFactors(2.2, 5.1, flat=6e-4), ErrorFactors(0.4, 0.6, moved=0.8)
-RUNG = Rung(
+RUNG = MeshLevel(
     "typed",
     (MeshChoice(THIN_PLAN, 0.6, THIN, AFTER), MeshChoice(WIDE_PLAN, 1.0, WIDE, THIN)),
     1e-2,
@@ -246,7 +246,7 @@ def test_the_first_mesh_is_the_coarsest_that_usually_meets_the_tolerance():
 
 
 def test_a_mesh_may_usually_meet_less_for_some_discs(monkeypatch):
-    quick = Rung(
+    quick = MeshLevel(
         "quick",
         (MeshChoice(THIN_PLAN, 0.3, THIN, AFTER, usual=3e-3), *RUNG.choices),
         2e-2,
@@ -288,14 +288,14 @@ def test_bars_of_slim_discs_hold_and_are_not_too_wide(place):
     """0.145 pitches: both forms err by what is singular at the rim, the mean by a half
     of half their difference. The
     bars were 19, 13, 8 and 7 errors; the mesh "finer" knows the answer to 1e-6."""
-    rung, case = ladder.RUNGS[place], case_of(SLIM, 0.058, Light(0.87))
-    made = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
-    error = np.abs(made.matrix - evaluate(case, ladder.FINER).matrix)[:, 0].max()
+    rung, case = ladder.RUNGS[place], case_of(SLIM, 0.058, Incidence(0.87))
+    made = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
+    error = np.abs(made.matrix - solve_on_mesh(case, ladder.FINER).matrix)[:, 0].max()
     assert 1.3 * error < rung.error(made, case.rho) < 6 * error
 
 
 def test_off_normal_incidence_waves_may_count_more():
-    slanted = Rung(
+    slanted = MeshLevel(
         "slanted",
         (MeshChoice(THIN_PLAN, 1.0, ErrorFactors(0.3, 1.4, slanted=2.1), AFTER),),
         1e-9,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.modal import engine
 from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
-from metalens.modal.engine import evaluate, geometric_mean, nearest_pairs
+from metalens.modal.engine import geometric_mean, nearest_pairs, solve_on_mesh
 from metalens.modal.homogeneous import homogeneous_modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.mesh import X0, X1, MeshPlan, build_mesh
@@ -87,7 +87,7 @@ def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
     monkeypatch.setattr(engine, "RUNGS", rungs(errors, told=told))
     monkeypatch.setattr(engine, "first_rung", lambda *asked: 3 if asked == begun else 5)
     monkeypatch.setattr(
-        engine, "evaluate", lambda case, plan, weak: (plan, round(10 * weak))
+        engine, "solve_on_mesh", lambda case, plan, weak: (plan, round(10 * weak))
     )
     made = engine.refine_mesh(
         SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance
@@ -110,7 +110,7 @@ def test_a_mesh_that_is_the_one_before_is_not_solved_again(monkeypatch):
     monkeypatch.setattr(engine, "RUNGS", rungs((0.9, 0.5, 0.01, 0.2), plans="aabb"))
     monkeypatch.setattr(engine, "first_rung", lambda *asked: 0)
     monkeypatch.setattr(
-        engine, "evaluate", lambda case, plan, weak: solved.append(plan) or plan
+        engine, "solve_on_mesh", lambda case, plan, weak: solved.append(plan) or plan
     )
     made = engine.refine_mesh(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
     assert solved == ["a", "b"]
@@ -289,8 +289,8 @@ def test_oblique_homogeneous_layer_is_fresnel(polarization):
 
 @pytest.mark.parametrize("diameter", [0.01, 0.1, 0.1937, 0.302, 0.39])
 def test_lossless_energy_and_reciprocity(diameter):
-    case = case_of(cell(), diameter, Light(WAVELENGTH))
-    solution = evaluate(case, COARSE)
+    case = case_of(cell(), diameter, Incidence(WAVELENGTH))
+    solution = solve_on_mesh(case, COARSE)
     s = solution.matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
     assert abs(s[0, 1] - s[1, 0]) < 1e-12
@@ -299,8 +299,9 @@ def test_lossless_energy_and_reciprocity(diameter):
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_lossless_energy_and_reciprocity_oblique(polarization):
-    solution = evaluate(
-        case_of(cell(), 0.272, Light(WAVELENGTH, math.radians(5), polarization)), COARSE
+    solution = solve_on_mesh(
+        case_of(cell(), 0.272, Incidence(WAVELENGTH, math.radians(5), polarization)),
+        COARSE,
     )
     s = solution.matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
@@ -308,15 +309,15 @@ def test_lossless_energy_and_reciprocity_oblique(polarization):
 
 
 def test_reciprocity_with_absorption():
-    s = evaluate(case_of(cell(k=0.1), 0.2, Light(WAVELENGTH)), COARSE).matrix
+    s = solve_on_mesh(case_of(cell(k=0.1), 0.2, Incidence(WAVELENGTH)), COARSE).matrix
     assert abs(s[0, 1] - s[1, 0]) < 1e-12
     assert np.linalg.norm(s, 2) < 1
 
 
 def test_swap_of_sides_turns_the_scattering_matrix_round():
-    there = evaluate(case_of(cell(), 0.2, Light(WAVELENGTH)), COARSE).matrix
-    back = evaluate(
-        case_of(cell(substrate=1.0, cover=1.4525), 0.2, Light(WAVELENGTH)), COARSE
+    there = solve_on_mesh(case_of(cell(), 0.2, Incidence(WAVELENGTH)), COARSE).matrix
+    back = solve_on_mesh(
+        case_of(cell(substrate=1.0, cover=1.4525), 0.2, Incidence(WAVELENGTH)), COARSE
     ).matrix
     assert np.abs(back - there[::-1, ::-1]).max() < 1e-11
 
@@ -355,7 +356,7 @@ def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
 
 @pytest.mark.parametrize("height", [50.0, 1000.0])
 def test_hard_tall_pillars_stay_unitary(height):
-    s = evaluate(case_of(cell(height), 0.2, Light(WAVELENGTH)), COARSE).matrix
+    s = solve_on_mesh(case_of(cell(height), 0.2, Incidence(WAVELENGTH)), COARSE).matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-10
 
 
@@ -368,7 +369,7 @@ def test_hard_touching_pillars_on_a_mesh_of_their_own():
     touching = rcwa.solve(cell(), 0.4, WAVELENGTH, harmonics=11)
     plan = MeshPlan(3, 4, 3, (0.7, 1.45), sectors=(0.15, 1.0))
     near, nearer = (
-        evaluate(case_of(cell(), 0.4 * (1 - gap), Light(WAVELENGTH)), plan)
+        solve_on_mesh(case_of(cell(), 0.4 * (1 - gap), Incidence(WAVELENGTH)), plan)
         for gap in (1e-4, 1e-5)
     )
     for solution in (near, nearer):
@@ -417,10 +418,10 @@ def test_hard_pitch_equals_wavelength():
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_hard_tiny_angles_join_normal_incidence(polarization):
     case = [
-        case_of(cell(), 0.2, Light(WAVELENGTH, a, polarization))
+        case_of(cell(), 0.2, Incidence(WAVELENGTH, a, polarization))
         for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)
     ]
-    t = [evaluate(c, COARSE).matrix[1, 0] for c in case]
+    t = [solve_on_mesh(c, COARSE).matrix[1, 0] for c in case]
     assert t[1] == t[0] == t[2]
     assert abs(t[3] - t[0]) < 1e-7
     assert abs(t[4] - t[0]) < 1e-4  # t is even in the angle: 20 theta² at most here
@@ -428,8 +429,8 @@ def test_hard_tiny_angles_join_normal_incidence(polarization):
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_hard_grazing(polarization):
-    case = case_of(cell(), 0.2, Light(WAVELENGTH, math.radians(89), polarization))
-    solution = evaluate(case, COARSE)
+    case = case_of(cell(), 0.2, Incidence(WAVELENGTH, math.radians(89), polarization))
+    solution = solve_on_mesh(case, COARSE)
     assert np.isfinite(solution.matrix).all()
     assert abs(solution.energy - 1) < 1e-12
 
@@ -497,7 +498,7 @@ def test_bad_numbers_are_refused(change, word):
 )
 def test_elements_refuse_films_and_tilted_walls_by_name(shape):
     with pytest.raises(CellError, match="upright pillar without films"):
-        case_of(Cell(0.4, **shape), 0.2, Light(0.85))
+        case_of(Cell(0.4, **shape), 0.2, Incidence(0.85))
 
 
 def test_absorbing_half_space_is_refused():
@@ -522,7 +523,7 @@ def test_upright_pillars_that_a_tilted_one_stands_on_are_asked_for_a_fifth_of_it
     monkeypatch.setattr(
         engine.anchored, "solve_anchored", lambda *words, tolerance: (words, tolerance)
     )
-    light = Light(0.83, 0.07, "p", math.pi / 2)
+    light = Incidence(0.83, 0.07, "p", math.pi / 2)
     leaning = Cell(0.4, 0.61, sidewall_rad=0.03)
     (whole, diameter_um, lit, nodes), tolerance = engine._as_built(
         leaning, 0.2, light, asked

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.modal import RUNGS
 from metalens.modal.case import ModalCase, case_of
-from metalens.modal.engine import evaluate
+from metalens.modal.engine import solve_on_mesh
 
 FILE = Path(__file__).parents[3] / "benchmarks" / "results" / "reference_pillars.json"
 ENTRIES = json.loads(FILE.read_text(encoding="utf-8"))["entries"]
@@ -90,8 +90,8 @@ def held_against(rung, where, **light):
     against the bar.
     """
     cell, diameter, wavelength = where
-    case = case_of(cell, diameter, Light(wavelength, **light))
-    solution = evaluate(case, rung.choice(case.rho).plan)
+    case = case_of(cell, diameter, Incidence(wavelength, **light))
+    solution = solve_on_mesh(case, rung.choice(case.rho).plan)
     return complex(solution.matrix[1, 0]), rung.error(solution, case.rho)
 
 
@@ -111,10 +111,10 @@ def test_one_guided_wave_that_both_forms_place_alike(size, media, where):
     Half the difference of the forms is 2 to 8 times below the error.
     """
     cell, (diameter, wavelength) = Cell(*size, *map(Index, media)), where
-    case = case_of(cell, diameter, Light(wavelength))
+    case = case_of(cell, diameter, Incidence(wavelength))
     want, doubt = held_against(RUNGS[3], (cell, diameter, wavelength))
     for rung in RUNGS[:2]:
-        got = evaluate(case, rung.choice(case.rho).plan)
+        got = solve_on_mesh(case, rung.choice(case.rho).plan)
         error = abs(got.matrix[1, 0] - want)
         assert 1.5 * got.spread < error <= rung.error(got, case.rho) + doubt
 
@@ -126,10 +126,10 @@ def test_error_estimate_holds_for_many_waves_in_a_pitch():
     case = ModalCase(
         0.668, 2.3157, 8.6786, 2.9236, 1.638, 11.8613 + 0j, 1.0997 + 0j, 0.0, False
     )
-    best = evaluate(case, RUNGS[3].choice(case.rho).plan)
+    best = solve_on_mesh(case, RUNGS[3].choice(case.rho).plan)
     doubt = RUNGS[3].error(best, case.rho)
     for rung in (RUNGS[0], RUNGS[2]):
-        got = evaluate(case, rung.choice(case.rho).plan)
+        got = solve_on_mesh(case, rung.choice(case.rho).plan)
         error = np.abs(got.matrix - best.matrix).max()
         assert 30 * error > rung.error(got, case.rho) > error - doubt
         assert got.size == pytest.approx(

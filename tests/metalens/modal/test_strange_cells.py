@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell import Cell, Index, Light
+from metalens.cell import Cell, Incidence, Index
 from metalens.cell.shapes import Ellipse
-from metalens.modal import RUNGS, case_of, evaluate
+from metalens.modal import RUNGS, case_of, solve_on_mesh
 from metalens.modal.case import ModalCase
 from metalens.modal.ladder import NEAREST
 
@@ -43,7 +43,7 @@ NARROW_GAP = (
         1.89605793,
     ),
     0.42349186308834735,
-    Light(0.8425811917203626),
+    Incidence(0.8425811917203626),
 )
 LOW = (
     cell(
@@ -55,7 +55,7 @@ LOW = (
         1.81642935,
     ),
     0.24177454050838318,
-    Light(0.5293950834131094),
+    Incidence(0.5293950834131094),
 )
 WIDE_HOLE = (
     cell(
@@ -67,7 +67,7 @@ WIDE_HOLE = (
         3.75606134,
     ),
     0.5139929458275264,
-    Light(1.7352906649295703),
+    Incidence(1.7352906649295703),
 )
 LOW_HOLE = (
     cell(
@@ -79,7 +79,7 @@ LOW_HOLE = (
         3.5682959427,
     ),
     0.1787102889704651,
-    Light(0.8806399780818054),
+    Incidence(0.8806399780818054),
 )
 THIN_HOLE = (
     cell(
@@ -91,7 +91,7 @@ THIN_HOLE = (
         3.11705012,
     ),
     0.032166565817817065,
-    Light(1.0136164975151287),
+    Incidence(1.0136164975151287),
 )
 RESONANCE = (
     cell(
@@ -103,7 +103,7 @@ RESONANCE = (
         1.21686081,
     ),
     0.22674369678315753,
-    Light(0.7687960094226736, 0.1487341598591234, "p"),
+    Incidence(0.7687960094226736, 0.1487341598591234, "p"),
 )
 MANY_ORDERS = (
     cell(
@@ -115,7 +115,7 @@ MANY_ORDERS = (
         1.88695666,
     ),
     0.28321358022201676,
-    Light(0.8349581637443448, 0.2001742614769124, "s"),
+    Incidence(0.8349581637443448, 0.2001742614769124, "s"),
 )
 # thin discs in a layer that guides without them: bars of the three coarsest meshes were
 # 0.45 to 0.73
@@ -129,7 +129,7 @@ GUIDED = (
         1.7535734634407,
     ),
     0.0750219081185,
-    Light(0.8912474407872),
+    Incidence(0.8912474407872),
 )
 NORMAL = [  # cell, its t and r, doubt, meshes whose bars did not hold
     (
@@ -203,7 +203,7 @@ def test_bars_of_coarse_meshes_cover_cells_unlike_those_of_lenses(
     name, drawn, t, r, doubt, rung
 ):
     case = case_of(*drawn)
-    found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+    found = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     assert error < rung.error(found, case.rho) + doubt
     assert error > 5 * doubt  # the mesh is what is wrong
@@ -215,38 +215,42 @@ def test_bars_of_coarse_meshes_cover_cells_unlike_those_of_lenses(
 TALL = (
     cell(0.4018070723, 1.869884332, 3.376210251, 1.66570934, 1.09029881, 1.21034073),
     0.1843747312,
-    Light(0.8402593739),
+    Incidence(0.8402593739),
 )
 TALLER = (
     cell(0.7948552376, 11.0175124, 1.89818664, 2.04340399, 1.32803376, 1.42092133),
     0.4767121087,
-    Light(0.8253536),
+    Incidence(0.8253536),
 )
 SHARP_HOLE = (
     cell(0.6718093377, 0.5558903487, 1.517523357, 1.3096561, 1.09357001, 3.66468821),
     0.1776699277,
-    Light(0.9744799279),
+    Incidence(0.9744799279),
 )
 # within 0.2 % of the cutoff of an order of the substrate, where bars were a fifteenth
 # of the error
 AT_CUTOFF = (
     cell(0.520574852, 0.381721476, 2.747248786, 1.60065034, 1.0, 1.0),
     0.351280652,
-    Light(0.834092407),
+    Incidence(0.834092407),
 )
 DARK = (
     cell(0.4, 0.7, 3.6, 1.4525, 1.0, 1.0),
     0.272,
-    Light(0.85, math.radians(5), "p"),
+    Incidence(0.85, math.radians(5), "p"),
 )  # a sharp oblique resonance
 # the coarse mesh moves the answer towards a resonance: to first order its bar was 0.73
 # of the error
 TOWARDS = (
     cell(0.4, 0.531554632, 3.733563396, 1.380462079, 1.242016263, 1.158479481),
     0.266161189,
-    Light(0.86002158, 0.106500461, "p"),
+    Incidence(0.86002158, 0.106500461, "p"),
 )
-FORMS_ALIKE = cell(0.4364, 1.8514, 2.9316, 1.302, 1.0744, 1.1737), 0.2165, Light(0.8488)
+FORMS_ALIKE = (
+    cell(0.4364, 1.8514, 2.9316, 1.302, 1.0744, 1.1737),
+    0.2165,
+    Incidence(0.8488),
+)
 TIGHT = [
     ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, EVEN),
     ("tall", TALL, 0.69795654 + 0.65842580j, -0.06944216 + 0.27296506j, FAIR),
@@ -287,7 +291,7 @@ def test_bars_that_are_tight_hold_and_would_not_with_two_fifths_of_their_factors
     name, drawn, t, r, rung
 ):
     case = case_of(*drawn)
-    found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+    found = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     assert 1.1 * error < rung.error(found, case.rho) < 2.5 * error
 
@@ -297,7 +301,7 @@ def test_bars_that_are_tight_hold_and_would_not_with_two_fifths_of_their_factors
 BESIDE_CUTOFF = (
     cell(0.58388739, 0.53453013, 2.73798679, 1.58821564, 1.08200867, 1.18564028),
     0.31785514,
-    Light(0.92731673),
+    Incidence(0.92731673),
 )
 
 
@@ -312,7 +316,7 @@ def test_forms_that_err_alike_at_a_cutoff_are_told_by_every_mesh(drawn, t, rung)
     times half of what its forms differ
     by; without the factors of cutoffs its bar was 0.98 of the error."""
     case = case_of(*drawn)
-    found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+    found = solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
     assert found.grazing > 0
     assert abs(found.matrix[1, 0] - t) < 0.5 * rung.error(
         found, case.rho
@@ -329,7 +333,7 @@ MANY_WAVES = (
         1.16126448325698,
     ),
     0.18680812157690393,
-    Light(0.9255815809035152),
+    Incidence(0.9255815809035152),
 )
 LOWER = (
     cell(
@@ -341,7 +345,7 @@ LOWER = (
         1.28469392918809,
     ),
     0.3523400660475739,
-    Light(0.6859730438764974),
+    Incidence(0.6859730438764974),
 )
 
 
@@ -362,7 +366,8 @@ def test_cells_of_damped_waves_have_bars_of_three_errors_from_how_the_answer_set
     error, and stay so at a cutoff."""
     case = case_of(*drawn)
     coarse, fair, found = (
-        evaluate(case, rung.choice(case.rho).plan, weak=rung.weak) for rung in RUNGS[:3]
+        solve_on_mesh(case, rung.choice(case.rho).plan, weak=rung.weak)
+        for rung in RUNGS[:3]
     )
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     bar, usual = (
@@ -387,7 +392,7 @@ def test_a_sharp_resonance_of_a_hole_is_told_by_the_meshes_before():
     t, r = TIGHT[-1][2:4]
     drawn, made = case_of(*SHARP_HOLE), []
     for rung in RUNGS[:4]:
-        made.append(evaluate(drawn, rung.choice(drawn.rho).plan, weak=rung.weak))
+        made.append(solve_on_mesh(drawn, rung.choice(drawn.rho).plan, weak=rung.weak))
     assert made[3].damping < 0.1 < made[1].damping
     for i in (2, 3):
         error = max(abs(made[i].matrix[1, 0] - t), abs(made[i].matrix[0, 0] - r))

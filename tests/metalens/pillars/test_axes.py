@@ -12,7 +12,7 @@ import pytest
 from metalens import rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Ellipse, Rectangle
-from metalens.ground.errors import CellError, ConfigError, DomainError
+from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.pillars import Sweep, axes, workers
 
 RANGE = (0.1, 0.27)
@@ -27,7 +27,7 @@ SETTINGS = Sweep(
 
 @pytest.fixture(scope="module")
 def library():
-    return axes.sweep(CELL, SETTINGS)
+    return axes.sweep_two_sizes(CELL, SETTINGS)
 
 
 def moving(x, y):
@@ -45,7 +45,7 @@ def moving(x, y):
 def test_a_surface_with_a_moving_pole_converges_and_knows_its_error(count, most):
     nodes = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
     places = np.linspace(0, 1, 57)
-    made = axes.surface(
+    made = axes.interpolate_table(
         (nodes, nodes), moving(nodes[:, None], nodes), (places, places), tolerance=1e-4
     )
     error = np.abs(made.value - moving(places[:, None], places)).max(axis=-1)
@@ -59,13 +59,13 @@ def test_a_surface_holds_its_nodes():
     nodes = (1 - np.cos(np.pi * np.arange(12) / 11)) / 2
     values = moving(nodes[:, None], nodes)
     x, y = nodes[[2, 5]], nodes[[3, 4]]
-    made = axes.surface((nodes, nodes), values, (x, y), tolerance=1e-8)
+    made = axes.interpolate_table((nodes, nodes), values, (x, y), tolerance=1e-8)
     assert np.abs(made.value - values[np.ix_([2, 5], [3, 4])]).max() < 1e-8
 
 
 def test_exchanged_sizes_exchange_x_and_y(library):
-    assert not axes.record.swaps(CELL, SETTINGS)
-    assert axes.record.swaps(SQUARE, SETTINGS)
+    assert not axes.record.is_exchange_symmetric(CELL, SETTINGS)
+    assert axes.record.is_exchange_symmetric(SQUARE, SETTINGS)
     t = library.t[0]
     # solved one by one; normals of places that are as near to either edge of a corner
     # are a matter of rounding
@@ -80,7 +80,7 @@ def test_bars_hold_against_a_finer_solver(library):
     for i, j in rng.integers(0, 35, (4, 2)):
         x, y = float(library.x_um[i]), float(library.y_um[j])
         exact = rcwa.jones(
-            axes.sized(SQUARE, x, y), x, 0.7, harmonics=library.harmonics + 4
+            axes.cell_of_sizes(SQUARE, x, y), x, 0.7, harmonics=library.harmonics + 4
         )
         assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
 
@@ -95,7 +95,9 @@ def test_pairs_held_out_lie_within_their_bars(library):
     i, j = (
         int(np.argmin(np.abs(a - v))) for a, v in ((library.x_um, x), (library.y_um, y))
     )
-    exact = rcwa.jones(axes.sized(SQUARE, x, y), x, 0.7, harmonics=library.harmonics).t
+    exact = rcwa.jones(
+        axes.cell_of_sizes(SQUARE, x, y), x, 0.7, harmonics=library.harmonics
+    ).t
     assert np.abs(exact - library.t[0, i, j]).max() == pytest.approx(error, abs=1e-9)
 
 
@@ -119,8 +121,10 @@ def test_weak_pillars_are_a_film_of_the_mean_permittivity(shape):
         cell = dataclasses.replace(
             SQUARE, pillar=Index(math.sqrt(1 + contrast)), shape=shape
         )
-        rows = workers.work(
-            workers.jones_task(axes.sized(cell, x, y), x, 0.7, tolerance=0.1, reach=4)
+        rows = workers.run_task(
+            workers.jones_task(
+                axes.cell_of_sizes(cell, x, y), x, 0.7, tolerance=0.1, reach=4
+            )
         )
         xx, xy, yx, yy = np.array(rows["t"]) @ (1, 1j)
         off.append(
@@ -157,7 +161,7 @@ def test_a_library_is_read_as_it_was_written(library, tmp_path):
 )
 def test_cells_that_cannot_be_swept_over_two_sizes_are_refused(cell, change, words):
     with pytest.raises(CellError, match=words):
-        axes.sweep(cell, dataclasses.replace(SETTINGS, **change))
+        axes.sweep_two_sizes(cell, dataclasses.replace(SETTINGS, **change))
 
 
 @pytest.mark.parametrize(

@@ -10,20 +10,20 @@ import pytest
 from metalens import cli
 from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
-from metalens.ground.console import Console
-from metalens.ground.errors import CellError, ConfigError, MetalensError, StoreError
+from metalens.core.console import Console
+from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
 from metalens.pillars import study as cell_study
 from metalens.pillars import study_plots, workers
-from metalens.pillars.study import Study
+from metalens.pillars.study import CellStudy
 
-SMALL = Study(
+SMALL = CellStudy(
     pitches_um=(0.30, 0.40), heights_um=(0.7,), wavelengths_um=(0.85,), tolerance=1e-2
 )
 
 
 @pytest.fixture(scope="module")
 def verdicts():
-    return cell_study.run(SMALL)
+    return cell_study.run_study(SMALL)
 
 
 def test_known_coverages(verdicts):
@@ -40,14 +40,14 @@ def test_known_coverages(verdicts):
 
 def test_choice_takes_the_lowest_then_the_most(verdicts):
     narrow, wide, _ = verdicts
-    assert cell_study.choice(SMALL, verdicts) == (0.30, 0.7)
+    assert cell_study.best_cell(SMALL, verdicts) == (0.30, 0.7)
     taller = dataclasses.replace(narrow, height_um=0.9, turns=2.0)
-    assert cell_study.choice(SMALL, [taller, narrow]) == (0.30, 0.7)
+    assert cell_study.best_cell(SMALL, [taller, narrow]) == (0.30, 0.7)
     better = dataclasses.replace(narrow, pitch_um=0.31, turns=1.6)
-    assert cell_study.choice(SMALL, [narrow, better]) == (0.31, 0.7)
+    assert cell_study.best_cell(SMALL, [narrow, better]) == (0.31, 0.7)
     elsewhere = dataclasses.replace(better, wavelength_um=0.94, turns=0.4)
-    assert cell_study.choice(SMALL, [narrow, better, elsewhere]) == (0.30, 0.7)
-    assert cell_study.choice(SMALL, [wide]) is None
+    assert cell_study.best_cell(SMALL, [narrow, better, elsewhere]) == (0.30, 0.7)
+    assert cell_study.best_cell(SMALL, [wide]) is None
 
 
 def test_page_json_and_figure(verdicts, tmp_path):
@@ -66,7 +66,7 @@ def test_page_json_and_figure(verdicts, tmp_path):
 
 def test_no_cell_is_said_plainly(verdicts):
     only = dataclasses.replace(SMALL, pitches_um=(0.40,))
-    assert "No cell covers a full turn at 850 nm" in cell_study.markdown(
+    assert "No cell covers a full turn at 850 nm" in cell_study.study_markdown(
         only, verdicts[1:2], command="x"
     )
 
@@ -80,13 +80,13 @@ def test_most_phase_of_runs():
 
 def test_pitch_without_room_is_refused():
     with pytest.raises(ConfigError, match="no pillar of"):
-        Study(pitches_um=(0.12,))
+        CellStudy(pitches_um=(0.12,))
 
 
 def test_pitches_above_cutoff_are_refused_and_named():
     with pytest.raises(CellError, match=r"pitch 0.7 um at 0.85 um: diffraction orders"):
-        cell_study.run(
-            Study(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,))
+        cell_study.run_study(
+            CellStudy(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,))
         )
 
 
@@ -102,20 +102,20 @@ def test_other_materials_are_tried_where_they_hold_and_never_the_own_one_again()
         pillar=Index(3.48),
     )
     far = dataclasses.replace(base, others=("a-Si", "Si-infrared", "a-Si"))
-    assert cell_study.others(far) == (("Si-infrared",), ("a-Si",))
+    assert cell_study.other_materials(far) == (("Si-infrared",), ("a-Si",))
     own = dataclasses.replace(
         base,
         pillar="Si-infrared",
         others=("Si-infrared", "TiO2"),
         wavelengths_um=(1.5,),
     )
-    assert cell_study.others(own) == (("TiO2",), ())
-    full = cell_study.Verdict(
+    assert cell_study.other_materials(own) == (("TiO2",), ())
+    full = cell_study.CellVerdict(
         0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i"
     )
     assert (
         "a-Si was not tried: its source does not hold 2500 nm"
-        in cell_study.markdown(far, [full], command="x")
+        in cell_study.study_markdown(far, [full], command="x")
     )
 
 
@@ -135,10 +135,10 @@ def test_what_cannot_be_solved_is_refused_before_any_cell_is(
     cell, others, says, monkeypatch
 ):
     monkeypatch.setattr(
-        workers, "run", lambda tasks: pytest.fail("cells were solved first")
+        workers, "run_tasks", lambda tasks: pytest.fail("cells were solved first")
     )
     with pytest.raises(MetalensError, match=says):
-        cell_study.run(dataclasses.replace(SMALL, cell=cell, others=others))
+        cell_study.run_study(dataclasses.replace(SMALL, cell=cell, others=others))
 
 
 def test_heights_of_layered_pillars_are_made_of_their_own_material():
@@ -165,7 +165,7 @@ def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
     neighbours overlapped, and the study
     ended with a refusal."""
     cell = Cell(0.3, pillar=Index(3.6), sidewall_rad=0.04)
-    leaning = Study(
+    leaning = CellStudy(
         pitches_um=(0.3,),
         heights_um=(0.7,),
         min_diameter_um=0.2,
@@ -179,16 +179,16 @@ def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
 
 
 def test_the_page_says_what_is_printable_of_any_shape():
-    crosses = Study(
+    crosses = CellStudy(
         pitches_um=(0.3,),
         heights_um=(0.7,),
         wavelengths_um=(0.85,),
         cell=Cell(0.3, shape=Cross(0.4)),
     )
-    verdict = cell_study.Verdict(
+    verdict = cell_study.CellVerdict(
         0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si"
     )
-    page = cell_study.markdown(
+    page = cell_study.study_markdown(
         dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x"
     )
     assert (
@@ -196,7 +196,7 @@ def test_the_page_says_what_is_printable_of_any_shape():
         in page
     )
     discs = dataclasses.replace(crosses, cell=Cell(0.3))
-    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.markdown(
+    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.study_markdown(
         discs, [verdict], command="x"
     )
 
@@ -215,7 +215,7 @@ def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
     def run(tasks):  # in this process, each once
         for i, task in enumerate(tasks):
             key = json.dumps(task)
-            answers[key] = answers.get(key) or workers.work(task)
+            answers[key] = answers.get(key) or workers.run_task(task)
             yield i, answers[key]
 
     def stopped(tasks):
@@ -226,14 +226,14 @@ def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
         solved.append(len(tasks))
         return run(tasks)
 
-    monkeypatch.setattr(workers, "run", stopped)
+    monkeypatch.setattr(workers, "run_tasks", stopped)
     assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.INTERRUPTED
     assert not (tmp_path / "out").exists()
     journal = tmp_path / "out.resume"
     assert len(journal.read_text().splitlines()) == 2
     with open(journal, "ab") as file:
         file.write(b'["cut sho')
-    monkeypatch.setattr(workers, "run", counted)
+    monkeypatch.setattr(workers, "run_tasks", counted)
     assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
     assert solved == [1, 1]  # the other cell, and the chosen one of another material
     assert not journal.exists()
@@ -255,7 +255,7 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     """
     table, path = tmp_path / "film.csv", tmp_path / "out.resume"
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
-    study, solved = Study(pillar=str(table)), []
+    study, solved = CellStudy(pillar=str(table)), []
 
     def told(tasks):
         solved.append(tasks)
@@ -273,12 +273,12 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
 
     def done(settings):
         solved.clear()
-        workers.Journal(path, settings).run(
+        workers.SweepJournal(path, settings).run(
             [{"kind": "curve"}], Console(quiet=True), "cells"
         )
         return any(solved)
 
-    monkeypatch.setattr(workers, "run", told)
+    monkeypatch.setattr(workers, "run_tasks", told)
     assert [done(study), done(study)] == [True, False]
     assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [
         True,
@@ -296,7 +296,7 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
     """
     table, path = tmp_path / "film.csv", tmp_path / "out.resume"
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
-    study = Study(pillar=str(table))
+    study = CellStudy(pillar=str(table))
 
     def told(tasks):
         for i, _ in enumerate(tasks):
@@ -312,9 +312,9 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
             )
             table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
 
-    monkeypatch.setattr(workers, "run", told)
+    monkeypatch.setattr(workers, "run_tasks", told)
     with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
-        workers.Journal(path, study).run(
+        workers.SweepJournal(path, study).run(
             [{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells"
         )
     assert len(path.read_text().splitlines()) == 2  # its title and the first
@@ -322,12 +322,12 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
 
 def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
     path = tmp_path / "out.resume"
-    title = workers.Journal(path, SMALL) and path.read_text()
+    title = workers.SweepJournal(path, SMALL) and path.read_text()
     path.write_text(title + '["task", {"diameter_um": [0.1]}]\n')
-    assert workers.Journal(path, SMALL)._known == {}
+    assert workers.SweepJournal(path, SMALL)._known == {}
     path.write_text("pages of a thesis\n")
     with pytest.raises(
         StoreError, match=r"out\.resume is in the way.*no journal of metalens"
     ):
-        workers.Journal(path, SMALL)
+        workers.SweepJournal(path, SMALL)
     assert path.read_text() == "pages of a thesis\n"

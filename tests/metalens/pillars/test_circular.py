@@ -11,10 +11,14 @@ import pytest
 from metalens import library, rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Square
-from metalens.ground.errors import CellError, ConfigError, DomainError
-from metalens.pillars import Sweep, Wanted, converted
-from metalens.pillars.circular import Turned, check, solve
-from metalens.pillars.circular.turned import circular, mirrored
+from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.pillars import ProxyTolerances, Sweep, converted
+from metalens.pillars.circular import (
+    GeometricPhase,
+    check_geometric_phase,
+    solve_rotations,
+)
+from metalens.pillars.circular.turned import mirror_jones, to_circular_basis
 from tests.referees.turned_pillar import isolated
 
 # low contrast, so that few harmonics suffice; far enough apart that the neighbours
@@ -41,7 +45,7 @@ def test_a_turned_wave_plate_is_that_of_the_textbook(angle):
 def test_the_other_hand_leaves_with_twice_the_turn(hand):
     t_x, t_y = 0.8 * np.exp(0.4j), 0.9 * np.exp(-1.3j)
     angle = np.array([0.0, 0.37, -1.2])
-    kept, other = circular(isolated(t_x, t_y, angle), hand)
+    kept, other = to_circular_basis(isolated(t_x, t_y, angle), hand)
     assert np.allclose(kept, (t_x + t_y) / 2)
     assert np.allclose(other, (t_x - t_y) / 2 * np.exp(2j * hand * angle))
     come = np.array([1, 1j * hand]) / math.sqrt(2)
@@ -52,7 +56,7 @@ def test_the_other_hand_leaves_with_twice_the_turn(hand):
 
 
 def test_solved_turns_have_the_symmetries_of_the_lattice():
-    found = solve(WEAK, 0.24, 0.74, tolerance=3e-2)
+    found = solve_rotations(WEAK, 0.24, 0.74, tolerance=3e-2)
     assert np.degrees(found.angle_rad).tolist() == pytest.approx(
         [0, 15, 30, 45, -30, -15]
     )
@@ -81,7 +85,7 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     before = np.stack(
         [0.99 * t, 1.02 * t], axis=1
     )  # coarser truncations: their shares are 0.9801 and 1.0404 of it
-    found = Turned(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
+    found = GeometricPhase(0.2, 0.9, angle, t, np.array([0.01, 0.02, 0.015]), before)
     amplitude = [0.85, 0.85 + 0.02j * np.exp(-0.8j), 0.85]  # <R| (0 1; 1 0) |L> = i
     assert found.efficiency(1.0)[0] == pytest.approx(abs(np.mean(amplitude)) ** 2)
     assert found.efficiency(1.0)[1] == pytest.approx(
@@ -89,7 +93,7 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     )
     assert found.unconverted(-1.0)[0] == pytest.approx(0.05**2)
     assert found.model_error == pytest.approx(0.02)
-    again = Turned.from_arrays(found.to_arrays())
+    again = GeometricPhase.from_arrays(found.to_arrays())
     assert (again.size_um, again.model_error) == (found.size_um, found.model_error)
     assert again.efficiency(1.0) == found.efficiency(1.0)
 
@@ -100,19 +104,21 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
 )
 def test_shapes_without_a_long_axis_along_x_or_y_are_refused(shape):
     with pytest.raises(CellError, match="circular light"):
-        check(dataclasses.replace(WEAK, shape=shape), 0.2)
+        check_geometric_phase(dataclasses.replace(WEAK, shape=shape), 0.2)
 
 
 def test_ellipses_and_own_polygons_are_taken():
     own = Polygon(((-0.5, -0.2), (0.5, -0.2), (0.5, 0.2), (-0.5, 0.2)))
     for shape in (Ellipse(0.5), own):
-        check(
+        check_geometric_phase(
             dataclasses.replace(WEAK, shape=shape, lattice=Lattice("hexagonal")), 0.25
         )
 
 
 def test_the_mirror_image_of_a_jones_matrix_is_that_of_the_other_turn():
-    assert np.allclose(mirrored(isolated(0.3j, 0.7, 0.5)), isolated(0.3j, 0.7, -0.5))
+    assert np.allclose(
+        mirror_jones(isolated(0.3j, 0.7, 0.5)), isolated(0.3j, 0.7, -0.5)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +154,8 @@ def test_its_proxy_is_that_of_the_converted_light(made, tmp_path):
         ]
     )
     known = dataclasses.replace(made, t=t[:, None, None])
-    fitted = converted.fit(
-        known, Wanted(phase_tolerance_rad=1e-4, transmission_tolerance=1e-4)
+    fitted = converted.fit_converted(
+        known, ProxyTolerances(phase_tolerance_rad=1e-4, transmission_tolerance=1e-4)
     )
     size = converted.best_size_um(known)
     assert size == pytest.approx(0.197, abs=0.0012)  # half a step of the sizes
@@ -164,7 +170,7 @@ def test_its_proxy_is_that_of_the_converted_light(made, tmp_path):
     )
     assert np.abs(got - want).max() < 2e-4  # both tolerances
     assert high - low > 0.05
-    turned = Turned(
+    turned = GeometricPhase(
         size,
         0.74,
         np.zeros(1),

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from metalens import library, modal, rcwa
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
-from metalens.ground.console import Console
-from metalens.ground.errors import (
+from metalens.core.console import Console
+from metalens.core.errors import (
     CellError,
     ConfigError,
     DomainError,
@@ -166,14 +166,16 @@ def test_loading_a_library_needs_neither_torch_nor_matplotlib():
 
 def test_films_go_to_both_solvers_and_other_shapes_to_rcwa():
     coated = dataclasses.replace(DEFAULT_CELL, over=(Film(Index(1.45), 0.1),))
-    assert engines.choose(coated) == "modal"
+    assert engines.choose_engine(coated) == "modal"
     assert (
-        engines.precise(coated, Light(0.85), tolerance=5e-2, engine="modal")(0.1).engine
+        engines.solve_to_tolerance(
+            coated, Incidence(0.85), tolerance=5e-2, engine="modal"
+        )(0.1).engine
         == "anchored"
     )
     square = dataclasses.replace(DEFAULT_CELL, shape=Square())
     small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12), engine="modal")
-    assert engines.choose(square) == "rcwa"
+    assert engines.choose_engine(square) == "rcwa"
     with pytest.raises(
         CellError, match="round pillars on a square lattice, not square on a square"
     ):
@@ -203,24 +205,26 @@ def test_propagating_orders_are_named():
     for pitch, angle in ((0.85 / n * 1.001, 0.0), (0.7, 0.0), (0.45, 30.0)):
         cell = Cell(pitch, 0.7, Index(3.6), cover=Index(n))
         with pytest.raises(CellError, match=r"orders .*\(-1, 0\).* in the cover"):
-            library.check(cell, Sweep(angles_deg=(angle,)))
-    library.check(Cell(0.85 / n * 0.999, 0.7, Index(3.6), cover=Index(n)), Sweep())
+            library.check_sweep(cell, Sweep(angles_deg=(angle,)))
+    library.check_sweep(
+        Cell(0.85 / n * 0.999, 0.7, Index(3.6), cover=Index(n)), Sweep()
+    )
 
 
 def test_orders_at_grazing_are_refused_too():
     cell = Cell(0.85, 0.7, Index(3.6), substrate=Index(1.0))
     with pytest.raises(CellError, match="propagate"):
-        library.check(cell, Sweep())
+        library.check_sweep(cell, Sweep())
 
 
 def test_impossible_diameters_and_wavelengths_are_refused():
     with pytest.raises(CellError, match="pillars touch"):
-        library.check(DEFAULT_CELL, Sweep(diameters_um=(0.1, 0.3)))
+        library.check_sweep(DEFAULT_CELL, Sweep(diameters_um=(0.1, 0.3)))
     for span in ((0.2, 0.1), (0.0, 0.1), (-0.1, 0.1), (math.nan, 0.2)):
         with pytest.raises(CellError, match="0 < least < largest"):
-            library.check(DEFAULT_CELL, Sweep(diameters_um=span))
+            library.check_sweep(DEFAULT_CELL, Sweep(diameters_um=span))
     with pytest.raises(MaterialError):
-        library.check(Cell(0.2, 0.7, "a-Si"), Sweep(wavelengths_um=(30.0,)))
+        library.check_sweep(Cell(0.2, 0.7, "a-Si"), Sweep(wavelengths_um=(30.0,)))
 
 
 @pytest.mark.parametrize(
@@ -242,7 +246,9 @@ def test_materials_of_layers_are_asked_for_before_anything_is_solved(part):
         layers=(Layer(3.0), Layer(1.0, **part)),
     )
     with pytest.raises(MaterialError, match="Si at 30"):
-        library.check(cell, Sweep(wavelengths_um=(30.0,), diameters_um=(1.0, 3.0)))
+        library.check_sweep(
+            cell, Sweep(wavelengths_um=(30.0,), diameters_um=(1.0, 3.0))
+        )
 
 
 def test_workers_pass_refusals_on():

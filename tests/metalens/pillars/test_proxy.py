@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from metalens.ground.errors import DomainError
+from metalens.core.errors import DomainError
 from metalens.pillars.proxy import Proxy
 
 TURN = 2 * math.pi

@@ -9,10 +9,10 @@ import pytest
 from metalens import library, proxy
 from metalens.cell.record import Cell, Index
 from metalens.cell.shapes import Circle
-from metalens.ground.errors import DomainError
+from metalens.core.errors import DomainError
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars import stretch as smooth
-from metalens.pillars.fit import Wanted
+from metalens.pillars.fit import ProxyTolerances
 from metalens.pillars.record import PillarLibrary, Sweep
 
 CELL = Cell(0.30, 0.7, Index(3.6))
@@ -129,7 +129,9 @@ def test_more_coefficients_leave_less_error():
 
 def test_a_proxy_that_falls_short_has_no_more_coefficients_than_were_wanted():
     """Less than a turn, which no more of them would complete."""
-    wanted = Wanted(coefficients=6, phase_tolerance_rad=1e-7, within_um=(0.06, 0.1))
+    wanted = ProxyTolerances(
+        coefficients=6, phase_tolerance_rad=1e-7, within_um=(0.06, 0.1)
+    )
     made = proxy_fit.fit(synthetic(), wanted)
     assert made.smooth_turns < 1
     assert "1e-07" in made.shortfall
@@ -258,7 +260,7 @@ def test_an_entry_whose_bar_is_above_half_of_its_light_cuts_the_domain():
     bars = made.t_error.copy()
     bars[..., 130] = 0.51 * np.abs(made.t[..., 130])
     bars[..., 20] = 0.49 * np.abs(made.t[..., 20])
-    found = smooth.stretch(
+    found = smooth.longest_monotonic_branch(
         dataclasses.replace(made, t_error=bars),
         least_transmission=0.7,
         least_half_width_um=0.005,
@@ -301,7 +303,7 @@ def test_resonances_everywhere_are_refused():
 
 
 def test_within_narrows_the_domain():
-    made = proxy.fit(synthetic(), Wanted(within_um=(0.1, 0.2)))
+    made = proxy.fit(synthetic(), ProxyTolerances(within_um=(0.1, 0.2)))
     assert made.domain_um[0] >= 0.1 - 1e-9
     assert made.domain_um[1] <= 0.2 + 1e-9
 
@@ -309,7 +311,9 @@ def test_within_narrows_the_domain():
 def test_few_coefficients_shorten_the_domain_but_not_below_a_turn():
     made = proxy_fit.fit(
         synthetic(),
-        Wanted(coefficients=8, phase_tolerance_rad=1e-4, transmission_tolerance=1e-4),
+        ProxyTolerances(
+            coefficients=8, phase_tolerance_rad=1e-4, transmission_tolerance=1e-4
+        ),
     )
     assert made.turns >= 1
     assert made.proxy.phase_coefficients.size > 4
@@ -329,7 +333,7 @@ def test_polarisations_are_averaged_and_their_spread_is_told():
 
 def test_phase_is_continuous_over_wavelength_and_angle():
     waves, angles = (0.83, 0.85, 0.87), (0.0, 20.0)
-    stretch = smooth.stretch(
+    stretch = smooth.longest_monotonic_branch(
         synthetic(waves, angles), least_transmission=0.7, least_half_width_um=0.005
     )
     d, w, a = (
@@ -361,7 +365,7 @@ def test_a_candidate_that_turns_negative_between_entries_is_passed_over():
     made = synthetic(
         factor=lambda d: 1 - 0.85 * np.exp(-(((d - 0.2) / 0.002) ** 2)), samples=60
     )
-    fitted = proxy_fit.fit(made, Wanted(least_transmission=0.05))
+    fitted = proxy_fit.fit(made, ProxyTolerances(least_transmission=0.05))
     assert 0.19 < fitted.proxy.domain_um[1] < 0.2  # up to the dip
     assert fitted.shortfall == ""
 
@@ -371,7 +375,7 @@ def test_a_dip_that_no_candidate_follows_is_refused():
         factor=lambda d: 1 - 0.995 * np.exp(-(((d - 0.1) / 0.003) ** 2)), samples=60
     )
     with pytest.raises(DomainError, match="sweep with more samples") as refused:
-        proxy_fit.fit(made, Wanted(least_transmission=0.001))
+        proxy_fit.fit(made, ProxyTolerances(least_transmission=0.001))
     assert "fit it again" not in str(
         refused.value
     )  # what the proxy says of its coefficients is no advice to a user
@@ -394,13 +398,16 @@ class Stated:
 
 
 def test_a_fit_costs_its_larger_error_in_units_of_the_tolerance():
-    wanted = Wanted(phase_tolerance_rad=4e-3, transmission_tolerance=0.05)
+    wanted = ProxyTolerances(phase_tolerance_rad=4e-3, transmission_tolerance=0.05)
     assert proxy_fit._cost(Stated(6e-3, 0.01), wanted) == pytest.approx(1.5)
     assert proxy_fit._cost(Stated(6e-3, 0.1), wanted) == pytest.approx(2.0)
-    assert proxy_fit.shortfall(Stated(4e-3, 0.05), wanted) == ""
-    assert "within 0.00401 rad" in proxy_fit.shortfall(Stated(4.01e-3, 0.01), wanted)
-    assert "|T| within 0.051, where 0.004 and 0.05 are wanted" in proxy_fit.shortfall(
-        Stated(1e-3, 0.051), wanted
+    assert proxy_fit.tolerance_shortfall(Stated(4e-3, 0.05), wanted) == ""
+    assert "within 0.00401 rad" in proxy_fit.tolerance_shortfall(
+        Stated(4.01e-3, 0.01), wanted
+    )
+    assert (
+        "|T| within 0.051, where 0.004 and 0.05 are wanted"
+        in proxy_fit.tolerance_shortfall(Stated(1e-3, 0.051), wanted)
     )
     for bad in ((0.8, 0.0), (0.9, 0.2), (0.8 / 2 + 0.9 / 2, 0.2)):
         assert proxy_fit._cost(Stated(1e-3, 0.01, bad), wanted) == math.inf
@@ -425,7 +432,9 @@ def test_the_least_largest_deviation_is_chebyshevs(pole, degree):
 def test_errors_of_phase_and_transmission_stand_each_in_its_place():
     made = proxy.fit(
         synthetic(),
-        Wanted(coefficients=8, phase_tolerance_rad=0.3, transmission_tolerance=0.1),
+        ProxyTolerances(
+            coefficients=8, phase_tolerance_rad=0.3, transmission_tolerance=0.1
+        ),
     )
     phase, level = errors(made, (0.85,), (0.0,))
     assert made.max_phase_error_rad == pytest.approx(
@@ -445,7 +454,7 @@ def test_pillars_on_both_sides_of_a_very_narrow_resonance_are_used():
     assert found.proxy.domain_um[1] > 0.21
     assert (
         found.turns
-        > 1.2 * proxy_fit.fit(library, Wanted(within_um=(0.06, 0.172))).turns
+        > 1.2 * proxy_fit.fit(library, ProxyTolerances(within_um=(0.06, 0.172))).turns
     )
     (gap,) = found.proxy.gaps_um
     assert gap == pytest.approx((centre - 0.005, centre + 0.005))

@@ -19,7 +19,7 @@ def rows(x):
 
 
 def test_a_rational_function_is_found_with_its_poles():
-    r = rational.fit(X, rows(X), tolerance=1e-10)
+    r = rational.fit_rational_aaa(X, rows(X), tolerance=1e-10)
     assert len(r.support) == 4  # degree 3
     assert r.residual < 1e-10
     t = np.random.default_rng(0).uniform(0.05, 0.3, (7, 9))
@@ -28,19 +28,19 @@ def test_a_rational_function_is_found_with_its_poles():
 
 
 def test_data_on_the_support_are_met_exactly():
-    r = rational.fit(X, rows(X), tolerance=1e-3)
+    r = rational.fit_rational_aaa(X, rows(X), tolerance=1e-3)
     assert np.array_equal(r(r.support), r.values)
     assert np.abs(r(X) - rows(X)).max() == pytest.approx(r.residual, rel=1e-9)
 
 
 def test_start_and_terms_bound_the_degree():
-    r = rational.fit(X, rows(X), tolerance=0.0, terms=3, start=X[[4, 9]])
+    r = rational.fit_rational_aaa(X, rows(X), tolerance=0.0, terms=3, start=X[[4, 9]])
     assert len(r.support) == 3
     assert set(X[[4, 9]]) <= set(r.support)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_data(count):
-    r = rational.fit(X[:count], rows(X[:count]), tolerance=1e-12)
+    r = rational.fit_rational_aaa(X[:count], rows(X[:count]), tolerance=1e-12)
     assert np.isfinite(r(X)).all()
     assert len(r.poles()) <= max(0, len(r.support) - 1)

@@ -8,7 +8,7 @@ import pytest
 from metalens import rcwa
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
-from metalens.ground.errors import DomainError
+from metalens.core.errors import DomainError
 from metalens.pillars import curve as reduced
 
 HARD = Cell(
@@ -25,12 +25,12 @@ def exact(diameter_um: float) -> Response:
     return rcwa.solve(HARD, diameter_um, 0.85, harmonics=6)
 
 
-def explored(tolerance: float) -> reduced.Curve:
-    nodes = reduced.explore(exact, *SPAN, tolerance=tolerance)
+def explored(tolerance: float) -> reduced.ResponseCurve:
+    nodes = reduced.sample_adaptively(exact, *SPAN, tolerance=tolerance)
     silent = np.zeros_like(
         nodes.error
     )  # so that the estimate of the interpolation stands alone
-    nodes = reduced.Nodes(
+    nodes = reduced.SolvedNodes(
         nodes.diameter_um,
         nodes.response,
         silent,
@@ -38,10 +38,10 @@ def explored(tolerance: float) -> reduced.Curve:
         nodes.converged,
         nodes.reason,
     )
-    return reduced.curve(nodes, tolerance=tolerance)
+    return reduced.fit_response_curve(nodes, tolerance=tolerance)
 
 
-def violations(curve: reduced.Curve, count: int) -> tuple[int, float, float]:
+def violations(curve: reduced.ResponseCurve, count: int) -> tuple[int, float, float]:
     """(entries whose error is above its estimate, largest error, largest estimate) at
     random diameters.
     """
@@ -76,15 +76,19 @@ def test_cheaper_diameters_are_taken_where_they_serve_and_the_estimate_holds_as_
     """
     plain = explored(1e-3).nodes.diameter_um
     for cheaper in (np.random.default_rng(13).uniform(*SPAN, 25), plain + 1e-5):
-        nodes = reduced.explore(exact, *SPAN, tolerance=1e-3, cheaper_um=cheaper)
+        nodes = reduced.sample_adaptively(
+            exact, *SPAN, tolerance=1e-3, cheaper_um=cheaper
+        )
         assert nodes.converged
         taken = np.isin(nodes.diameter_um, cheaper)
         assert taken.sum() >= 8
         assert (~taken).sum() <= len(plain) - 8
-        silent = reduced.Nodes(
+        silent = reduced.SolvedNodes(
             nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, ""
         )
-        wrong, error, _ = violations(reduced.curve(silent, tolerance=1e-3), 400)
+        wrong, error, _ = violations(
+            reduced.fit_response_curve(silent, tolerance=1e-3), 400
+        )
         assert wrong == 0
         assert error < 1e-3
 
@@ -124,7 +128,7 @@ def test_outside_the_nodes_is_refused():
 
 
 def test_too_few_solves_say_so():
-    nodes = reduced.explore(exact, *SPAN, tolerance=1e-6, most=20)
+    nodes = reduced.sample_adaptively(exact, *SPAN, tolerance=1e-6, most=20)
     assert not nodes.converged
     assert nodes.reason == "20 solves do not meet 1e-06"
     assert len(nodes.diameter_um) == 20
@@ -137,8 +141,8 @@ def test_the_solvers_error_enters_the_estimate():
             made.t, made.r, 0.02, made.orders, made.energy, made.engine, True, ""
         )
 
-    curve = reduced.curve(
-        reduced.explore(coarse, *SPAN, tolerance=1e-3), tolerance=1e-3
+    curve = reduced.fit_response_curve(
+        reduced.sample_adaptively(coarse, *SPAN, tolerance=1e-3), tolerance=1e-3
     )
     d = np.linspace(*SPAN, 400)
     estimate = curve(d)[1]

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 
 from metalens import rcwa
-from metalens.cell import Light, Response
+from metalens.cell import Incidence, Response
 from metalens.cell.record import Cell, Index
-from metalens.ground import executor
-from metalens.ground.errors import MaterialError, WorkerError
+from metalens.core import executor
+from metalens.core.errors import MaterialError, WorkerError
 from metalens.pillars import engines, workers
 
 CELL = Cell(0.30, 0.7, Index(3.6))
 TASK = workers.points_task(
-    CELL, Light(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa"
+    CELL, Incidence(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa"
 )
 
 
 def test_what_comes_back_is_what_was_computed():
-    ((index, result),) = workers.run([TASK])
+    ((index, result),) = workers.run_tasks([TASK])
     assert index == 0
     exact = [rcwa.solve(CELL, d, 0.85, tolerance=5e-2) for d in (0.1, 0.15)]
     assert result["diameter_um"] == [0.1, 0.15]
@@ -42,29 +42,29 @@ def test_what_comes_back_is_what_was_computed():
 def test_the_same_bits_from_any_number_of_workers():
     tasks = [
         workers.points_task(
-            CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa"
+            CELL, Incidence(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa"
         )
         for i in range(5)
     ]
-    found = dict(workers.run(tasks, processes=2))
+    found = dict(workers.run_tasks(tasks, processes=2))
     assert sorted(found) == [0, 1, 2, 3, 4]
     assert [found[i]["diameter_um"][0] for i in range(5)] == [
         0.05 + 0.02 * i for i in range(5)
     ]
-    assert found == dict(workers.run(tasks, processes=1))
+    assert found == dict(workers.run_tasks(tasks, processes=1))
 
 
 def test_refusals_keep_their_class():
     unknown = workers.points_task(
-        Cell(0.3, 0.7, "a-Sj"), Light(0.85), [0.1], tolerance=0.1, engine="rcwa"
+        Cell(0.3, 0.7, "a-Sj"), Incidence(0.85), [0.1], tolerance=0.1, engine="rcwa"
     )
     with pytest.raises(MaterialError, match="did you mean 'a-Si'"):
-        list(workers.run([TASK, unknown]))
+        list(workers.run_tasks([TASK, unknown]))
 
 
 def test_a_worker_that_dies_is_told_with_its_cause():
     with pytest.raises(WorkerError, match=r"ended early.*SIGKILL"):
-        list(executor.run(signal.raise_signal, [signal.SIGKILL]))
+        list(executor.run_parallel(signal.raise_signal, [signal.SIGKILL]))
 
 
 def test_a_worker_looks_after_whoever_started_it_and_ends_with_him():
@@ -100,7 +100,7 @@ def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(
     script.write_text(
         textwrap.dedent("""
             import os, sys
-            from metalens.ground import executor
+            from metalens.core import executor
             print(dict(executor.run(os.path.basename, ["a/b", "c/d"], processes=2)))
             print(dict(executor.run(print, ["stray"], processes=1)))
         """)
@@ -142,9 +142,13 @@ def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
         return [level("coarse", False), level("fine", True), level("finest", True)]
 
     monkeypatch.setattr(engines, "_modal_levels", levels)
-    found = workers.work(
+    found = workers.run_task(
         workers.curves_task(
-            CELL, [engines.Light(0.85)], (0.07, 0.23), tolerance=1e-3, engine="modal"
+            CELL,
+            [engines.Incidence(0.85)],
+            (0.07, 0.23),
+            tolerance=1e-3,
+            engine="modal",
         )
     )
     failed, nodes = (
@@ -187,8 +191,8 @@ def test_beside_a_resonance_alone_the_next_mesh_takes_over(monkeypatch, finer_er
         return [coarse, fine]
 
     monkeypatch.setattr(engines, "_modal_levels", levels)
-    at = engines.smooth(
-        CELL, engines.Light(0.85), (0.07, 0.23), tolerance=5e-4, engine="modal"
+    at = engines.solver_at_fixed_discretization(
+        CELL, engines.Incidence(0.85), (0.07, 0.23), tolerance=5e-4, engine="modal"
     )
     assert (at(0.12).reason, at(0.12).t_error) == ("coarse", 1e-5)
     assert at(0.22).t_error == min(bar, finer_error)
@@ -222,8 +226,8 @@ def test_lights_of_one_direction_take_the_mesh_that_both_need(monkeypatch):
         return [level(number) for number in range(4)]
 
     monkeypatch.setattr(engines, "_modal_levels", levels)
-    lights = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
-    s, p = engines.smooth_all(
+    lights = [Incidence(0.85, 0.2, "s"), Incidence(0.85, 0.2, "p")]
+    s, p = engines.solvers_at_common_discretization(
         CELL, lights, (0.07, 0.23), tolerance=5e-4, engine="modal"
     )
     assert [asked.count(("s", number)) for number in range(4)] == [2, 3, 3, 0]
@@ -235,9 +239,9 @@ def test_lights_of_one_direction_take_the_mesh_that_both_need(monkeypatch):
     ]  # where s fails p is not tried
     assert s(0.12).reason == p(0.12).reason == "2"
     assert (
-        engines.smooth(CELL, lights[0], (0.07, 0.23), tolerance=5e-4, engine="modal")(
-            0.12
-        ).reason
+        engines.solver_at_fixed_discretization(
+            CELL, lights[0], (0.07, 0.23), tolerance=5e-4, engine="modal"
+        )(0.12).reason
         == "1"
     )
 
@@ -247,14 +251,17 @@ def test_curves_of_one_task_are_those_of_tasks_of_their_own():
     itself, since both need the same
     mesh here."""
     span, about = (0.1, 0.14), {"tolerance": 2e-2, "engine": "modal"}
-    both = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
-    joined = workers.work(workers.curves_task(CELL, both, span, **about))
+    both = [Incidence(0.85, 0.2, "s"), Incidence(0.85, 0.2, "p")]
+    joined = workers.run_task(workers.curves_task(CELL, both, span, **about))
     alone = [
-        workers.work(workers.curves_task(CELL, [one], span, **about)) for one in both
+        workers.run_task(workers.curves_task(CELL, [one], span, **about))
+        for one in both
     ]
     assert joined["counts"] == [len(one["diameter_um"]) for one in alone]
-    for made, one in zip(workers.curves(joined, tolerance=2e-2), alone, strict=True):
-        (same,) = workers.curves(one, tolerance=2e-2)
+    for made, one in zip(
+        workers.solve_curves(joined, tolerance=2e-2), alone, strict=True
+    ):
+        (same,) = workers.solve_curves(one, tolerance=2e-2)
         assert (made.nodes.diameter_um == same.nodes.diameter_um).all()
         assert (
             np.abs(made.nodes.response - same.nodes.response).max() < 1e-9
@@ -262,7 +269,8 @@ def test_curves_of_one_task_are_those_of_tasks_of_their_own():
         assert made.nodes.error == pytest.approx(same.nodes.error, rel=1e-5, abs=1e-9)
         assert made.nodes.reason == same.nodes.reason
     s, p = (
-        made.nodes.response[0, 0] for made in workers.curves(joined, tolerance=2e-2)
+        made.nodes.response[0, 0]
+        for made in workers.solve_curves(joined, tolerance=2e-2)
     )
     assert abs(s - p) > 0.01  # and not one of them twice
 
@@ -275,7 +283,7 @@ def test_bars_of_a_shared_mesh_are_no_less_than_those_of_the_mesh_that_a_thin_di
 
     cell, light, thin = (
         Cell(0.30, 0.5, Index(3.6)),
-        Light(0.85),
+        Incidence(0.85),
         0.15,
     )  # of a pitch of 0.3
     rung = next(one for one in modal.RUNGS if one.name == "even")
@@ -283,7 +291,7 @@ def test_bars_of_a_shared_mesh_are_no_less_than_those_of_the_mesh_that_a_thin_di
     levels = engines._modal_levels(cell, light, 0.8 * cell.pitch_um, 1e-4)
     (at,) = [level for level in levels if level(thin).reason == "mesh even"]
     case = modal.case_of(cell, thin, light)
-    made = modal.evaluate(case, mesh.plan, weak=rung.weak)
+    made = modal.solve_on_mesh(case, mesh.plan, weak=rung.weak)
     ends = [one.factors.bound(made) for one in (own, mesh)]
     first = max(ends)
     assert at(thin).t_error == pytest.approx(
@@ -298,9 +306,9 @@ def test_one_mesh_for_a_span_is_that_of_its_widest_pillar():
     """
     spans = (0.07, 0.23), (0.20, 0.23), (0.07, 0.10)
     own = [
-        engines.smooth(CELL, engines.Light(0.85), span, tolerance=1e-2, engine="modal")(
-            0.09
-        )
+        engines.solver_at_fixed_discretization(
+            CELL, engines.Incidence(0.85), span, tolerance=1e-2, engine="modal"
+        )(0.09)
         for span in spans
     ]
     assert (own[0].t, own[0].orders) == (own[1].t, own[1].orders)

@@ -27,7 +27,9 @@ def exact(value, delta):
 
 def test_with_every_pixel_it_is_the_sum_itself():
     value, delta = light()
-    points, chance = estimate.draw(value, estimate.scan(SHAPE), 3 * value.shape[1])
+    points, chance = estimate.draw_pixels(
+        value, estimate.morton_scan(SHAPE), 3 * value.shape[1]
+    )
     assert (chance == 1).all()
     assert estimate.square_error(value, points, chance, delta) == pytest.approx(
         exact(value, delta), rel=1e-12
@@ -57,7 +59,7 @@ def test_drawn_pixels_give_it_without_bias():
 
 def test_a_systematic_draw_follows_the_light_and_its_root():
     value = light(3, depths=1)[0]
-    points, chance = estimate.draw(value, estimate.scan(SHAPE), 40)
+    points, chance = estimate.draw_pixels(value, estimate.morton_scan(SHAPE), 40)
     root = np.sqrt(value) / np.sqrt(value).sum()
     density = (value + root) / 2
     assert points.shape == (1, 40)
@@ -69,7 +71,7 @@ def test_a_systematic_draw_follows_the_light_and_its_root():
 
 
 def test_the_scan_goes_through_a_window_in_z_order():
-    order = estimate.scan((4, 4))
+    order = estimate.morton_scan((4, 4))
     assert order.tolist() == [0, 1, 4, 5, 2, 3, 6, 7, 8, 9, 12, 13, 10, 11, 14, 15]
 
 
@@ -108,7 +110,9 @@ def test_draws_go_by_the_light_by_its_root_at_the_edges_and_by_what_lies_near(
     value = light(3, depths=2)[0]
     rng = np.random.default_rng(8)
     edges, near = rng.uniform(1, 10, value.shape[1]), rng.uniform(0, 1, value.shape[1])
-    points, chance = estimate.draw(value, estimate.scan(SHAPE), count, edges, near)
+    points, chance = estimate.draw_pixels(
+        value, estimate.morton_scan(SHAPE), count, edges, near
+    )
     assert points.shape == (2, drawn)
     for row, at, told in zip(value, points, chance, strict=True):
         root = np.sqrt(row) * edges
@@ -118,7 +122,9 @@ def test_draws_go_by_the_light_by_its_root_at_the_edges_and_by_what_lies_near(
             np.abs(np.bincount(at, minlength=len(row)) - drawn * density).max()
             < 1 + 1e-9
         )
-    plain = estimate.draw(value, estimate.scan(SHAPE), 2 * value.shape[1] - 2)[1]
+    plain = estimate.draw_pixels(
+        value, estimate.morton_scan(SHAPE), 2 * value.shape[1] - 2
+    )[1]
     assert plain.shape == (2, value.shape[1] - 1)  # one less than all
 
 
@@ -136,5 +142,5 @@ def test_parts_of_a_window_lie_one_after_the_other_and_have_neighbours_of_their_
         ]
     assert estimate._near(mean, shapes) == pytest.approx(np.array(want), rel=1e-12)
     order = estimate._orders([(3, 5, 12), (3, 11, 3)])
-    assert order[:60].tolist() == estimate.scan((5, 12)).tolist()
-    assert order[60:].tolist() == (60 + estimate.scan((11, 3))).tolist()
+    assert order[:60].tolist() == estimate.morton_scan((5, 12)).tolist()
+    assert order[60:].tolist() == (60 + estimate.morton_scan((11, 3))).tolist()

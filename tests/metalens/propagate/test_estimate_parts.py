@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from metalens.ground import legendre
+from metalens.core import legendre
 from metalens.lens import Media
-from metalens.propagate import Case, choice, estimate
-from metalens.propagate.estimate import Sample
+from metalens.propagate import PropagationCase, choice, estimate
+from metalens.propagate.estimate import ErrorSample
 from tests.referees import films
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -32,13 +32,16 @@ RNG = np.random.default_rng(17)
 
 def sample(case=CASE, *, weight=1.0, noise=0.0, parts=1, orders=(5, 6)):
     moments = RNG.normal(size=orders) + 1j * RNG.normal(size=orders)
-    return Sample(case, weight, moments, noise, parts)
+    return ErrorSample(case, weight, moments, noise, parts)
 
 
 def light_on_nodes(moments):
     """Σ_m P̂_m(t_a) w_a times the moments, along both axes."""
-    (ty, wy), (tx, wx) = (legendre.nodes(n) for n in moments.shape)
-    left, right = legendre.values(len(ty), ty), legendre.values(len(tx), tx)
+    (ty, wy), (tx, wx) = (legendre.gauss_legendre_nodes(n) for n in moments.shape)
+    left, right = (
+        legendre.legendre_values(len(ty), ty),
+        legendre.legendre_values(len(tx), tx),
+    )
     return (left * wy[:, None]) @ moments @ (right * wx[:, None]).T
 
 
@@ -54,7 +57,10 @@ def test_the_direct_field_is_a_sum_of_wavelets_over_the_nodes(plated):
     depths, at = np.array([0, 2]), (np.array([0, 2, 1]), np.array([3, 1, 0]))
     got = estimate._direct(one, depths, at)[0]
     light, k = light_on_nodes(one.moments), 2 * np.pi / 0.85
-    (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
+    (ty, _), (tx, _) = (
+        legendre.gauss_legendre_nodes(5),
+        legendre.gauss_legendre_nodes(6),
+    )
     ey, ex = ty * 14.5 * 0.37, tx * 20 * 0.37
     middle = (1 / 400 + 1 / 2500) / 2
 
@@ -164,7 +170,10 @@ def test_components_are_sums_of_maps_with_their_factors_on_the_nodes():
     maps = np.stack([one.moments, 0.3j * one.moments[::-1]])
     rng = np.random.default_rng(6)
     signs, factors = np.array([1.0, -1.0, 1.0]), rng.normal(size=(3, 2, 5, 6))
-    (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
+    (ty, _), (tx, _) = (
+        legendre.gauss_legendre_nodes(5),
+        legendre.gauss_legendre_nodes(6),
+    )
     nodes = ty * 14.5 * 0.37, tx * 20 * 0.37
     at = (np.array([0, 2]), np.array([1, 3]))
     both = replace(one, moments=maps, pupils=(signs, factors))
@@ -189,7 +198,10 @@ def test_components_are_sums_of_maps_with_their_factors_on_the_nodes():
 def test_light_on_nodes_of_the_lens_needs_no_polynomials():
     """The same field whether the light is given by its moments or on nodes of its own."""
     one = sample()
-    (ty, _), (tx, _) = legendre.nodes(5), legendre.nodes(6)
+    (ty, _), (tx, _) = (
+        legendre.gauss_legendre_nodes(5),
+        legendre.gauss_legendre_nodes(6),
+    )
     nodes = ty * 14.5 * 0.37, tx * 20 * 0.37
     other = replace(one, moments=light_on_nodes(one.moments), nodes_um=nodes)
     at = (np.array([0, 2]), np.array([1, 3]))
@@ -286,9 +298,9 @@ def plans(monkeypatch):
     monkeypatch.setattr(
         choice, "_layout", lambda case, tolerance: known.get(case.samples)
     )
-    choice.choose.cache_clear()
+    choice.choose_method.cache_clear()
     yield known
-    choice.choose.cache_clear()
+    choice.choose_method.cache_clear()
 
 
 def test_the_exact_sum_takes_its_time_by_pillars_points_and_depths():
@@ -313,13 +325,13 @@ def test_the_cheaper_method_is_taken(plans):
         (exact - 4 * 0.02, "exact"),
     ):
         plans[(30, 40)] = SimpleNamespace(seconds=seconds, parts=2, nodes=(11, 12))
-        made = choice.choose(wide, 1e-4)
+        made = choice.choose_method(wide, 1e-4)
         assert made.method == method
         assert made.seconds == pytest.approx(
             seconds + 0.08 + 630_000 * 3e-9 if method == "windowed" else exact
         )
-        choice.choose.cache_clear()
-    forced = choice.choose(wide, 1e-4, differentiable=True)
+        choice.choose_method.cache_clear()
+    forced = choice.choose_method(wide, 1e-4, differentiable=True)
     assert (forced.method, forced.tiles) == ("windowed", ((wide,),))
 
 
@@ -339,21 +351,21 @@ def test_transforms_are_taken_where_a_window_is_wide_and_they_cost_less_than_the
         exact - 0.02 - 2 * 630_000 * 3e-9 + 1e-3,
     ):
         monkeypatch.setattr(choice.grids, "seconds", lambda *_, own=own: own)
-        choice.choose.cache_clear()
-        made = choice.choose(case, 1e-4)
+        choice.choose_method.cache_clear()
+        made = choice.choose_method(case, 1e-4)
         cheaper = own + 0.02 + 2 * 630_000 * 3e-9 < exact
         assert made.method == ("wide" if wide and cheaper else "exact")
         assert made.seconds == pytest.approx(
             own + 0.02 + 2 * 630_000 * 3e-9 if wide and cheaper else exact
         )
-        assert choice.choose(case, 1e-4, moving=True).method == "exact"
+        assert choice.choose_method(case, 1e-4, moving=True).method == "exact"
 
 
 def test_a_window_that_has_no_plan_is_cut_until_its_corners_have_one(plans):
     """Quarters have none, sixteenths do: 16 tiles of 0.05 s, a plan each."""
     wide = replace(CASE, shape=(9000, 9000), samples=(40, 48))
     plans[(10, 12)] = SimpleNamespace(seconds=0.05, parts=1, nodes=(5, 6))
-    made = choice.choose(wide, 1e-4)
+    made = choice.choose_method(wide, 1e-4)
     assert made.method == "tiled"
     assert [len(row) for row in made.tiles] == [4, 4, 4, 4]
     assert made.seconds == pytest.approx(16 * (0.05 + 0.02 + 81e6 * 3e-9))
@@ -373,7 +385,7 @@ def test_dark_ends_of_rows_are_passed_over_and_change_no_sum():
         e[:, None] ** 2 / 25 + x**2 / 49 < 0.8, RNG.normal(size=(9, 12)) + 0.3j, 0
     )
     at = np.array([0, 2]), np.array([3, 1])
-    some = Sample(CASE, 1.0, round_, 0.0, 1, (e, x))
+    some = ErrorSample(CASE, 1.0, round_, 0.0, 1, (e, x))
     faint = replace(
         some, moments=np.where(round_ == 0, 1e-40, round_)
     )  # no end is dark

@@ -10,14 +10,14 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from metalens.lens import saddle
+from metalens.lens import saddle_correction
 from metalens.lens.media import Media
-from metalens.propagate import Case, paths
+from metalens.propagate import PropagationCase, paths
 from metalens.psf import compute
 
 PITCH = 4.1
 FILMS = Media((1.0, 1.52, 2.1), (11.0, 9.0, 3.0))
-CASE = Case(
+CASE = PropagationCase(
     (3, 4),
     PITCH,
     0.85,
@@ -51,9 +51,9 @@ def errors():
                 for b in (-2.4, 2.4)
             )
             p = brentq(lambda p, far=far: reach(p) - far, 0.0, 1 - 1e-12, xtol=1e-15)
-            found[i, j] = saddle(FILMS, 2 * math.pi / 0.85, CASE.reach_um).error(
-                np.array([p * p])
-            )[0]
+            found[i, j] = saddle_correction(
+                FILMS, 2 * math.pi / 0.85, CASE.reach_um
+            ).error(np.array([p * p]))[0]
     return found
 
 
@@ -85,14 +85,14 @@ def test_of_a_spectrum_the_worst_wavelength_counts_with_its_own_light(order):
     ]
     assert each[0] > 2 * each[1] > 0
     maps = torch.from_numpy(np.stack([levels[i] for i in order]))
-    lit = compute.Lit(
+    lit = compute.IntensityRequest(
         torch.zeros_like(maps), maps, [cases[i] for i in order], [0.3, 0.7]
     )
     assert lit.films == pytest.approx(each[0], rel=1e-12)
 
 
 def test_one_medium_leaves_nothing_out():
-    air = Case(
+    air = PropagationCase(
         (3, 4), PITCH, 0.85, 23.0, (0.21, -0.13), (1 / 400,), (14.0, -8.5), 0.6, (9, 11)
     )
     assert paths.films_error(air, np.ones((3, 4))) == 0.0

@@ -71,7 +71,7 @@ def test_light_is_gathered_by_the_shares_of_every_node(kind):
         Case(kind),
         np.full((2 * NODES, 2, 3 * NODES), 0.25, kind),
     )  # what is there is added to
-    power = compiled.gather(*case.given, out)
+    power = compiled.grid_pillars(*case.given, out)
     want = sum(
         case.weights(i, j) * float(case.level[i, j]) * case.phasor(i, j)
         for i, j in SITES
@@ -92,7 +92,7 @@ def test_gradients_are_the_adjoint_of_gathering(kind, asked):
         np.full((ROWS, COLUMNS), 7.0, kind) if asked in (one, "both") else nothing
         for one in ("phase", "level")
     )
-    compiled.spread(*case.given, case.grad, phase, level)
+    compiled.interpolate_to_pillars(*case.given, case.grad, phase, level)
     for one in (phase, level):
         assert (one[: FIRST * LENGTH] == 7).all()
     for i, j in SITES:
@@ -109,7 +109,9 @@ def test_gradients_are_the_adjoint_of_gathering(kind, asked):
 def test_a_phase_that_is_no_number_is_told_where_nothing_is_lit():
     case = Case(np.float64)
     case.phase[11, CHUNK - 1] = np.nan
-    assert np.isnan(compiled.gather(*case.given, np.zeros((2 * NODES, 2, 3 * NODES))))
+    assert np.isnan(
+        compiled.grid_pillars(*case.given, np.zeros((2 * NODES, 2, 3 * NODES)))
+    )
 
 
 def _grid_shares():

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.propagate import geometry
-from metalens.propagate.geometry import Case
+from metalens.propagate.geometry import PropagationCase
 
-CASE = Case(
+CASE = PropagationCase(
     shape=(4, 7), pitch_um=0.5, row_um=0.8, wavelength_um=0.85, sensor_distance_um=90.0, tangents=(0.1, -0.2),
     inverse_depths_per_um=(0.0, 0.001), centre_um=(-6.0, 2.5), step_um=0.3, samples=(9, 14),
 )  # fmt: skip
@@ -51,7 +51,7 @@ def samples_of(case):
     [(1, [9], [14]), (4, [2, 2, 2, 3], [3, 4, 3, 4]), (20, [1] * 9, [1] * 14)],
 )
 def test_parts_of_a_window_hold_every_sample_once_and_in_order(parts, rows, columns):
-    made = geometry.windows(CASE, parts)
+    made = geometry.split_window(CASE, parts)
     assert [row[0].samples[0] for row in made] == rows
     assert [part.samples[1] for part in made[0]] == columns
     y, x = samples_of(CASE)
@@ -64,7 +64,7 @@ def test_parts_of_a_window_hold_every_sample_once_and_in_order(parts, rows, colu
 
 @pytest.mark.parametrize("parts", [1, 3, 4, 20])
 def test_tiles_are_of_one_size_and_reach_from_rim_to_rim(parts):
-    (top, left), made = geometry.tiles(CASE, parts)
+    (top, left), made = geometry.window_tiles(CASE, parts)
     sides = {part.samples for row in made for part in row}
     assert sides == {tuple(math.ceil(n / min(parts, n)) for n in (9, 14))}
     ((high, wide),) = sides

@@ -12,11 +12,11 @@ import pytest
 from scipy import special, stats
 
 from metalens.lens import Media
-from metalens.propagate import Case, grids, wide
-from metalens.propagate.blocks import Blocks
-from metalens.propagate.grids import Axis
+from metalens.propagate import PropagationCase, grids, wide
+from metalens.propagate.blocks import AxisBlocks
+from metalens.propagate.grids import WideAxis
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -30,8 +30,8 @@ CASE = Case(
 
 
 def axis(**numbers):
-    given = {name: 0 for name in Axis.__dataclass_fields__}
-    return Axis(**(given | numbers))
+    given = {name: 0 for name in WideAxis.__dataclass_fields__}
+    return WideAxis(**(given | numbers))
 
 
 def test_light_between_grid_points_is_spread_by_a_sinc_under_kaisers_window():
@@ -68,7 +68,7 @@ def test_light_between_grid_points_is_spread_by_a_sinc_under_kaisers_window():
 def test_blocks_hold_every_pillar_and_their_nodes_carry_polynomials(
     pillars, length, nodes, bases
 ):
-    made = Blocks(pillars, length, nodes)
+    made = AxisBlocks(pillars, length, nodes)
     assert made.count == len(bases)
     assert made.bases.tolist() == bases
     place = (np.arange(pillars) - (pillars - 1) / 2) * 0.37
@@ -84,7 +84,7 @@ def test_blocks_hold_every_pillar_and_their_nodes_carry_polynomials(
             assert (row - place[b : b + length].mean()) ** power @ (
                 made.weights @ light
             ) == pytest.approx(own, abs=1e-9)
-    assert Blocks(5, 1, 1).along.tolist() == [0.0]
+    assert AxisBlocks(5, 1, 1).along.tolist() == [0.0]
 
 
 def test_light_is_faded_by_the_integral_of_a_gaussian_in_the_middle_of_its_band():
@@ -97,18 +97,18 @@ def test_light_is_faded_by_the_integral_of_a_gaussian_in_the_middle_of_its_band(
 def test_seconds_of_three_transforms_by_their_points_and_depths(monkeypatch):
     y = axis(count=90, first=200, size=120, fine=150)
     x = axis(count=70, first=180, size=100, fine=250)
-    monkeypatch.setattr(grids, "axes", lambda case, tolerance: (y, x))
+    monkeypatch.setattr(grids, "wide_axes", lambda case, tolerance: (y, x))
     points = (90 * 180 + 200 * 100) / 2 + 120 * 100 + 150 * 250
     few = 1e-3 + 2 * points * 1e-8 + 2 * 2 * 13 * 24 * 4e-10
-    assert grids.seconds(CASE, 1e-4) == pytest.approx(few, rel=1e-12)
+    assert grids.expected_cost(CASE, 1e-4) == pytest.approx(few, rel=1e-12)
     many = replace(
         CASE, inverse_depths_per_um=tuple(np.linspace(1 / 2500, 1 / 400, 21))
     )
-    assert grids.seconds(many, 1e-4) == pytest.approx(
+    assert grids.expected_cost(many, 1e-4) == pytest.approx(
         1e-3 + 14 * points * 1e-8 + 21 * 14 * 312 * 4e-10, rel=1e-12
     )
-    monkeypatch.setattr(grids, "axes", lambda case, tolerance: None)
-    assert grids.seconds(CASE, 1e-4) == math.inf
+    monkeypatch.setattr(grids, "wide_axes", lambda case, tolerance: None)
+    assert grids.expected_cost(CASE, 1e-4) == math.inf
     assert not grids.is_wide(CASE, 1e-4)
 
 
@@ -125,7 +125,7 @@ def test_a_window_is_wide_from_120_points_and_half_waves_on(
     half = 0.85 * 121 / (4 * 3.6)
     case = SimpleNamespace(wavelength_um=0.85, half_window_um=(half, 2 * half))
     made = axis(count=count, taps=9, most=most), axis(count=170, taps=9, most=most)
-    monkeypatch.setattr(grids, "axes", lambda case, tolerance: made)
+    monkeypatch.setattr(grids, "wide_axes", lambda case, tolerance: made)
     assert grids.is_wide(case, 1e-4) is wide_one
 
 
@@ -248,7 +248,7 @@ def test_nodes_of_the_depths_are_six_a_turn_and_24_more():
         assert wide._coarse(CASE, i, grid) == 24 + math.ceil(6 * turns)
 
 
-LARGE = Case(
+LARGE = PropagationCase(
     (420, 540),
     0.37,
     0.85,
@@ -266,7 +266,7 @@ def test_grids_of_a_wide_window_hold_its_light_its_fade_and_the_kernels_band(tol
     """Every number of both axes by its formula, from the rays, the band and the
     tolerance alone.
     """
-    found, k = grids.axes(LARGE, tolerance), 2 * math.pi / 0.85
+    found, k = grids.wide_axes(LARGE, tolerance), 2 * math.pi / 0.85
     fits = grids._fitted(LARGE, list(LARGE.half_window_um))
     for _ in range(2):  # rays to where the quadratic leaves them
         reached = [
@@ -317,8 +317,8 @@ def test_grids_of_a_wide_window_hold_its_light_its_fade_and_the_kernels_band(tol
 
 def test_windows_whose_rays_no_quadratic_follows_have_no_grids():
     near = replace(LARGE, sensor_distance_um=30.0)
-    assert grids.axes(near, 1e-4) is None
-    assert grids.seconds(near, 1e-4) == math.inf
+    assert grids.wide_axes(near, 1e-4) is None
+    assert grids.expected_cost(near, 1e-4) == math.inf
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import pytest
 
-from metalens.lens import Media, saddle
+from metalens.lens import Media, saddle_correction
 from metalens.propagate import layered
 
 N, T = (1.31, 1.52, 2.1), (31.0, 12.0, 3.0)
@@ -52,14 +52,16 @@ def level(p):
 
 def test_products_of_complex_rows_are_summed_without_a_conjugate():
     """(2 + 3i)(5 - 1i) = 13 + 13i, (-1 + 0.5i)(4 + 2i) = -5, together 8 + 13i."""
-    got = layered.product(
+    got = layered.complex_product(
         np.array([2.0, -1.0]),
         np.array([3.0, 0.5]),
         np.array([5.0, 4.0]),
         np.array([-1.0, 2.0]),
     )
     assert got == pytest.approx(8 + 13j)
-    assert layered.product(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)) == 0
+    assert (
+        layered.complex_product(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)) == 0
+    )
 
 
 def test_rays_are_those_of_snell_from_any_start():
@@ -70,7 +72,7 @@ def test_rays_are_those_of_snell_from_any_start():
     tan2 = np.array([math.tan(angles(p)[0]) ** 2 for p in P])
     for start in (np.zeros(5), tan2[::-1].copy(), 30 * tan2 + 2):
         work, s = np.full((6, 5), np.nan), start.copy()
-        layered.rays(reach2, SQUARED, THICK, s, work)
+        layered.solve_rays(reach2, SQUARED, THICK, s, work)
         assert work[0] == pytest.approx(P**2, rel=1e-12, abs=1e-15)
         assert s == pytest.approx(tan2, rel=1e-12, abs=1e-15)
 
@@ -83,7 +85,7 @@ def test_rays_that_are_far_off_take_more_than_a_few_steps():
     far = np.array([reach(want) ** 2])
     for start in (0.0, 1e10):
         work = np.empty((6, 1))
-        layered.rays(far, SQUARED, THICK, np.array([start]), work)
+        layered.solve_rays(far, SQUARED, THICK, np.array([start]), work)
         assert 1.31**2 - work[0, 0] == pytest.approx(
             1.31**2 / (1 + 1e6), rel=1e-8
         )  # 1e6 ulp of rounding
@@ -91,22 +93,24 @@ def test_rays_that_are_far_off_take_more_than_a_few_steps():
 
 def test_paths_and_levels_of_rays_are_those_of_their_angles():
     w, work, far, out = P**2, np.full((6, 5), np.nan), np.full(5, 7.0), np.full(5, 9.0)
-    layered.lengths(w, SQUARED, THICK, far)
+    layered.ray_path_lengths(w, SQUARED, THICK, far)
     assert far == pytest.approx([length(p) for p in P], rel=1e-14)
-    layered.levels(w, SQUARED, THICK, np.array(ORDER), out, work)
+    layered.ray_amplitudes(w, SQUARED, THICK, np.array(ORDER), out, work)
     assert out == pytest.approx([level(p) for p in P], rel=1e-13)
 
 
 def test_light_straight_ahead_loses_what_two_faces_reflect():
     """R = (0.79 / 3.41)² and (0.58 / 3.62)²; the level is its root over Σ t / n."""
     out = np.empty(1)
-    layered.levels(np.zeros(1), SQUARED, THICK, np.array(ORDER), out, np.empty((6, 1)))
+    layered.ray_amplitudes(
+        np.zeros(1), SQUARED, THICK, np.array(ORDER), out, np.empty((6, 1))
+    )
     passed = (1 - (0.79 / 3.41) ** 2) * (1 - (0.58 / 3.62) ** 2)
     assert out[0] == pytest.approx(
         math.sqrt(passed) / (31 / 1.31 + 12 / 1.52 + 3 / 2.1), rel=1e-13
     )
     alone = np.empty(1)  # a single medium has no face
-    layered.levels(
+    layered.ray_amplitudes(
         np.zeros(1), SQUARED, THICK, np.array(ORDER[:1]), alone, np.empty((6, 1))
     )
     assert alone[0] == pytest.approx(1 / (31 / 1.31 + 12 / 1.52 + 3 / 2.1), rel=1e-13)
@@ -125,7 +129,7 @@ def beside(p):
 
 def test_what_is_beside_a_ray_is_a_power_series_in_the_cosine_of_the_rarest_medium():
     work = np.full((6, 5), np.nan)
-    layered.beside(P**2, SQUARED, SERIES, work)
+    layered.ray_corrections(P**2, SQUARED, SERIES, work)
     want = np.array([beside(p) for p in P])
     assert work[1] == pytest.approx(want[:, 0], rel=1e-13)
     assert work[2] == pytest.approx(want[:, 1], rel=1e-13)
@@ -140,7 +144,7 @@ def test_arrays_of_media_are_squares_thicknesses_faces_and_the_series():
     assert thick.tolist() == [25.0, 3.0]
     assert thick.dtype == float
     assert order.tolist() == [2.1, 1.0, 1.0]
-    made = saddle(media, K, 40.0)
+    made = saddle_correction(media, K, 40.0)
     assert series.shape == (1 + len(made.real), 2)
     assert series[0].tolist() == [made.middle, made.half]
     assert series[1:, 0].tolist() == list(made.real)
@@ -239,7 +243,7 @@ def test_light_takes_the_phase_of_every_depth_less_that_of_the_reference():
     rng = np.random.default_rng(7)
     light = rng.normal(size=(4, 5)) + 1j * rng.normal(size=(4, 5))
     re, im = np.full((4, 3, 5), 7.5), np.full((4, 3, 5), -7.5)
-    layered.curved(light, e, x, NUMBERS, inverse, spans, re, im)
+    layered.node_phases(light, e, x, NUMBERS, inverse, spans, re, im)
     for i, z, j in np.ndindex(4, 3, 5):
         if spans[i, 0] <= j < spans[i, 1]:
             path = from_source(x[j], e[i], inverse[z]) - from_source(

@@ -16,16 +16,16 @@ import torch
 
 from metalens import propagate, psf
 from metalens.cell import Film, Index
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Media, media
-from metalens.propagate import Case
-from metalens.propagate.layered import rays
+from metalens.propagate import PropagationCase
+from metalens.propagate.layered import solve_rays
 from metalens.propagate.paths import (
-    amplitude,
     chief_path,
-    cosines,
     from_source,
-    slopes,
+    kernel_derivatives,
+    ray_amplitude,
+    ray_cosines,
     to_sensor,
 )
 from tests.referees import films as referee
@@ -61,7 +61,7 @@ def lens(case, shape=(92, 96), seed=0):
 
 @pytest.mark.parametrize("angle_rad", [0.0, (0.3, -0.2)])
 def test_the_exact_sum_is_that_of_plane_waves_through_the_stack(angle_rad):
-    case = propagate.case(
+    case = propagate.make_case(
         (92, 96),
         **GEOMETRY
         | dict(
@@ -104,7 +104,7 @@ def test_the_exact_sum_of_few_pillars_close_to_the_sensor_is_that_of_all_plane_w
         behind=(Film(Index(1.52), 11.0), Film(Index(2.1), 3.0)), cover=Index(1.0)
     )
     about = GEOMETRY | dict(sensor_distance_um=25.0, layers=near, depths_um=np.inf)
-    case = propagate.case((3, 4), **about, angle_rad=(0.3, -0.2))
+    case = propagate.make_case((3, 4), **about, angle_rad=(0.3, -0.2))
     phase, level = np.zeros((3, 4)), np.zeros((3, 4))
     level[2, 1], level[0, 3], phase[0, 3] = 0.7, 0.9, 0.4
     y, x = case.pillars_um
@@ -171,7 +171,7 @@ def test_the_error_of_a_scalar_behind_films_is_told(
         layers=layers,
     )
     about |= dict(angle_rad=angle_rad, offset_um=offset, window_um=4.2, samples=7)
-    case = propagate.case((34, 39), **about)
+    case = propagate.make_case((34, 39), **about)
     y, x = case.pillars_um
     level = (np.hypot(x, y[:, None]) < 8.0) * np.random.default_rng(3).uniform(
         0.7, 1, (34, 39)
@@ -201,7 +201,7 @@ def test_the_error_of_a_scalar_behind_films_is_told(
 
 def test_a_source_behind_a_film_has_the_phase_of_its_plane_waves():
     tangents, depth = (0.21, -0.11), 1340.0
-    case = propagate.case(
+    case = propagate.make_case(
         (90, 90),
         **GEOMETRY | dict(depths_um=depth, angle_rad=tuple(np.arctan(tangents))),
     )
@@ -224,7 +224,7 @@ def test_a_source_behind_a_film_has_the_phase_of_its_plane_waves():
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
 def test_the_engine_meets_its_tolerance_through_films(tolerance):
     geometry = GEOMETRY | dict(angle_rad=(0.3, -0.2))
-    phase, level = lens(propagate.case((92, 96), **geometry))
+    phase, level = lens(propagate.make_case((92, 96), **geometry))
     maps = torch.tensor(phase, requires_grad=True), torch.tensor(level)
     stack = psf.psf_stack(*maps, tolerance=tolerance, **geometry)
     want = np.abs(propagate.exact(phase, level, **geometry)) ** 2
@@ -238,7 +238,7 @@ def test_films_of_the_index_around_them_change_nothing():
     plain = {
         name: value for name, value in GEOMETRY.items() if name != "layers"
     } | dict(angle_rad=(0.1, 0.25))
-    phase, level = lens(propagate.case((92, 96), **plain))
+    phase, level = lens(propagate.make_case((92, 96), **plain))
     of_air = Layers(front=(Film(Index(1.0), 30.0),), behind=(Film(Index(1.0), 20.0),))
     one, other = (
         propagate.exact(phase, level, **plain, layers=layers)
@@ -253,7 +253,7 @@ def test_films_of_the_index_around_them_change_nothing():
 
 
 def test_a_source_at_infinity_is_the_limit_of_far_ones():
-    case = propagate.case(
+    case = propagate.make_case(
         (90, 90), **GEOMETRY | dict(depths_um=[1e9, np.inf], angle_rad=(0.2, 0.1))
     )
     x, y = np.array([3.0, -11.0]), np.array([7.0, 2.0])
@@ -272,7 +272,7 @@ def test_derivatives_in_distance_and_window_centre(step):
     """Against central differences of the kernel at a fixed pillar; their own error is
     1e-8.
     """
-    case = propagate.case((9, 9), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
+    case = propagate.make_case((9, 9), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
     x, y, X, Y = 6.0, -9.0, 3.1, -4.7
 
     def log_kernel(change):
@@ -285,11 +285,11 @@ def test_derivatives_in_distance_and_window_centre(step):
         moved = dataclasses.replace(case, behind=behind, centre_um=tuple(centre))
         reach2 = (centre[0] + X - x) ** 2 + (centre[1] + Y - y) ** 2
         w = media.square(behind.layers, reach2)
-        level = amplitude(moved, behind.layers, w)
+        level = ray_amplitude(moved, behind.layers, w)
         return np.log(level) + 1j * case.wavenumber * media.whole_path(behind.layers, w)
 
-    across = cosines(case, x - case.centre_um[0], y - case.centre_um[1])
-    got = slopes(case, across, y, X, Y)[step]
+    across = ray_cosines(case, x - case.centre_um[0], y - case.centre_um[1])
+    got = kernel_derivatives(case, across, y, X, Y)[step]
     assert got == pytest.approx((log_kernel(1e-4) - log_kernel(-1e-4)) / 2e-4, rel=1e-7)
 
 
@@ -304,7 +304,7 @@ def test_derivatives_of_a_stack():
     phase, level = (
         torch.tensor(m)
         for m in lens(
-            propagate.case((92, 96), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
+            propagate.make_case((92, 96), **GEOMETRY | dict(angle_rad=(0.3, -0.2)))
         )
     )
     rising = torch.linspace(0.3, 1, 20, dtype=torch.float64)
@@ -340,16 +340,16 @@ def test_films_that_do_not_fit_are_refused_by_name():
         PropagationError,
         match="layers: films of 151 um in the 150 um from lens to sensor",
     ):
-        propagate.case((9, 9), **GEOMETRY | dict(layers=thick))
+        propagate.make_case((9, 9), **GEOMETRY | dict(layers=thick))
     with pytest.raises(
         PropagationError,
         match="layers: films of 1200 um in the 1000 um from source to lens",
     ):
-        propagate.case(
+        propagate.make_case(
             (9, 9), **GEOMETRY | dict(layers=Layers(front=(Film(Index(1.5), 1200.0),)))
         )
     with pytest.raises(PropagationError, match="absorb"):
-        propagate.case(
+        propagate.make_case(
             (9, 9),
             **GEOMETRY | dict(layers=Layers(behind=(Film(Index(1.5, 0.2), 3.0),))),
         )
@@ -358,7 +358,7 @@ def test_films_that_do_not_fit_are_refused_by_name():
 
 
 def test_chief_ray_and_its_path_obey_snell():
-    case = propagate.case((9, 9), **GEOMETRY | dict(angle_rad=(0.4, 0.0)))
+    case = propagate.make_case((9, 9), **GEOMETRY | dict(angle_rad=(0.4, 0.0)))
     sine = np.sin(0.4)
     angles = [np.arcsin(sine / n) for n in (1.31, 1.52, 2.1)]
     thick = (DISTANCE - 62.0, 55.0, 7.0)
@@ -370,7 +370,7 @@ def test_chief_ray_and_its_path_obey_snell():
         for n, t, a in zip((1.31, 1.52, 2.1), thick, angles, strict=True)
     )
     assert chief_path(case) == pytest.approx(length, rel=1e-12)
-    assert isinstance(case, Case)
+    assert isinstance(case, PropagationCase)
 
 
 def test_rays_of_a_row_are_found_from_any_others() -> None:
@@ -388,5 +388,5 @@ def test_rays_of_a_row_are_found_from_any_others() -> None:
     s = np.zeros(reach2.size)
     for start in (0.0 * s, want[::-1] / (1 - want[::-1]), np.full(reach2.size, 1e7)):
         s[:] = start
-        rays(reach2, squared, thick, s, work)
+        solve_rays(reach2, squared, thick, s, work)
         assert work[0] == pytest.approx(want, rel=1e-13, abs=1e-15)

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from metalens import propagate
-from metalens.ground import legendre
-from metalens.propagate import Case, blocks, choice, operators, window
+from metalens.core import legendre
+from metalens.propagate import PropagationCase, blocks, choice, operators, window
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -24,7 +24,7 @@ CASE = Case(
     0.6,
     (3, 4),
 )
-NODES = legendre.mapped(9, -5.365, 5.365), legendre.mapped(11, -7.4, 7.4)
+NODES = legendre.mapped_nodes(9, -5.365, 5.365), legendre.mapped_nodes(11, -7.4, 7.4)
 
 
 def phases(case=CASE, nodes=NODES):
@@ -50,7 +50,9 @@ def phases(case=CASE, nodes=NODES):
 
 def test_depths_are_sums_of_fields_that_are_orthonormal_under_the_weights_of_the_nodes():
     made = operators.depth_basis(CASE, NODES, 1e-9)
-    weight = np.outer(legendre.nodes(9)[1], legendre.nodes(11)[1])
+    weight = np.outer(
+        legendre.gauss_legendre_nodes(9)[1], legendre.gauss_legendre_nodes(11)[1]
+    )
     flat = made.basis.reshape(len(made.basis), -1)
     assert (flat * weight.ravel()) @ flat.conj().T == pytest.approx(
         np.eye(len(flat)), abs=1e-10
@@ -67,7 +69,9 @@ def test_a_loose_tolerance_leaves_weak_fields_out():
     """Root mean square of what is left of all depths together, against the singular
     values.
     """
-    weight = np.outer(legendre.nodes(9)[1], legendre.nodes(11)[1])
+    weight = np.outer(
+        legendre.gauss_legendre_nodes(9)[1], legendre.gauss_legendre_nodes(11)[1]
+    )
     size = np.linalg.svd((phases() * np.sqrt(weight)).reshape(3, -1), compute_uv=False)
     tail = [np.sqrt((size[k:] ** 2).sum() / (size**2).sum()) for k in range(3)]
     assert tail[1] > 2 * tail[2]
@@ -147,9 +151,9 @@ def test_rounding_of_long_paths_keeps_no_block_from_being_used():
         depths_um=[2e4],
         angle_rad=0.35,
     )
-    case = propagate.case((25000, 25000), **given, window_um=10, samples=4)
+    case = propagate.make_case((25000, 25000), **given, window_um=10, samples=4)
     assert blocks._carried(case, 1 / 2e4, 2, 8)
-    rows = blocks.Blocks(25000, 64, 64)
+    rows = blocks.AxisBlocks(25000, 64, 64)
     x, y = case.pillars_um[1][::2500], rows.middles_um(0.4)[[0, 40, -1], None, None]
     half = 63 / 2 * 0.4
     got = rows.along[:, None] ** np.arange(9) @ blocks._powers(
@@ -161,7 +165,7 @@ def test_rounding_of_long_paths_keeps_no_block_from_being_used():
         * np.pi
     )
     assert 2 * np.pi * 4.5e-13 < np.abs(error).max() < 2 * np.pi * 12 * 4.5e-13
-    made = blocks.Carrier(case, 1 / 2e4, rows, 512).rounding_rad
+    made = blocks.ReferencePhase(case, 1 / 2e4, rows, 512).rounding_rad
     assert made / 8 < error.std() < made
 
 
@@ -193,8 +197,8 @@ def test_the_rounding_of_a_carrier_is_that_of_its_longest_path(
         - np.hypot(d, np.hypot(*centre_um))
     )
     want = 2 * np.pi * 5e-16 * np.abs(path).max() / 0.85
-    made = blocks.Carrier(
-        case, 1 / 777.0, blocks.Blocks(shape[0], 16, 16), 512
+    made = blocks.ReferencePhase(
+        case, 1 / 777.0, blocks.AxisBlocks(shape[0], 16, 16), 512
     ).rounding_rad
     assert made == pytest.approx(
         want, rel=0.02, abs=0
@@ -206,11 +210,11 @@ def test_both_corners_of_a_window_need_a_plan(monkeypatch):
         asked = []
 
         def plan(one, tolerance, missing=missing, asked=asked):
-            rows = choice.windows(CASE, 1)
+            rows = choice.split_window(CASE, 1)
             asked.append(one)
             whole = one.samples == CASE.samples
             corner = (
-                choice.windows(CASE, 2)[missing[0]][missing[1]]
+                choice.split_window(CASE, 2)[missing[0]][missing[1]]
                 if not whole
                 else rows[0][0]
             )

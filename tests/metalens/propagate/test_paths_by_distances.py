@@ -32,8 +32,8 @@ PLACES = [
 @pytest.fixture(scope="module")
 def cases():
     return {
-        "air": propagate.case((40, 34), **GIVEN),
-        "films": propagate.case((40, 34), **GIVEN, layers=FILMS),
+        "air": propagate.make_case((40, 34), **GIVEN),
+        "films": propagate.make_case((40, 34), **GIVEN, layers=FILMS),
     }
 
 
@@ -76,7 +76,7 @@ def test_paths_to_the_sensor_are_those_of_single_rays(cases, kind):
             other, abs=1e-9
         )
         there = ray(stack, math.hypot(x - cx - X, y - cy - Y))[1]
-        assert paths.beyond(case, x, y, X, Y)[1] == pytest.approx(
+        assert paths.ray_to_offset(case, x, y, X, Y)[1] == pytest.approx(
             there - middle, abs=1e-9
         )
 
@@ -90,14 +90,16 @@ def test_cosines_of_a_ray_and_what_is_left_of_its_plane_wave(cases, kind):
         reach = math.hypot(x - cx, y - cy)
         sine, middle = ray(stack, reach)
         p, q = sine * (x - cx) / reach, sine * (y - cy) / reach
-        assert paths.cosines(case, x - cx, y - cy) == pytest.approx(p, abs=1e-12)
+        assert paths.ray_cosines(case, x - cx, y - cy) == pytest.approx(p, abs=1e-12)
         assert paths.cosine_y(case, p, y) == pytest.approx(q, abs=1e-12)
         there = ray(stack, math.hypot(x - cx - X, y - cy - Y))[1]
-        level, left = paths.residual(case, p, y, X, Y)
+        level, left = paths.residual_path(case, p, y, X, Y)
         assert left == pytest.approx(there - middle + p * X + q * Y, abs=1e-9)
-        assert level == pytest.approx(paths.beyond(case, x, y, X, Y)[0], rel=1e-9)
+        assert level == pytest.approx(
+            paths.ray_to_offset(case, x, y, X, Y)[0], rel=1e-9
+        )
         wave = level * np.exp(1j * case.wavenumber * (there - middle + p * X + q * Y))
-        assert abs(paths.correction(case, p, y, X, Y) - wave) < 1e-7 * abs(
+        assert abs(paths.plane_wave_residual(case, p, y, X, Y) - wave) < 1e-7 * abs(
             wave
         )  # 2 pi 1e-9 / 0.8
 
@@ -150,14 +152,14 @@ def test_the_kernel_is_the_field_of_a_pillar_its_carriers_taken_off(cases):
             want = field(case, x, y, np.array([cx + X, cy + Y, D]), z) * np.exp(
                 -1j * k * carrier
             )
-            got = paths.kernel(case, x, y, X, Y, 1 / z)
+            got = paths.rayleigh_sommerfeld_kernel(case, x, y, X, Y, 1 / z)
             assert abs(got - want) < 1e-8 * abs(want)
     wy, wx = case.half_window_um
     some = paths.over_blocks(case)(
         np.array([PLACES[0][1]]), np.array([PLACES[0][0]])
     ).ravel()
     want = [
-        paths.kernel(case, *PLACES[0][:2], X, Y, v)
+        paths.rayleigh_sommerfeld_kernel(case, *PLACES[0][:2], X, Y, v)
         for X in (-wx, 0, wx) for Y in (-wy, 0, wy) for v in (1 / 2500, 1 / 310)
     ]  # fmt: skip
     assert some == pytest.approx(np.array(want), rel=1e-9)
@@ -171,7 +173,7 @@ def test_slopes_are_those_of_the_logarithm_of_the_field(cases):
     cx, cy = case.centre_um
     for x, y, X, Y in PLACES:
         r_w = math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + D**2)
-        found = paths.slopes(case, (x - cx) / r_w, y, X, Y)
+        found = paths.kernel_derivatives(case, (x - cx) / r_w, y, X, Y)
         at = np.array([cx + X, cy + Y, D])
         for slope, axis in zip(found, (2, 0, 1), strict=True):
             step = h * np.eye(3)[axis]
@@ -244,6 +246,6 @@ def test_what_nodes_are_counted_by_is_the_kernel_along_a_line_at_the_ends_and_th
     for i, (o, X, Y, v) in enumerate(at):
         for j, x in enumerate((-3.1, 2.4)):
             assert columns[i, j] == pytest.approx(
-                complex(paths.kernel(case, x, o, X, Y, v)), rel=1e-9
+                complex(paths.rayleigh_sommerfeld_kernel(case, x, o, X, Y, v)), rel=1e-9
             )
     assert hx > 3.1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens import propagate
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 
 PITCH, WAVELENGTH, D = 0.4, 0.85, 60.0
 K = 2 * np.pi / WAVELENGTH

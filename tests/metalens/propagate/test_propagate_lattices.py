@@ -57,7 +57,7 @@ def summed(phase, level, x, y, at, *, depth=4e3, tangent=0.05):
 
 def test_the_exact_sum_counts_every_site_once_at_its_place():
     phase, level, x, y = lens()
-    case = propagate.case(
+    case = propagate.make_case(
         phase.shape, **GRID, **VIEW, depths_um=4e3, angle_rad=np.arctan(0.05)
     )
     at = np.random.default_rng(1).uniform(-6, 6, (20, 2))

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.ground import legendre
-from metalens.ground.errors import PropagationError
+from metalens.core import legendre
+from metalens.core.errors import PropagationError
 from metalens.propagate import window as windowed
-from metalens.propagate.nodes import layout
+from metalens.propagate.nodes import plan_layout
 from metalens.propagate.operators import depth_basis, depth_factors
 
 WAVELENGTH, PITCH = 0.85, 0.4
@@ -205,8 +205,8 @@ def test_maps_that_are_not_square(shape):
 def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
     geometry = dict(sensor_distance_um=20.0, window_um=30.0, samples=16)
     check(*lens((64, 64), distance=20.0), tolerance=1e-4, **geometry)
-    case = propagate.case((64, 64), **GEOMETRY | geometry)
-    assert layout(case, 1e-4).parts > 1
+    case = propagate.make_case((64, 64), **GEOMETRY | geometry)
+    assert plan_layout(case, 1e-4).parts > 1
 
 
 @pytest.mark.slow
@@ -223,7 +223,7 @@ def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
     oldest go.
     """
     cases = [
-        propagate.case(
+        propagate.make_case(
             (31, 27),
             pitch_um=0.4,
             wavelength_um=0.85,
@@ -236,17 +236,17 @@ def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
         for i in range(21)
     ]
     about = 1e-3, torch.float32, torch.device("cpu")
-    first = [windowed.plan(one, *about) for one in cases]
+    first = [windowed.plan_window(one, *about) for one in cases]
     assert all(
-        windowed.plan(one, *about) is kept
+        windowed.plan_window(one, *about) is kept
         for one, kept in zip(cases, first, strict=True)
     )
     assert all(one.bytes > sum(t.nbytes for t in one.tensors.values()) for one in first)
     monkeypatch.setattr(windowed, "KEPT_BYTES", 3.5 * max(one.bytes for one in first))
-    newer = windowed.plan(cases[0], 2e-3, *about[1:])
-    assert windowed.plan(cases[0], 2e-3, *about[1:]) is newer
-    assert windowed.plan(cases[20], *about) is first[20]
-    assert windowed.plan(cases[5], *about) is not first[5]
+    newer = windowed.plan_window(cases[0], 2e-3, *about[1:])
+    assert windowed.plan_window(cases[0], 2e-3, *about[1:]) is newer
+    assert windowed.plan_window(cases[20], *about) is first[20]
+    assert windowed.plan_window(cases[5], *about) is not first[5]
 
 
 def test_energy_is_kept_in_a_large_window():
@@ -315,14 +315,14 @@ def score(phase, level, **geometry):
 
 def test_gradcheck_of_the_moments_and_of_the_window():
     from metalens.propagate.paths import over_blocks
-    from metalens.propagate.pillars import moments, reduce
-    from metalens.propagate.window import plan, polynomials, zoom
+    from metalens.propagate.pillars import plan_moments, reduce_to_moments
+    from metalens.propagate.window import legendre_bases, plan_window, zoom_to_tiles
 
-    case = propagate.case((9, 70), **GEOMETRY | dict(samples=3))
-    made = moments(
+    case = propagate.make_case((9, 70), **GEOMETRY | dict(samples=3))
+    made = plan_moments(
         case,
         1e-3,
-        polynomials(case, (3, 4)),
+        legendre_bases(case, (3, 4)),
         over_blocks(case),
         tolerance=1e-9,
         dtype=torch.float64,
@@ -332,15 +332,15 @@ def test_gradcheck_of_the_moments_and_of_the_window():
     )  # light is moved to fewer nodes than pillars
     maps = [torch.tensor(m).requires_grad_() for m in lens((9, 70), kind="noisy")]
     assert torch.autograd.gradcheck(
-        lambda p, t: torch.view_as_real(reduce(p, t, made)[0]), maps
+        lambda p, t: torch.view_as_real(reduce_to_moments(p, t, made)[0]), maps
     )
-    found = plan(case, 1e-4, torch.float64, torch.device("cpu"))
+    found = plan_window(case, 1e-4, torch.float64, torch.device("cpu"))
     count = found.tensors["turn"].shape[0]
     light = torch.randn(
         count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True
     )
     assert torch.autograd.gradcheck(
-        lambda v: torch.view_as_real(zoom(v, found.tensors)), light
+        lambda v: torch.view_as_real(zoom_to_tiles(v, found.tensors)), light
     )
 
 
@@ -467,16 +467,18 @@ def test_torch_path_for_other_devices_equals_the_compiled_loops(
     the last 16 nodes a block along y and single ones along x, the lower half by another
     thread."""
     from metalens.propagate import pillars
-    from metalens.propagate.window import from_moments, plan
+    from metalens.propagate.window import from_moments, plan_window
 
     monkeypatch.setattr(pillars, "DEVICE_ROWS", 32)
     threads(count)
-    made = plan(
-        propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu")
+    made = plan_window(
+        propagate.make_case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu")
     )
     blocks, case = made.moments, made.case
     places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)
-    at_pillars = [torch.tensor(legendre.values(n, p / h)) for n, p, h in places]
+    at_pillars = [
+        torch.tensor(legendre.legendre_values(n, p / h)) for n, p, h in places
+    ]
     plain = dataclasses.replace(blocks, rows=at_pillars[0], columns=at_pillars[1])
     maps = tuple(torch.tensor(m) for m in lens(shape, kind="noisy"))
     (first, power), (second, same) = (
@@ -500,15 +502,15 @@ def test_torch_path_for_other_devices_equals_the_compiled_loops(
 
 
 def test_choose_takes_the_exact_sum_for_few_pillars_and_says_why():
-    small = propagate.choose(propagate.case((8, 8), **GEOMETRY), 1e-4)
-    large = propagate.choose(propagate.case((600, 600), **GEOMETRY), 1e-4)
+    small = propagate.choose_method(propagate.make_case((8, 8), **GEOMETRY), 1e-4)
+    large = propagate.choose_method(propagate.make_case((600, 600), **GEOMETRY), 1e-4)
     assert small.method == "exact"
     assert "64 pillars" in small.reason
     assert large.method == "windowed"
     assert "nodes" in large.reason
     assert (
-        propagate.choose(
-            propagate.case((8, 8), **GEOMETRY), 1e-4, differentiable=True
+        propagate.choose_method(
+            propagate.make_case((8, 8), **GEOMETRY), 1e-4, differentiable=True
         ).method
         == "windowed"
     )
@@ -525,11 +527,13 @@ def test_many_depths_of_a_fast_lens_are_spanned_by_the_basis():
     """Depths that differ by many turns at the rim need more training fields than the
     first few.
     """
-    many = propagate.case((512, 512), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=200.0, window_um=12.0,
+    many = propagate.make_case((512, 512), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=200.0, window_um=12.0,
                           samples=12, depths_um=np.linspace(120.0, 900.0, 150))  # fmt: skip
-    x = legendre.mapped(64, -102.4, 102.4)
+    x = legendre.mapped_nodes(64, -102.4, 102.4)
     basis = depth_basis(many, (x, x), 1e-5)
-    weight = np.outer(legendre.nodes(64)[1], legendre.nodes(64)[1])
+    weight = np.outer(
+        legendre.gauss_legendre_nodes(64)[1], legendre.gauss_legendre_nodes(64)[1]
+    )
     want = np.exp(
         1j
         * depth_factors(

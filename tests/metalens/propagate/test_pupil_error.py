@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from metalens.ground import legendre
-from metalens.propagate import Case, estimate
-from metalens.propagate.estimate import Sample
+from metalens.core import legendre
+from metalens.propagate import PropagationCase, estimate
+from metalens.propagate.estimate import ErrorSample
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -58,9 +58,12 @@ def sample(case, orders, weight, seed, *, held=True):
     rng = np.random.default_rng(seed)
     shape = (2, *orders) if held else orders
     hy, hx = case.half_size_um
-    places = legendre.nodes(orders[0])[0] * hy, legendre.nodes(orders[1])[0] * hx
+    places = (
+        legendre.gauss_legendre_nodes(orders[0])[0] * hy,
+        legendre.gauss_legendre_nodes(orders[1])[0] * hx,
+    )
     pupils = factors(case)(*places) if held else None
-    return Sample(
+    return ErrorSample(
         case,
         weight,
         rng.normal(size=shape) + 1j * rng.normal(size=shape),

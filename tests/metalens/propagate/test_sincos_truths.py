@@ -11,7 +11,7 @@ import pytest
 from metalens.propagate import sincos
 
 TURNS64, TURNS32 = (
-    getattr(f, "py_func", f) for f in (sincos.turns64, sincos.turns32)
+    getattr(f, "py_func", f) for f in (sincos.sincos_turns64, sincos.sincos_turns32)
 )  # itself where none is compiled
 T = np.concatenate([np.linspace(-0.5, 0.5, 20_001), [1e-9, -3e-5, 0.25, -0.25, 0.125]])
 
@@ -43,10 +43,10 @@ def test_power_series_end_where_double_precision_does():
 
 @numba.njit
 def in_a_loop(t, like):
-    return sincos.turns(t, like)
+    return sincos.sincos_turns(t, like)
 
 
-@pytest.mark.parametrize("turns", [sincos.turns, in_a_loop])
+@pytest.mark.parametrize("turns", [sincos.sincos_turns, in_a_loop])
 def test_the_kind_of_the_array_chooses_the_precision(turns):
     """At a tenth of a turn a polynomial in single precision is some 1e-8 off, one in
     double precision 1e-16.

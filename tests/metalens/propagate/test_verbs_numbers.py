@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from metalens.cell import Film, Index
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Stop
 from metalens.propagate import verbs
 
@@ -23,7 +23,7 @@ WINDOW = {"window_um": (21.0, 33.0), "samples": (7, 11)}
 
 
 def test_every_number_has_its_place():
-    found = verbs.case(
+    found = verbs.make_case(
         (5, 301, 203),
         **PLAIN,
         **WINDOW,
@@ -45,8 +45,10 @@ def test_every_number_has_its_place():
     assert (found.step_um, found.samples) == (3.0, (11, 7))
     assert (found.row_um, found.site_um2) == (0.37, 0.0)
     assert (found.front, found.behind) == ((), None)
-    assert verbs.case((9, 7), **PLAIN, **WINDOW, site_um2=0.15).site_um2 == 0.15
-    plain = verbs.case((9, 7), **PLAIN | {"depths_um": 4e3}, **WINDOW, angle_rad=0.3)
+    assert verbs.make_case((9, 7), **PLAIN, **WINDOW, site_um2=0.15).site_um2 == 0.15
+    plain = verbs.make_case(
+        (9, 7), **PLAIN | {"depths_um": 4e3}, **WINDOW, angle_rad=0.3
+    )
     assert plain.inverse_depths_per_um == (1 / 4e3,)
     assert plain.tangents == pytest.approx((math.tan(0.3), 0.0))
     assert plain.centre_um == pytest.approx((900 * math.tan(0.3), 0.0))
@@ -73,10 +75,10 @@ def test_windows_are_numbers_or_pairs_of_square_cells():
     "wrong", [math.pi / 2, -math.pi / 2, (0.1, math.nan), (0.1, 0.2, 0.3), [[0.1, 0.2]]]
 )
 def test_an_angle_is_one_or_two_below_a_right_one(wrong):
-    assert verbs.angles((0.3, -1.57)) == (0.3, -1.57)
-    assert verbs.angles(-0.4) == (-0.4, 0.0)
+    assert verbs.to_angle_pair((0.3, -1.57)) == (0.3, -1.57)
+    assert verbs.to_angle_pair(-0.4) == (-0.4, 0.0)
     with pytest.raises(PropagationError, match="need one angle or a pair"):
-        verbs.angles(wrong)
+        verbs.to_angle_pair(wrong)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,9 @@ def test_an_angle_is_one_or_two_below_a_right_one(wrong):
 )
 def test_depths_below_0_and_odd_offsets_are_refused(depths, offset, told):
     with pytest.raises(PropagationError, match=told):
-        verbs.case((9, 7), **PLAIN | {"depths_um": depths}, **WINDOW, offset_um=offset)
+        verbs.make_case(
+            (9, 7), **PLAIN | {"depths_um": depths}, **WINDOW, offset_um=offset
+        )
 
 
 FILMS = Layers(
@@ -107,7 +111,7 @@ def snell(tangent, gap=480.0, films=((2.1, 300.0), (1.4, 120.0))):
 
 
 def test_the_chief_ray_goes_through_films_by_snell():
-    found = verbs.case(
+    found = verbs.make_case(
         (9, 7),
         **PLAIN,
         **WINDOW,
@@ -121,7 +125,9 @@ def test_the_chief_ray_goes_through_films_by_snell():
         (480.0, 300.0, 120.0),
     )
     assert found.centre_um == pytest.approx((snell(math.tan(0.4)) + 2, -3.0))
-    aside = verbs.case((9, 7), **PLAIN, **WINDOW, angle_rad=(-0.3, 0.25), layers=FILMS)
+    aside = verbs.make_case(
+        (9, 7), **PLAIN, **WINDOW, angle_rad=(-0.3, 0.25), layers=FILMS
+    )
     x, y = math.tan(-0.3), math.tan(0.25)
     way = snell(math.hypot(x, y)) / math.hypot(x, y)
     assert aside.centre_um == pytest.approx((way * x, way * y))
@@ -129,22 +135,26 @@ def test_the_chief_ray_goes_through_films_by_snell():
 
 def test_the_chief_rays_place_grows_with_the_gap_alone():
     """d place / d distance is the tangent in the gap, whatever films follow."""
-    behind = verbs.case((9, 7), **PLAIN, **WINDOW, layers=FILMS).behind
+    behind = verbs.make_case((9, 7), **PLAIN, **WINDOW, layers=FILMS).behind
     distance = torch.tensor(900.0, dtype=torch.float64, requires_grad=True)
     for axis, slope in ((0, 0.5), (1, -0.2)):
-        place = verbs.chief(behind, distance, (0.5, -0.2), axis)
+        place = verbs.chief_ray_offset(behind, distance, (0.5, -0.2), axis)
         way = snell(math.hypot(0.5, 0.2)) / math.hypot(0.5, 0.2)
         assert float(place.detach()) == pytest.approx(way * slope)
         assert float(torch.autograd.grad(place, distance)[0]) == pytest.approx(slope)
-        assert verbs.chief(None, 900.0, (0.5, -0.2), axis) == pytest.approx(900 * slope)
+        assert verbs.chief_ray_offset(None, 900.0, (0.5, -0.2), axis) == pytest.approx(
+            900 * slope
+        )
 
 
 def test_films_of_no_thickness_count_for_nothing_and_a_stop_is_refused():
     empty = Layers(front=(Film(Index(1.5), 0.0),))
-    assert verbs.around(empty, 900.0, 0.83)["front"] == ()
-    assert verbs.case((9, 7), **PLAIN, **WINDOW, layers=Layers()).behind is None
+    assert verbs.film_settings(empty, 900.0, 0.83)["front"] == ()
+    assert verbs.make_case((9, 7), **PLAIN, **WINDOW, layers=Layers()).behind is None
     with pytest.raises(PropagationError, match="a stop is no part"):
-        verbs.case((9, 7), **PLAIN, **WINDOW, layers=Layers(stop=Stop(100.0, 50.0)))
+        verbs.make_case(
+            (9, 7), **PLAIN, **WINDOW, layers=Layers(stop=Stop(100.0, 50.0))
+        )
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -157,7 +167,7 @@ def test_films_that_fill_the_gap_let_through_what_their_face_does(along, sign):
     full = Layers(behind=(Film(Index(2.0), 30.0),))
     given = {"pitch_um": 0.5, "wavelength_um": 0.83, "sensor_distance_um": 30.0, "depths_um": math.inf,
              "window_um": (4.0, 2.4), "samples": (5, 3), "layers": full}  # fmt: skip
-    bare = verbs.case((20, 12), **given)
+    bare = verbs.make_case((20, 12), **given)
     (high, wide), (down, across) = bare.half_size_um, bare.half_window_um
     turn = np.linspace(0, math.pi / 2, 4001)
 
@@ -178,12 +188,12 @@ def test_films_that_fill_the_gap_let_through_what_their_face_does(along, sign):
         offset = [0.0, 0.0]
         offset[along] = sign * (off + beside)
         if passes:
-            verbs.case((20, 12), **given, offset_um=tuple(offset))
+            verbs.make_case((20, 12), **given, offset_um=tuple(offset))
         else:
             with pytest.raises(
                 PropagationError, match="do not leave the cover of index 1"
             ):
-                verbs.case((20, 12), **given, offset_um=tuple(offset))
+                verbs.make_case((20, 12), **given, offset_um=tuple(offset))
 
 
 GEOMETRY = {"pitch_um": 0.5, "wavelength_um": 0.7, "sensor_distance_um": 31.0, "depths_um": (95.0, math.inf),

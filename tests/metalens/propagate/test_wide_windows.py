@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import Media
 from metalens.propagate import grids, wide
 
@@ -64,7 +64,7 @@ def test_against_the_exact_sum_where_it_is_bright_and_in_the_corners(
     angle, tolerance, corner
 ):
     phase, level = lens()
-    case = propagate.case(phase.shape, **ABOUT, **WINDOW, angle_rad=angle)
+    case = propagate.make_case(phase.shape, **ABOUT, **WINDOW, angle_rad=angle)
     made = propagate.plan_wide(case, tolerance / 2, torch.float64, torch.device("cpu"))
     light = propagate.light_wide(
         (torch.tensor(phase)[None], torch.tensor(level)[None]), made
@@ -91,7 +91,7 @@ def test_through_films_it_is_the_windowed_field_of_the_same_window():
     phase, level = (torch.tensor(m) for m in lens())
     films = Media((1.0, 1.52, 1.45), (DISTANCE - 85.0, 60.0, 25.0))
     case = dataclasses.replace(
-        propagate.case(lens()[0].shape, **ABOUT, **WINDOW), behind=films
+        propagate.make_case(lens()[0].shape, **ABOUT, **WINDOW), behind=films
     )
     light = propagate.light_wide(
         (phase[None], level[None]),
@@ -101,7 +101,7 @@ def test_through_films_it_is_the_windowed_field_of_the_same_window():
         case, samples=(21, 21)
     )  # of the middle, both counts odd
     field = propagate.field_windowed(
-        phase, level, propagate.plan(small, 1e-6, torch.float64, phase.device)
+        phase, level, propagate.plan_window(small, 1e-6, torch.float64, phase.device)
     )[0]
     want = field.abs() ** 2
     got = light[:, 95 - 10 : 95 + 11, 100 - 10 : 100 + 11]
@@ -133,7 +133,7 @@ def test_the_stack_takes_it_and_says_what_it_errs():
 
 def test_gradients_are_those_of_differences():
     phase, level = (torch.tensor(m) for m in lens())
-    case = propagate.case(tuple(phase.shape), **ABOUT, **WINDOW)
+    case = propagate.make_case(tuple(phase.shape), **ABOUT, **WINDOW)
     made = propagate.plan_wide(case, 1e-6, torch.float64, phase.device)
     draw = torch.Generator().manual_seed(3)
     weight = torch.rand(3, 191, 201, generator=draw, dtype=torch.float64)
@@ -159,7 +159,9 @@ def test_dark_corners_of_the_lens_take_fewer_fields_and_change_no_light():
     phase, level = (torch.tensor(m) for m in lens())
     depths = 1 / np.linspace(1 / 7700.0, 1 / 1900.0, 17)
     made = propagate.plan_wide(
-        propagate.case(tuple(phase.shape), **ABOUT | {"depths_um": depths}, **WINDOW),
+        propagate.make_case(
+            tuple(phase.shape), **ABOUT | {"depths_um": depths}, **WINDOW
+        ),
         1e-4,
         torch.float64,
         phase.device,
@@ -178,17 +180,20 @@ def test_dark_corners_of_the_lens_take_fewer_fields_and_change_no_light():
 
 
 def test_narrow_windows_small_lenses_and_moving_geometry_go_the_other_way():
-    whole = propagate.case((610, 610), **ABOUT, **WINDOW)
-    assert propagate.choose(whole, 1e-4, differentiable=True).method == "wide"
+    whole = propagate.make_case((610, 610), **ABOUT, **WINDOW)
+    assert propagate.choose_method(whole, 1e-4, differentiable=True).method == "wide"
     assert (
-        propagate.choose(whole, 1e-4, differentiable=True, moving=True).method != "wide"
+        propagate.choose_method(whole, 1e-4, differentiable=True, moving=True).method
+        != "wide"
     )
-    narrow = propagate.case((610, 610), **ABOUT, window_um=31.0, samples=40)
-    assert propagate.choose(narrow, 1e-4).method == "windowed"
-    assert not grids.is_wide(propagate.case((90, 90), **ABOUT, **WINDOW), 1e-4)
+    narrow = propagate.make_case((610, 610), **ABOUT, window_um=31.0, samples=40)
+    assert propagate.choose_method(narrow, 1e-4).method == "windowed"
+    assert not grids.is_wide(propagate.make_case((90, 90), **ABOUT, **WINDOW), 1e-4)
 
 
 def test_rays_that_graze_are_refused():
-    steep = propagate.case((610, 610), **ABOUT | {"sensor_distance_um": 40.0}, **WINDOW)
+    steep = propagate.make_case(
+        (610, 610), **ABOUT | {"sensor_distance_um": 40.0}, **WINDOW
+    )
     with pytest.raises(PropagationError, match="too steep"):
         propagate.plan_wide(steep, 1e-4, torch.float64, torch.device("cpu"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.lens import Neighbours
+from metalens.lens import NeighbourRows
 from metalens.psf import among
 
 PITCH, WAVE = 0.37, 0.83
@@ -19,7 +19,7 @@ ALONG, ACROSS, ASIDE = (
 )  # C - 1 for a sine of 1; of the diagonal, on either field
 # two rows of one sine: all that is told is in proportion to it, for amplitudes over the
 # field's share
-ROWS = Neighbours(
+ROWS = NeighbourRows(
     np.array([0.4, 0.2, 0.4, 0.2]),
     np.array([False, False, True, True]),
     np.array(
@@ -66,7 +66,7 @@ def paired(light, i, j, along):
 
 def test_slopes_are_the_mean_turn_of_the_pairs_of_five_by_five_pillars():
     light = drawn((8, 11))
-    found = among.slopes(torch.from_numpy(light), PITCH)
+    found = among.phase_slopes(torch.from_numpy(light), PITCH)
     for got, along in zip(found, "xy", strict=True):
         want = [
             [paired(light, i, j, along) / PITCH for j in range(11)] for i in range(8)
@@ -79,18 +79,18 @@ def test_a_single_row_has_no_slope_across_it_and_dark_pillars_none_at_all():
         torch.ones(1, 9, dtype=torch.float64),
         0.31 * torch.arange(9.0, dtype=torch.float64)[None],
     )
-    across, down = among.slopes(light, PITCH)
+    across, down = among.phase_slopes(light, PITCH)
     assert across.numpy() == pytest.approx(np.full((1, 9), 0.31 / PITCH), rel=1e-12)
     assert not down.any()
-    across, down = among.slopes(light.T, PITCH)
+    across, down = among.phase_slopes(light.T, PITCH)
     assert down.numpy() == pytest.approx(np.full((9, 1), 0.31 / PITCH), rel=1e-12)
     assert not across.any()
     two = torch.from_numpy(np.exp(1j * np.array([[0.0, 0.4], [-0.3, 0.1]])))
-    across, down = among.slopes(two, PITCH)
+    across, down = among.phase_slopes(two, PITCH)
     assert across.numpy() == pytest.approx(np.full((2, 2), 0.4 / PITCH), rel=1e-12)
     assert down.numpy() == pytest.approx(np.full((2, 2), -0.3 / PITCH), rel=1e-12)
     assert not torch.stack(
-        among.slopes(torch.zeros(5, 6, dtype=torch.complex128), PITCH)
+        among.phase_slopes(torch.zeros(5, 6, dtype=torch.complex128), PITCH)
     ).any()
 
 
@@ -117,17 +117,17 @@ def test_both_fields_take_their_factors_along_and_across_the_slope(sx, sy):
         torch.full((7, 9), 0.6, dtype=torch.float64),
     )
     want = factors(sx, sy)
-    got = among.jones(phase, level, ROWS, PITCH)
+    got = among.apply_jones_coupling(phase, level, ROWS, PITCH)
     for part, at in ((got.xx, (0, 0)), (got.yy, (1, 1)), (got.xy, (0, 1))):
         assert part.numpy() == pytest.approx(
             np.full((7, 9), want[at]), rel=1e-11, abs=1e-11
         )
     mean = np.trace(want) / 2
     light = torch.polar(level, phase)
-    assert among.mean(light, ROWS, PITCH).numpy() == pytest.approx(
+    assert among.mean_coupling(light, ROWS, PITCH).numpy() == pytest.approx(
         np.full((7, 9), mean), rel=1e-11
     )
-    turned, weaker = among.scalar(phase, level, ROWS, PITCH)
+    turned, weaker = among.apply_scalar_coupling(phase, level, ROWS, PITCH)
     assert (turned - phase).numpy() == pytest.approx(
         np.full((7, 9), np.angle(mean)), rel=1e-10
     )
@@ -139,21 +139,25 @@ def test_rows_that_are_taken_together_make_no_difference(monkeypatch, rows):
     light = torch.from_numpy(drawn((9, 7), dark=0.0))
     phase, level = torch.angle(light), light.abs()
     mean, fields = (
-        among.mean(light, ROWS, PITCH),
-        among.jones(phase, level, ROWS, PITCH),
+        among.mean_coupling(light, ROWS, PITCH),
+        among.apply_jones_coupling(phase, level, ROWS, PITCH),
     )
     monkeypatch.setattr(among, "ROWS", rows)
-    assert among.mean(light, ROWS, PITCH).numpy() == pytest.approx(
+    assert among.mean_coupling(light, ROWS, PITCH).numpy() == pytest.approx(
         mean.numpy(), rel=1e-12
     )
-    for got, want in zip(among.jones(phase, level, ROWS, PITCH), fields, strict=True):
+    for got, want in zip(
+        among.apply_jones_coupling(phase, level, ROWS, PITCH), fields, strict=True
+    ):
         assert got.numpy() == pytest.approx(want.numpy(), rel=1e-12, abs=1e-13)
 
 
 @pytest.mark.parametrize(("slope", "flat"), [(0.9e-4, True), (1.1e-4, False)])
 def test_a_slope_below_a_ten_thousandth_of_a_radian_a_micron_turns_nothing(slope, flat):
     phase = torch.from_numpy(slope * PITCH * np.indices((6, 7))[1])
-    got = among.jones(phase, torch.ones(6, 7, dtype=torch.float64), ROWS, PITCH)
+    got = among.apply_jones_coupling(
+        phase, torch.ones(6, 7, dtype=torch.float64), ROWS, PITCH
+    )
     sine = 0.0 if flat else slope * WAVE / (2 * math.pi)
     assert (got.xx - 1).numpy() == pytest.approx(
         np.full((6, 7), sine * ALONG), rel=1e-6, abs=1e-14

@@ -13,11 +13,11 @@ from scipy.special import fresnel
 
 from metalens import propagate
 from metalens.cell import Cell, Film, Index
+from metalens.core.errors import ConfigError, PropagationError
 from metalens.design import Focus
 from metalens.field import Optics, SmoothWave, Window
 from metalens.field.points import psfs
-from metalens.ground.errors import ConfigError, PropagationError
-from metalens.lens import DiameterMap, Layers, Lens, Pairs, Stop, media
+from metalens.lens import DiameterMap, Layers, Lens, Stop, TwoSizeTable, media
 from metalens.psf import Extent, View, blur_um, from_lens, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
@@ -228,7 +228,7 @@ def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(
         PITCH,
         length_um=np.where(there, axis[sizes[1]], 0.0),
     )
-    pairs = Pairs(np.array([WAVE]), axis, axis, table, (SENSOR, math.inf))
+    pairs = TwoSizeTable(np.array([WAVE]), axis, axis, table, (SENSOR, math.inf))
     hole = (24.0, 90.0, (7.0, -11.0))
     layers = Layers(front=(Film(Index(GLASS), hole[1]),), stop=Stop(*hole))
     lens = Lens(
@@ -596,7 +596,7 @@ def test_stops_that_cannot_be_are_refused_by_name() -> None:
     with pytest.raises(PropagationError, match="behind the stop"):
         psf_stack(PHASE, LEVEL, depths_um=[80.0], layers=LAYERS, **about)
     with pytest.raises(PropagationError, match=r"put Layers\.lit onto"):
-        propagate.case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
+        propagate.make_case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
     moving = torch.tensor(400.0, requires_grad=True)
     with pytest.raises(PropagationError, match="no derivatives in the geometry"):
         psf_stack(

@@ -67,7 +67,7 @@ def test_the_error_of_an_exact_sum_beside_the_light_is_told(distance, offset, tu
         angle_rad=(0.2, -0.11),
     )
     about |= dict(window_um=4 * WAVE, samples=4, offset_um=offset)
-    case = propagate.case((67, 61), **about)
+    case = propagate.make_case((67, 61), **about)
     y, x = case.pillars_um
     level = (np.hypot(x, y[:, None]) < 13.0) * np.random.default_rng(5).uniform(
         0.5, 1, (67, 61)

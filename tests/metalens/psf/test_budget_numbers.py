@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
-from metalens.lens import Neighbours
+from metalens.lens import NeighbourRows
 from metalens.psf import budget
 from metalens.psf.budget import Budget
 
@@ -36,7 +36,7 @@ def test_terms_add_as_squares_and_unknown_ones_not_at_all():
 
 
 def test_the_worst_budget_takes_the_largest_of_every_term():
-    made = budget.worst(
+    made = budget.worst_of_budgets(
         [
             Budget(0.2, 0.01, angle=0.5),
             Budget(0.1, 0.04, 0.3, glass=0.2),
@@ -172,7 +172,7 @@ def test_light_unlike_that_of_the_rows_has_its_own_terms_with_the_factor_of_unli
     from the side (2.5 sin² of it) and, for each wavelength, a factor that goes with the
     sine in place of the zones."""
     aperture, factor = 0.5, np.full((2, 1), 0.8 + 0.1j)
-    known = Neighbours(
+    known = NeighbourRows(
         np.array([0.6]), np.zeros(1, bool), factor, factor, np.zeros(1), 0.85
     )
     radius = np.linspace(0, 30 / aperture, 240)
@@ -219,7 +219,7 @@ def test_the_scalar_leaves_out_that_fields_along_and_across_the_slope_are_told_a
     absence counts beside it."""
     aperture = 0.5
     factor = np.array([[0.8 + 0.1j, 0.85 - 0.2j], [1.5 - 0.5j, 1.3 + 0.4j]])
-    known = Neighbours(
+    known = NeighbourRows(
         np.array([0.6, 0.55]),
         np.array([False, True]),
         factor,
@@ -270,7 +270,7 @@ def test_light_that_neighbours_scatter_meets_the_focus_in_any_phase():
     lens: its beat with the PSF.
     """
     aperture, lit, step, factor = 0.4, 900.0, 0.2, 0.9
-    known = Neighbours(
+    known = NeighbourRows(
         np.array([0.5]),
         np.zeros(1, bool),
         *2 * [np.full((2, 1), factor + 0j)],
@@ -393,7 +393,7 @@ def test_of_rows_left_out_the_one_that_matters_most_counts():
     factor = np.array(
         [[0.8 + 0.1j, 0.85 - 0.2j, 0.7 + 0.3j], [0.9 - 0.1j, 0.75 + 0.2j, 0.8 - 0.3j]]
     )
-    known = Neighbours(
+    known = NeighbourRows(
         np.array([0.3, 0.45, 0.6]), np.zeros(3, bool), factor, factor, np.zeros(3), 0.85
     )
     radius, mean = airy(aperture, known.mean)
@@ -419,7 +419,7 @@ def test_of_rows_left_out_the_one_that_matters_most_counts():
 
 
 def test_words_of_what_is_left_out_say_whose_numbers_they_are():
-    rows = Neighbours(
+    rows = NeighbourRows(
         np.array([0.3, 0.6]),
         np.zeros(2, bool),
         *2 * [np.ones((2, 2), complex)],

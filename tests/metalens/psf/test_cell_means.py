@@ -9,9 +9,16 @@ import pytest
 import torch
 
 from metalens import propagate
-from metalens.psf.cells import BORDER, FINER, Cells, cells, integrated, nyquist_um
+from metalens.psf.cells import (
+    BORDER,
+    FINER,
+    PixelCells,
+    integrate_cells,
+    nyquist_um,
+    plan_pixel_cells,
+)
 
-CASE = propagate.case((60, 60), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=30.0, depths_um=[np.inf],
+CASE = propagate.make_case((60, 60), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=30.0, depths_um=[np.inf],
                       window_um=30.0, samples=12)  # fmt: skip
 
 
@@ -20,7 +27,7 @@ def test_what_is_left_of_the_shortest_wave_is_told(finer):
     """cos(2 pi f x) along x and along y at f = B: the mean over a cell, sinc(pi f w),
     against what is made of it.
     """
-    fine = cells(CASE, finer)
+    fine = plan_pixel_cells(CASE, finer)
     wide = 12 * fine.points
     at = (
         np.arange(wide + 2 * BORDER) - (wide + 2 * BORDER - 1) / 2
@@ -31,7 +38,7 @@ def test_what_is_left_of_the_shortest_wave_is_told(finer):
         wave, mean = (np.cos(2 * np.pi * band * a + phase) for a in (at, middle))
         light = torch.from_numpy(3 + wave[None, :] + wave[:, None] * 0.5)
         shrunk = np.sinc(band * CASE.step_um) * mean
-        got, error = integrated(light[None], fine)
+        got, error = integrate_cells(light[None], fine)
         want = 3 + shrunk[None, :] + 0.5 * shrunk[:, None]
         true = np.linalg.norm(got[0].numpy() - want) / np.linalg.norm(want)
         assert (
@@ -44,7 +51,7 @@ def test_the_second_correction_vouches_where_the_fourth_is_nothing(along):
     """Of a parabola, which means meet exactly: 1/12 of its bend is put on, of which the
     estimate takes its shares.
     """
-    fine = Cells(3, CASE, (0.11, 0.23))
+    fine = PixelCells(3, CASE, (0.11, 0.23))
     at = np.arange(12 + 2 * BORDER) - 5.5 - BORDER
     y, x = (
         (at[:, None], at)
@@ -53,7 +60,9 @@ def test_the_second_correction_vouches_where_the_fourth_is_nothing(along):
         if along == "x"
         else (at[:, None], 0 * at)
     )
-    got, error = integrated(torch.from_numpy(40 + 0.7 * x**2 + 0.4 * y**2)[None], fine)
+    got, error = integrate_cells(
+        torch.from_numpy(40 + 0.7 * x**2 + 0.4 * y**2)[None], fine
+    )
     bend = (0.7 if along != "y" else 0) / 12 + (0.4 if along != "x" else 0) / 12
     inside = (np.arange(12) - 5.5).reshape(4, 3) ** 2
     means = inside.mean(1)
@@ -78,7 +87,7 @@ def drawn(seed, finer):
     case = replace(
         CASE, samples=(down, across), step_um=nyquist_um(CASE) * draw.uniform(1.1, 6.0)
     )
-    fine, half = cells(case, finer), 1 / (4 * nyquist_um(case))
+    fine, half = plan_pixel_cells(case, finer), 1 / (4 * nyquist_um(case))
     axis = np.linspace(-half, half, 9)
     rays = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     rays = rays[np.hypot(*rays.T) <= half]
@@ -112,7 +121,7 @@ def test_the_error_of_few_cells_holds():
     ratios = []
     for seed in range(60):
         light, want, fine = drawn(seed, FINER[0])
-        got, error = integrated(light, fine)
+        got, error = integrate_cells(light, fine)
         ratios.append(
             np.linalg.norm(got[0].numpy() - want) / np.linalg.norm(want) / error
         )
@@ -125,14 +134,14 @@ def test_cells_of_polynomials_of_fifth_degree_are_exact():
     """x⁴ y and x² y² and x⁵ over cells of three points 0.4 apart: integrals of each
     over the cell by hand.
     """
-    fine = Cells(3, CASE, (0.3, 0.2))
+    fine = PixelCells(3, CASE, (0.3, 0.2))
     at = (np.arange(3 * 4 + 2 * BORDER) - 7.5) * 0.4
     y, x = at[:, None], at[None, :]
     light = torch.from_numpy(90 + x**4 * y + x**2 * y**2 - 0.3 * x**5 + 0 * y)
     ends = (np.arange(5) - 2) * 1.2
     mean = {n: np.diff(ends ** (n + 1)) / (n + 1) / 1.2 for n in (1, 2, 4, 5)}
     want = 90 + np.outer(mean[1], mean[4]) + np.outer(mean[2], mean[2]) - 0.3 * mean[5]
-    got, error = integrated(light[None], fine)
+    got, error = integrate_cells(light[None], fine)
     assert got[0].numpy() == pytest.approx(want, rel=1e-12)
     assert error > 0
-    assert integrated(0 * light[None], fine)[1] == 0
+    assert integrate_cells(0 * light[None], fine)[1] == 0

@@ -59,10 +59,10 @@ def test_sums_have_what_cells_leave_of_the_tolerance(monkeypatch):
     """Errors add as squares: √(1 - 1/4) of it; all of it where samples are close
     enough, or are asked for.
     """
-    asked, plain = [], direction.intensity
+    asked, plain = [], direction.compute_intensity
     monkeypatch.setattr(
         direction,
-        "intensity",
+        "compute_intensity",
         lambda *a, **k: asked.append(k["tolerance"]) or plain(*a, **k),
     )
     stack(8e-3)

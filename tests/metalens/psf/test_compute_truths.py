@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.propagate import SHARE, Case
+from metalens.propagate import SHARE, PropagationCase
 from metalens.psf import compute
-from metalens.psf.compute import Result
+from metalens.psf.compute import IntensityResult
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -26,7 +26,7 @@ CASE = Case(
     (9, 11),
 )
 SIMPLE = SimpleNamespace(carrier=SimpleNamespace(rounding_rad=0.0))
-OTHER = Case(
+OTHER = PropagationCase(
     (30, 41),
     0.37,
     0.79,
@@ -56,7 +56,7 @@ def scripted(monkeypatch, *results):
     def windowed(lit, dtype, tolerance, moving):
         asked.append((dtype, tolerance))
         error, bright = left.pop(0)
-        return Result(
+        return IntensityResult(
             torch.ones(2, 9, 11, dtype=torch.float64),
             error,
             "typed",
@@ -66,7 +66,9 @@ def scripted(monkeypatch, *results):
 
     monkeypatch.setattr(compute, "_windowed", windowed)
     monkeypatch.setattr(
-        compute, "choose", lambda *given, **more: SimpleNamespace(method="windowed")
+        compute,
+        "choose_method",
+        lambda *given, **more: SimpleNamespace(method="windowed"),
     )
     return asked
 
@@ -75,7 +77,9 @@ SINGLE, DOUBLE = torch.float32, torch.float64
 
 
 def run(dtype=SINGLE, tolerance=1e-3, case=CASE, **more):
-    return compute.intensity(*maps(dtype), [case], [1.0], tolerance=tolerance, **more)
+    return compute.compute_intensity(
+        *maps(dtype), [case], [1.0], tolerance=tolerance, **more
+    )
 
 
 def test_one_try_at_half_the_tolerance_adds_what_sums_and_results_round(monkeypatch):
@@ -104,7 +108,7 @@ def test_what_single_precision_cannot_hold_is_summed_in_double(monkeypatch):
         monkeypatch, (1e-4, 500.0)
     )  # 7 x 9 samples have no mean rounding, 8 x 8 have
     run(
-        case=Case(
+        case=PropagationCase(
             (30, 41),
             0.37,
             0.85,
@@ -119,7 +123,7 @@ def test_what_single_precision_cannot_hold_is_summed_in_double(monkeypatch):
     assert few == [(DOUBLE, 5e-4)]
     enough = scripted(monkeypatch, (1e-4, 500.0))
     run(
-        case=Case(
+        case=PropagationCase(
             (30, 41),
             0.37,
             0.85,
@@ -163,7 +167,7 @@ def test_gradients_ask_for_tighter_settings(monkeypatch):
     for tolerance, want in ((1e-3, 1e-3 / 32), (2e-5, 1e-6), (4e-6, 5e-7)):
         asked = scripted(monkeypatch, (0.0, 500.0))
         phase, level = maps(SINGLE)
-        compute.intensity(
+        compute.compute_intensity(
             phase.requires_grad_(), level, [CASE], [1.0], tolerance=tolerance
         )
         assert asked == [(SINGLE, pytest.approx(want))]
@@ -207,7 +211,9 @@ def test_exact_sums_add_wavelengths_by_their_weights():
         for p, t, case in zip(phase.numpy(), level.numpy(), (CASE, OTHER), strict=True)
     ]
     want, squares = 0.7 * each[0] + 0.4 * each[1], (level**2).sum((1, 2))
-    double = compute.intensity(phase, level, [CASE, OTHER], [0.7, 0.4], tolerance=1e-3)
+    double = compute.compute_intensity(
+        phase, level, [CASE, OTHER], [0.7, 0.4], tolerance=1e-3
+    )
     assert double.intensity.numpy() == pytest.approx(
         want, rel=1e-9, abs=1e-12 * want.max()
     )  # 7000 rad in float64
@@ -216,7 +222,7 @@ def test_exact_sums_add_wavelengths_by_their_weights():
     )
     assert double.error == pytest.approx(4e-12, rel=1e-3)
     assert double.reason.startswith("exact sum: 1,230 pillars at 99 points")
-    single = compute.intensity(
+    single = compute.compute_intensity(
         *maps(SINGLE, 2), [CASE, OTHER], [0.7, 0.4], tolerance=1e-3
     )
     assert single.error == pytest.approx(1e-7)
@@ -242,7 +248,7 @@ def test_an_estimate_looks_at_few_of_the_samples_of_windows_above_a_size(monkeyp
     error = {}
     for many in (98, 99):
         monkeypatch.setattr(compute, "MANY", many)
-        found = compute.intensity(
+        found = compute.compute_intensity(
             phase.requires_grad_(), level, [CASE], [1.0], tolerance=4e-3
         )  # not by the exact sum
         assert found.reason.startswith("windowed")
@@ -253,7 +259,7 @@ def test_an_estimate_looks_at_few_of_the_samples_of_windows_above_a_size(monkeyp
 
 
 def test_few_of_many_samples_may_miss_half_as_much_again_and_a_part_of_the_setting():
-    found = compute._few_seen(Result(torch.ones(1), 3e-4, "typed", 1.0), 8e-3)
+    found = compute._few_seen(IntensityResult(torch.ones(1), 3e-4, "typed", 1.0), 8e-3)
     assert found.error == pytest.approx(math.hypot(1.5 * 3e-4, 0.02 * 8e-3), rel=1e-12)
 
 
@@ -287,7 +293,10 @@ def test_a_wide_window_tells_noise_brightness_and_transforms(monkeypatch):
     )
     choice = SimpleNamespace(method="wide", reason="typed")
     found = compute._wide(
-        compute.Lit(*maps(SINGLE, 2), [CASE, OTHER], [0.7, 0.4]), SINGLE, 8e-3, choice
+        compute.IntensityRequest(*maps(SINGLE, 2), [CASE, OTHER], [0.7, 0.4]),
+        SINGLE,
+        8e-3,
+        choice,
     )
     own = math.hypot(math.hypot(1.5 * 4e-4, 0.02 * 8e-3), 1e-6)
     assert found.error == pytest.approx(own, rel=1e-12)
@@ -335,7 +344,7 @@ def test_an_exact_sum_of_light_that_cancels_is_as_wrong_as_it_says():
     of thousands of radians.
     """
     phase, level = faint()
-    found = compute.intensity(
+    found = compute.compute_intensity(
         torch.from_numpy(phase), torch.from_numpy(level), [CASE], [1.0], tolerance=1e-3
     )
     assert found.reason.startswith("exact sum")
@@ -416,7 +425,10 @@ def test_windows_above_eight_thousand_samples_are_looked_at_in_few(monkeypatch):
             monkeypatch.setattr(compute, "MANY", many)
             found.append(
                 compute._windowed(
-                    compute.Lit(phase, level, [case], [1.0]), SINGLE, 4e-3, None
+                    compute.IntensityRequest(phase, level, [case], [1.0]),
+                    SINGLE,
+                    4e-3,
+                    None,
                 ).error
             )
         assert (found[0] > found[1]) is more

@@ -12,7 +12,7 @@ from scipy import optimize
 
 from metalens.cell import Film, Index
 from metalens.lens import Layers, Media
-from metalens.propagate import Case
+from metalens.propagate import PropagationCase
 from metalens.psf import of_lens, vector
 
 EDGE, DISTANCE, FILM, GLASS, GEL = (
@@ -62,7 +62,7 @@ def test_the_aperture_is_that_of_the_medium_at_the_sensor(angle):
     slope = math.hypot(math.tan(angle[0]), math.tan(angle[1]))
     centre = reach(math.sin(math.atan(slope)))
     want = (sine(centre + EDGE) - sine(centre - EDGE)) / 2
-    assert of_lens.aperture(lens(), angle) == pytest.approx(want, rel=1e-9)
+    assert of_lens.sine_aperture(lens(), angle) == pytest.approx(want, rel=1e-9)
 
 
 def test_obliquity_is_that_of_the_medium_at_the_sensor():
@@ -73,7 +73,7 @@ def test_obliquity_is_that_of_the_medium_at_the_sensor():
         1 / math.sqrt(1 - sine(EDGE * math.sqrt((i + 0.5) / 400)) ** 2)
         for i in range(400)
     ]
-    assert of_lens.uneven(lens(), (0.0, 0.0)) == pytest.approx(
+    assert of_lens.obliquity_variation(lens(), (0.0, 0.0)) == pytest.approx(
         np.std(steep) / np.mean(steep), rel=1e-4
     )
 
@@ -93,7 +93,7 @@ def snell(pairs, far):
 )
 def test_rays_to_the_window_have_the_directions_of_the_last_medium(behind):
     """Straight in one medium, whatever its index; through two by Snell's law."""
-    case = Case(
+    case = PropagationCase(
         (30, 41),
         0.37,
         0.85,
@@ -125,7 +125,7 @@ def test_light_behind_a_face_is_parted_into_s_and_p_by_what_passes():
     """Fresnel's powers of both: their shares of the sum, times the light; halves in one
     medium. Waves about the ray add
     1/(kL), 2e-3, of which a few percent are not common to both."""
-    case = Case(
+    case = PropagationCase(
         (30, 41), 0.37, 0.85, 62.0, (0.0, 0.0), (1 / 400,), (14.0, -8.5), 0.6, (3, 3)
     )
     y, x = np.array([-41.0, 3.0]), np.array([-27.0, 0.5, 30.0])

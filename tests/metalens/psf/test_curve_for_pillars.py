@@ -10,7 +10,7 @@ import pytest
 from metalens import design, psf
 from metalens.cell import Cell, Index
 from metalens.design import Focus
-from metalens.pillars.fit import Data, fit_terms
+from metalens.pillars.fit import FitData, fit_terms
 from metalens.psf import View, from_lens
 
 WAVELENGTH, TURN = 0.85, 2 * np.pi
@@ -29,7 +29,7 @@ def level_of(d):
 def curve(terms):
     d = np.linspace(0.08, 0.22, 141)
     return fit_terms(
-        Data(
+        FitData(
             phase_of(d)[None, None],
             level_of(d)[None, None],
             d,

@@ -20,9 +20,9 @@ def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
 
     def intensity(*_, tolerance, **__):
         asked.append(tolerance)
-        return direction.Result(light, 1e-4, "so", torch.ones(1))
+        return direction.IntensityResult(light, 1e-4, "so", torch.ones(1))
 
-    monkeypatch.setattr(direction, "intensity", intensity)
+    monkeypatch.setattr(direction, "compute_intensity", intensity)
     monkeypatch.setattr(direction.extended, "blurred", lambda light, *_: (light, 0.003))
 
     def unlike(light, case, source, point):

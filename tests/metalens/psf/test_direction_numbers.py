@@ -5,10 +5,10 @@ import math
 import pytest
 
 from metalens.lens import Media
-from metalens.propagate import Case
+from metalens.propagate import PropagationCase
 from metalens.psf import direction
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -26,7 +26,7 @@ def test_faces_let_through_what_fresnel_has_for_the_chief_ray():
     both polarisations.
     """
     behind = Media((1.37, 1.52), (40.0, 22.0))
-    case = Case(
+    case = PropagationCase(
         (30, 41),
         0.37,
         0.85,

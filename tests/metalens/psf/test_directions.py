@@ -11,7 +11,7 @@ from scipy import special
 
 from metalens import lens as lenses
 from metalens.cell import Cell, Film, Index, Lattice
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Layers, Lens, Stop
 from metalens.pillars import Proxy
 from metalens.psf import directions, far_field
@@ -212,7 +212,7 @@ def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys)
     import json
 
     from metalens import cli
-    from metalens.ground import store
+    from metalens.core import store
 
     x, _ = axes(64, 96)
     lenses.save(

@@ -56,7 +56,7 @@ def test_tiff_pages_run_over_depth_first_and_have_their_scale_in_centimetres():
     """0.8 um: 12500 a centimetre. A depth at infinity is null, and all numbers stand
     beside the axes.
     """
-    with tifffile.TiffFile(io.BytesIO(export.tiff(stack()))) as file:
+    with tifffile.TiffFile(io.BytesIO(export.write_tiff(stack()))) as file:
         pages, tags = [page.asarray() for page in file.pages], file.pages[0].tags
         about = json.loads(file.pages[0].description)
     assert np.array_equal(np.stack(pages), LIGHT.reshape(6, 4, 5))
@@ -85,7 +85,7 @@ def test_tiff_pages_run_over_depth_first_and_have_their_scale_in_centimetres():
 
 
 def test_the_head_of_a_matlab_file_is_116_bytes_of_text_and_its_version():
-    data = export.matlab(stack())
+    data = export.write_matlab(stack())
     assert (
         data[:116].decode()
         == f"{'MATLAB 5.0 MAT-file, metalens PSF stack, um and rad':116}"
@@ -106,7 +106,7 @@ def test_fits_axes_count_from_the_middle_of_an_oblong_window():
     """Of five columns the third, of four rows between the second and the third, where
     pixels count from 1.
     """
-    (about, image), *parts = list(_units(export.fits(stack())))
+    (about, image), *parts = list(_units(export.write_fits(stack())))
     assert np.array_equal(image, LIGHT)
     assert [about[f"CTYPE{axis}"] for axis in (1, 2)] == ["x", "y"]
     assert [about[f"CUNIT{axis}"] for axis in (1, 2)] == ["um", "um"]
@@ -137,7 +137,7 @@ def test_the_ending_says_the_format_in_small_letters_or_capitals(tmp_path):
         ("a.Mat", b"MATLAB"),
         ("a.fits", b"SIMPLE"),
     ):
-        export.write(tmp_path / name, made)
+        export.export_psf(tmp_path / name, made)
         assert (tmp_path / name).read_bytes().startswith(begins)
-    export.write(tmp_path / "a.H5", made)
+    export.export_psf(tmp_path / "a.H5", made)
     assert (tmp_path / "a.H5").read_bytes().startswith(b"\x89HDF")

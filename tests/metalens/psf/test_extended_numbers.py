@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.propagate import Case
+from metalens.propagate import PropagationCase
 from metalens.psf import extended
 from metalens.psf.extended import Extent
 
-CASE = Case(
+CASE = PropagationCase(
     (44, 58),
     0.37,
     0.85,
@@ -81,10 +81,10 @@ def test_half_of_a_source_that_counts():
 
 def test_images_in_air_are_the_source_times_distance_over_depth():
     """-d / z for um, whatever the angle; -d for the tangent of a size in rad."""
-    got = extended.images(CASE, Extent("square", size_um=70.0))
+    got = extended.source_to_image_matrices(CASE, Extent("square", size_um=70.0))
     assert got[0] == pytest.approx(-95 / 900 * 70 * np.eye(2), abs=1e-7)
     assert got[1] == pytest.approx(-95 / 2100 * 70 * np.eye(2), abs=1e-7)
-    wide = extended.images(CASE, Extent("square", size_rad=0.06))
+    wide = extended.source_to_image_matrices(CASE, Extent("square", size_rad=0.06))
     assert wide == pytest.approx(np.stack([-95 * 0.06 * np.eye(2)] * 2), abs=1e-7)
 
 
@@ -111,9 +111,9 @@ def test_images_through_a_window_of_glass_turn_with_the_angle():
     want = (
         95 * 70 * np.linalg.inv(slopes)
     )  # tangents by the source, um on the sensor by tangents
-    assert extended.images(case, Extent("disc", size_um=70.0))[0] == pytest.approx(
-        want, rel=1e-6
-    )
+    assert extended.source_to_image_matrices(case, Extent("disc", size_um=70.0))[
+        0
+    ] == pytest.approx(want, rel=1e-6)
 
 
 def test_a_window_is_widened_by_the_image_and_twelve_steps_of_nyquist():
@@ -123,7 +123,7 @@ def test_a_window_is_widened_by_the_image_and_twelve_steps_of_nyquist():
     limit = extended.nyquist_um(CASE)
     guard = 12 * math.ceil(limit / 0.5)
     for shape, samples in (("disc", 8), ("square", 8), ("gaussian", 26)):
-        wide, more = extended.widened(CASE, Extent(shape, size_um=70.0))
+        wide, more = extended.widen_case(CASE, Extent(shape, size_um=70.0))
         assert more == (samples + guard, samples + guard)
         assert wide.samples == (17 + 2 * more[0], 26 + 2 * more[1])
         assert replace(wide, samples=CASE.samples) == CASE
@@ -141,7 +141,7 @@ def test_blurred_light_is_the_convolution_and_what_was_cut_is_the_edge():
     light = torch.from_numpy(np.stack([spot, spot]))
     extent = Extent("gaussian", size_um=20.0)
     more = (14, 16)
-    got, edge = extended.blurred(light, case, extent, more)
+    got, edge = extended.blur_by_source(light, case, extent, more)
     for plane, depth in zip(got.numpy(), (900, 2100), strict=True):
         added = 95 / depth * 20 * extended.SIGMA["gaussian"]
         wide2 = sigma**2 + added**2
@@ -155,7 +155,7 @@ def test_blurred_light_is_the_convolution_and_what_was_cut_is_the_edge():
         )  # light beyond the window: exp(-25)
     assert 0 < edge < 1e-3
     flat = torch.ones(2, 61, 81, dtype=torch.float64)
-    bright, edge = extended.blurred(flat, case, extent, more)
+    bright, edge = extended.blur_by_source(flat, case, extent, more)
     reach = math.ceil(95 / 900 * 20 * 4 * extended.SIGMA["gaussian"] / 0.5)
     down, across = (14 - reach) // 2, (16 - reach) // 2
     cut = flat.clone()
@@ -184,7 +184,7 @@ def test_unlike_is_what_a_blur_leaves_of_a_change_along_the_source():
         asked.append((depth, change, np.subtract(other.centre_um, case.centre_um)))
         return light[depth : depth + 1] * (1 + float(change @ slopes))
 
-    got = extended.unlike(light, case, extent, probe)
+    got = extended.shift_invariance_error(light, case, extent, probe)
     found = []
     for depth, z in enumerate((900, 2100)):
         one = replace(case, inverse_depths_per_um=(1 / z,))
@@ -214,7 +214,9 @@ def test_a_source_seen_through_glass_is_drawn_along_its_slanted_image():
         CASE, samples=(81, 97), front=((1.6, 600.0),), inverse_depths_per_um=(1 / 900,)
     )
     extent = Extent("gaussian", size_um=25.0)
-    turn = extended.images(case, extent)[0] * extended.SIGMA["gaussian"]
+    turn = (
+        extended.source_to_image_matrices(case, extent)[0] * extended.SIGMA["gaussian"]
+    )
     y, x = ((np.arange(n) - (n - 1) / 2) * 0.5 for n in (81, 97))
     covariance = 1.6**2 * np.eye(2) + turn @ turn.T
     assert abs(covariance[0, 1]) > 0.002

@@ -93,13 +93,16 @@ def test_a_wide_window_states_no_less_than_its_error(seed, least):
         "samples": 131,
         "offset_um": offset,
     }
-    case = propagate.case((150, 190), **given, **window)
+    case = propagate.make_case((150, 190), **given, **window)
     pair = tuple(torch.tensor(one)[None] for one in maps)
 
     def light_of(setting):
         choice = SimpleNamespace(method="wide", reason="")
         found = compute._wide(
-            compute.Lit(*pair, [case], [1.0]), torch.float64, setting, choice
+            compute.IntensityRequest(*pair, [case], [1.0]),
+            torch.float64,
+            setting,
+            choice,
         )
         return found.intensity[0].numpy(), found.error
 
@@ -126,12 +129,12 @@ def test_a_window_of_many_samples_is_looked_at_in_one_of_32():
         "samples": 96,
         "offset_um": offset,
     }
-    case = propagate.case((57, 70), **given, **window)
+    case = propagate.make_case((57, 70), **given, **window)
     pair = tuple(torch.tensor(one)[None] for one in maps)
 
     def light_of(setting):
         found = compute._windowed(
-            compute.Lit(*pair, [case], [1.0]), torch.float64, setting, None
+            compute.IntensityRequest(*pair, [case], [1.0]), torch.float64, setting, None
         )
         return found.intensity[0].numpy(), found.error
 
@@ -143,7 +146,7 @@ def test_errors_beside_a_sharp_spot_are_seen_wherever_it_lies(monkeypatch):
     """A sharp spot on a dim ground, all of the error in a ring of 3 to 4.4 samples
     about it, which light and its root
     root alone give half a point. True: Σδ² over Σ I², both of sum 1; twenty places."""
-    case = propagate.case(
+    case = propagate.make_case(
         (30, 30),
         pitch_um=0.4,
         wavelength_um=0.8,
@@ -152,7 +155,7 @@ def test_errors_beside_a_sharp_spot_are_seen_wherever_it_lies(monkeypatch):
         window_um=96.0,
         samples=96,
     )
-    one = estimate.Sample(case, 1.0, np.zeros((5, 6), complex), 0.0, 1)
+    one = estimate.ErrorSample(case, 1.0, np.zeros((5, 6), complex), 0.0, 1)
     draw = np.random.default_rng(6)
     y, x = np.indices((96, 96))
     found = []

@@ -12,7 +12,7 @@ from metalens import propagate, psf
 from metalens.cell import Film, Index
 from metalens.lens import Layers
 from metalens.psf import among
-from metalens.psf.vector import Mixing
+from metalens.psf.vector import PolarizationMixing
 
 PITCH, WAVE, DISTANCE, COUNT = 0.41, 0.83, 60.0, 110
 ANGLE, SEEN = (
@@ -66,11 +66,12 @@ def plain(maps, jones, *, kind, index=1.0, layers=None):
         **SEEN,
         layers=layers,
     )
-    case = propagate.case((COUNT, COUNT), **about)
+    case = propagate.make_case((COUNT, COUNT), **about)
     y, x = case.pillars_um
     dx, dy = case.centre_um[0] - x[None, :], case.centre_um[1] - y[:, None]
     p, q = (
-        propagate.cosines(case, along, across) for along, across in ((dx, dy), (dy, dx))
+        propagate.ray_cosines(case, along, across)
+        for along, across in ((dx, dy), (dy, dx))
     )
     b = np.stack([p, q, np.sqrt(1 - p * p - q * q)])
     bent = np.stack([p / index, q / index, np.sqrt(1 - (p * p + q * q) / index**2)])
@@ -144,7 +145,7 @@ def test_factors_on_nodes_are_those_of_every_pillar(kind, films, answer):
         torch.tensor(one, dtype=torch.complex128)[None]
         for one in (jones[0, 0], jones[1, 1], jones[0, 1])
     ]
-    fields = None if answer == "alike" else among.Jones(*tensors)
+    fields = None if answer == "alike" else among.NeighbourJonesFactors(*tensors)
     about = dict(
         pitch_um=PITCH,
         wavelength_um=WAVE,
@@ -184,18 +185,18 @@ def test_factors_on_nodes_are_those_of_every_pillar(kind, films, answer):
 def test_what_pillars_let_through_is_their_power_and_over_the_cosine_of_rays():
     """By every pillar: t² of the flux, t² / cos θ of |E|²; of pillars apart half of |J|². Blocks of two: 1e-4."""
     maps, jones = lens(), uneven()
-    case = propagate.case((COUNT, COUNT), pitch_um=PITCH, wavelength_um=WAVE, sensor_distance_um=DISTANCE,
+    case = propagate.make_case((COUNT, COUNT), pitch_um=PITCH, wavelength_um=WAVE, sensor_distance_um=DISTANCE,
                           angle_rad=ANGLE, **SEEN)  # fmt: skip
     y, x = case.pillars_um
     dx, dy = case.centre_um[0] - x, (case.centre_um[1] - y)[:, None]
     steep = np.sqrt(dx**2 + dy**2 + DISTANCE**2) / DISTANCE
     level = torch.tensor(maps[1])
     power = float((level**2).sum())
-    assert Mixing(True).power(case, [power], level[None]) == pytest.approx(
+    assert PolarizationMixing(True).power(case, [power], level[None]) == pytest.approx(
         power, rel=1e-12
     )
     want = float((maps[1] ** 2 * steep).sum())
-    assert Mixing(False).power(case, [power], level[None]) == pytest.approx(
+    assert PolarizationMixing(False).power(case, [power], level[None]) == pytest.approx(
         want, rel=1e-4
     )
     three = [
@@ -204,12 +205,12 @@ def test_what_pillars_let_through_is_their_power_and_over_the_cosine_of_rays():
     levels = torch.tensor(np.sqrt(np.array(three)))
     both = (np.abs(jones) ** 2).sum((0, 1)) * maps[1] ** 2 / 2
     powers = [float(one.sum()) for one in three]
-    assert Mixing(True, apart=True).power(case, powers, levels) == pytest.approx(
-        both.sum(), rel=1e-12
-    )
-    assert Mixing(False, apart=True).power(case, powers, levels) == pytest.approx(
-        (both * steep).sum(), rel=1e-4
-    )
+    assert PolarizationMixing(True, apart=True).power(
+        case, powers, levels
+    ) == pytest.approx(both.sum(), rel=1e-12)
+    assert PolarizationMixing(False, apart=True).power(
+        case, powers, levels
+    ) == pytest.approx((both * steep).sum(), rel=1e-4)
 
 
 def test_a_wide_window_of_both_polarisations_is_the_sum_of_pillars():
@@ -234,8 +235,8 @@ def test_a_wide_window_of_both_polarisations_is_the_sum_of_pillars():
         phase, level, **about, tolerance=1e-4, integrate=False, polarisation="flux"
     )
     assert stack.reason.startswith("wide")
-    case = propagate.case(phase.shape, **about)
-    signs, factors = Mixing(True).pupils(case)(*case.pillars_um)
+    case = propagate.make_case(phase.shape, **about)
+    signs, factors = PolarizationMixing(True).pupils(case)(*case.pillars_um)
     rng, light = np.random.default_rng(5), stack.intensity[0].ravel()
     at = np.concatenate([np.argsort(light)[-40:], rng.integers(0, light.size, 20)])
     j, i = np.divmod(at, 230)

@@ -12,7 +12,7 @@ from metalens.cell.shapes.round import Circle, Ellipse
 from metalens.cell.shapes.straight import Cross, Rectangle, RegularPolygon
 from metalens.cli import main
 from metalens.commands import design_words
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Lens, save
 from metalens.pillars import Proxy
 from metalens.psf import View, from_lens
@@ -49,8 +49,11 @@ def test_psfs_of_one_light_say_so_and_are_not_called_those_of_both(shape):
     for counted in ("flux", "vector"):
         with pytest.raises(PropagationError, match="knows light along x alone"):
             from_lens(made, VIEW, tolerance=1e-3, polarisation=counted)
-    assert "all of it for light along x" in design_words.held(made)
-    assert f"within {made.proxy.max_phase_error_rad:.1e} rad" in design_words.held(made)
+    assert "all of it for light along x" in design_words.pillar_accuracy_text(made)
+    assert (
+        f"within {made.proxy.max_phase_error_rad:.1e} rad"
+        in design_words.pillar_accuracy_text(made)
+    )
 
 
 @pytest.mark.parametrize(
@@ -63,7 +66,7 @@ def test_pillars_alike_for_both_take_both(shape):
     made = lens(shape)
     found = from_lens(made, VIEW, tolerance=1e-3, polarisation="flux")
     assert "light along" not in found.reason
-    assert "all of it" not in design_words.held(made)
+    assert "all of it" not in design_words.pillar_accuracy_text(made)
 
 
 def test_at_angles_the_library_holds_the_mean_of_both_in_one_plane_of_incidence():

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from metalens import psf
-from metalens.propagate import Case, Moving, blocks
+from metalens.propagate import MovingGeometry, PropagationCase, blocks
 from metalens.psf import compute
-from metalens.psf.compute import Result
+from metalens.psf.compute import IntensityResult
 
-CASE = Case(
+CASE = PropagationCase(
     (30, 41),
     0.37,
     0.85,
@@ -25,7 +25,7 @@ CASE = Case(
     0.6,
     (9, 11),
 )
-OTHER = Case(
+OTHER = PropagationCase(
     (30, 41),
     0.37,
     0.79,
@@ -64,7 +64,7 @@ def test_light_that_rounds_is_that_of_every_component_at_its_largest_factor():
 
 
 def test_errors_of_a_result_add_as_squares():
-    assert Result(
+    assert IntensityResult(
         torch.ones(1), 0.02, "", 1.0, sampling=0.03, source=0.06
     ).whole == pytest.approx(0.07, rel=1e-12)
 
@@ -89,7 +89,10 @@ def test_power_of_windows_is_weighed_by_the_light_of_the_wavelengths():
         for _ in range(2)
     )
     found = compute._windowed(
-        compute.Lit(phase, level, [CASE, OTHER], [0.7, 0.4]), torch.float64, 1e-4, None
+        compute.IntensityRequest(phase, level, [CASE, OTHER], [0.7, 0.4]),
+        torch.float64,
+        1e-4,
+        None,
     )
     squares = (level**2).sum((1, 2)).tolist()
     assert found.power == pytest.approx(0.7 * squares[0] + 0.4 * squares[1], rel=1e-9)
@@ -128,13 +131,13 @@ def test_the_flux_of_an_exact_sum_is_that_of_the_window():
 
 
 def test_a_moving_window_is_seen_from_its_tile():
-    moving = Moving(
+    moving = MovingGeometry(
         torch.zeros(2),
         torch.ones(1),
         torch.tensor(62.0),
         torch.tensor([14.0, -8.5], dtype=torch.float64),
     )
-    tile = Case(
+    tile = PropagationCase(
         (30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400,), (15.2, -9.1), 0.6, (3, 4)
     )
     assert compute._shifted(moving, CASE, tile).centre.tolist() == pytest.approx(
@@ -145,7 +148,9 @@ def test_a_moving_window_is_seen_from_its_tile():
 
 def needed(shape, kernel, axis=0):
     """Nodes that a kernel asks for in blocks of 32 pillars."""
-    case = Case(shape, 0.4, 0.85, 62.0, (0.0, 0.0), (1 / 400,), (0.0, 0.0), 0.6, (3, 3))
+    case = PropagationCase(
+        shape, 0.4, 0.85, 62.0, (0.0, 0.0), (1 / 400,), (0.0, 0.0), 0.6, (3, 3)
+    )
     return blocks._needed(case, axis, 32, kernel, 1e-5, 0).nodes
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.psf import PsfStack, on_pixels
 
 ENERGY = np.array([7.0, 4.0])

@@ -48,7 +48,7 @@ def shown(monkeypatch):
 
 
 def test_the_montage_has_the_shape_of_the_window(shown):
-    plots.montage(stack())
+    plots.plot_montage(stack())
     assert [image.shape for image, _ in shown] == [(10, 24), (10, 24)]
     assert shown[0][1] == pytest.approx((-6.0, 6.0, 2.5, -2.5))
 
@@ -60,7 +60,7 @@ def test_flux_below_0_is_drawn_as_none(shown):
     made = stack()
     light = made.intensity.copy()
     light[0, 3, 7] = -1e-4 * light.max()
-    plots.montage(dataclasses.replace(made, intensity=light))
+    plots.plot_montage(dataclasses.replace(made, intensity=light))
     assert shown[0][0][3, 7] == 0.0
     assert np.isfinite(shown[0][0]).all()
 
@@ -75,4 +75,4 @@ def test_flux_below_0_is_drawn_as_none(shown):
     ],
 )
 def test_information_is_drawn_between_depths_that_differ(depths_um, told):
-    assert ("information" in plots.pictures(stack(depths_um))) == told
+    assert ("information" in plots.psf_pictures(stack(depths_um))) == told

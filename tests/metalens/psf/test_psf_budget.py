@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.ground import store
-from metalens.ground.errors import PropagationError
+from metalens.core import store
+from metalens.core.errors import PropagationError
 from metalens.lens import Layers
 from metalens.psf import of_lens, spectrum
 from metalens.psf.cells import nyquist_um
@@ -79,7 +79,7 @@ def test_a_coarse_window_gives_the_light_on_its_cells():
 
 
 def test_a_window_within_nyquist_is_sampled_as_it_was():
-    case = propagate.case(
+    case = propagate.make_case(
         (150, 150), **{n: v for n, v in geometry(90.0).items() if n != "tolerance"}
     )
     sine = math.sin(math.atan(149 * PITCH / 2 / 90.0))
@@ -195,7 +195,9 @@ def test_what_one_scalar_misses_is_below_what_is_said_of_light_from_the_side(
         wavelength_um=WAVELENGTH,
         diameters=SimpleNamespace(radius_um=radius, pitch_um=0.0),
     )
-    said = psf.scalar_error(of_lens.aperture(lens, angle), of_lens.uneven(lens, angle))
+    said = psf.scalar_error(
+        of_lens.sine_aperture(lens, angle), of_lens.obliquity_variation(lens, angle)
+    )
     assert 0.1 * said < true < said
 
 
@@ -278,7 +280,7 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
     )
     (tmp_path / "filter.csv").write_text("840;0\n841;3\n860;3\n861;0\n")
     files = [tmp_path / "led.csv", tmp_path / "filter.csv"]
-    found = spectrum.measured(files, within_um=(0.8, 0.9))
+    found = spectrum.read_measured_spectrum(files, within_um=(0.8, 0.9))
     nm = found.wavelengths_um * 1e3
     assert (nm.min(), nm.max()) == pytest.approx((840.25, 860.75), abs=0.26)
     fine = np.arange(840, 861, 1e-3)
@@ -286,17 +288,17 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
         fine, [840, 841, 860, 861], [0, 3, 3, 0]
     )
     assert found.share @ nm == pytest.approx((line * fine).sum() / line.sum(), abs=0.02)
-    rule = spectrum.nodes(found, path_um=50.0, tolerance=1e-4)
+    rule = spectrum.spectral_nodes(found, path_um=50.0, tolerance=1e-4)
     assert rule.weights @ rule.wavelengths_um * 1e3 == pytest.approx(
         found.share @ nm, rel=1e-9
     )
     with pytest.raises(PropagationError, match="pillars are known from 845 to 850"):
-        spectrum.measured(files, within_um=(0.845, 0.85))
+        spectrum.read_measured_spectrum(files, within_um=(0.845, 0.85))
     (tmp_path / "bad.csv").write_text("840,1\n850,x\n")
     with pytest.raises(PropagationError, match=r"bad\.csv: line 2"):
-        spectrum.measured([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
+        spectrum.read_measured_spectrum([tmp_path / "bad.csv"], within_um=(0.8, 0.9))
     with pytest.raises(PropagationError, match=r"none\.csv: cannot be read"):
-        spectrum.measured([tmp_path / "none.csv"], within_um=(0.8, 0.9))
+        spectrum.read_measured_spectrum([tmp_path / "none.csv"], within_um=(0.8, 0.9))
 
 
 @pytest.mark.parametrize(
@@ -313,7 +315,7 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
 def test_rows_of_a_spectrum_that_are_none_are_named(tmp_path, rows, named):
     (tmp_path / "led.csv").write_text("nm,power\n" + rows)
     with pytest.raises(PropagationError, match=rf"led\.csv: {named}"):
-        spectrum.measured([tmp_path / "led.csv"], within_um=(0.8, 0.9))
+        spectrum.read_measured_spectrum([tmp_path / "led.csv"], within_um=(0.8, 0.9))
 
 
 def test_rows_of_a_spectrum_may_come_in_any_order_with_gaps_and_dark_between(tmp_path):
@@ -323,7 +325,9 @@ def test_rows_of_a_spectrum_may_come_in_any_order_with_gaps_and_dark_between(tmp
     (tmp_path / "led.csv").write_text(
         "858,1\n842,0\n838,2\n862,0\n846,3\n844,0\n834,0\n"
     )
-    found = spectrum.measured([tmp_path / "led.csv"], within_um=(0.8, 0.9))
+    found = spectrum.read_measured_spectrum(
+        [tmp_path / "led.csv"], within_um=(0.8, 0.9)
+    )
     areas = np.array([4.0, 4.0, 3.0, 24.0, 2.0])  # 834-838-842, 844-846-858-862
     middles = np.array(
         [836 + 2 / 3, 839 + 1 / 3, 845 + 1 / 3, 851.0, 859 + 1 / 3]
@@ -338,7 +342,7 @@ def test_light_of_a_diode_beyond_the_library_is_told():
     normal distribution.
     """
     diode = spectrum.Source(850.0, 20.0)
-    told = spectrum.beyond(diode, (0.838, 0.867))
+    told = spectrum.outside_library_text(diode, (0.838, 0.867))
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (12, 17))
     share, words = told[2:].split(" of the light lies beyond ")
@@ -346,14 +350,14 @@ def test_light_of_a_diode_beyond_the_library_is_told():
         tails, rel=0.05
     )  # two digits; silicon weighs the blue by 4 % more, the red less
     assert words.startswith("838 to 867 nm, where the pillars are not known")
-    assert spectrum.beyond(diode, (0.8, 0.9)) == ""
-    assert spectrum.beyond(diode, (0.85, 0.85)) == ""
-    assert spectrum.unknown(diode, (0.838, 0.867)) == pytest.approx(
+    assert spectrum.outside_library_text(diode, (0.8, 0.9)) == ""
+    assert spectrum.outside_library_text(diode, (0.85, 0.85)) == ""
+    assert spectrum.share_outside_library(diode, (0.838, 0.867)) == pytest.approx(
         tails, rel=0.05
     )  # as above
     assert (
-        spectrum.unknown(
-            spectrum.Nodes(np.array([0.81]), np.ones(1), 0.0), (0.838, 0.867)
+        spectrum.share_outside_library(
+            spectrum.SpectralNodes(np.array([0.81]), np.ones(1), 0.0), (0.838, 0.867)
         )
         == 0.0
     )  # refused later

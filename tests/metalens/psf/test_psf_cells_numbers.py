@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.ground.errors import PropagationError
-from metalens.propagate import Case
+from metalens.core.errors import PropagationError
+from metalens.propagate import PropagationCase
 from metalens.psf import cells
 
 # 4.4 um to either side along x, 2.96 um along y; the window's middle lies at (14.0,
 # -8.5)
-CASE = Case(
+CASE = PropagationCase(
     (17, 23),
     0.4,
     0.85,
@@ -63,8 +63,8 @@ def stepped(steps, samples=(9, 11)):
 def test_steps_up_to_nyquists_are_sampled_as_they_are():
     for steps in (0.3, 1.0):
         case = stepped(steps)
-        assert cells.cells(case) == cells.Cells(1, case, (0.0, 0.0))
-    assert cells.cells(stepped(1 + 1e-6)).points == 4
+        assert cells.plan_pixel_cells(case) == cells.PixelCells(1, case, (0.0, 0.0))
+    assert cells.plan_pixel_cells(stepped(1 + 1e-6)).points == 4
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_cells_have_so_many_points_in_nyquists_step_and_two_around_the_window(
     differences up to the fourth.
     """
     case = stepped(steps)
-    found = cells.cells(case, finer)
+    found = cells.plan_pixel_cells(case, finer)
     assert found.points == points
     assert found.case.step_um == pytest.approx(case.step_um / points, rel=1e-12)
     assert found.case.samples == (9 * points + 4, 11 * points + 4)
@@ -95,25 +95,25 @@ def test_cells_have_so_many_points_in_nyquists_step_and_two_around_the_window(
 
 def test_by_default_two_points_stand_in_nyquists_step_then_four_and_eight():
     assert cells.FINER == (2, 4, 8)
-    assert cells.cells(stepped(2.5)).points == 6
+    assert cells.plan_pixel_cells(stepped(2.5)).points == 6
 
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_six_thousand_points_along_an_axis_are_the_most(turned):
     """1499 cells of four points and two on either side; of 1500 there are 6004."""
     whole, more = ((1499, 3), (1500, 3)) if turned else ((3, 1499), (3, 1500))
-    assert max(cells.cells(stepped(1.5, whole)).case.samples) == 6000
+    assert max(cells.plan_pixel_cells(stepped(1.5, whole)).case.samples) == 6000
     with pytest.raises(
         PropagationError, match="6004 points along an axis, at most 6000"
     ):
-        cells.cells(stepped(1.5, more))
+        cells.plan_pixel_cells(stepped(1.5, more))
 
 
 def test_means_follow_the_second_and_fourth_differences_of_a_lone_point():
     """A lit point among its differences, 1 -2 1 and 1 -4 6 -4 1 along each axis, by the
     module's weights.
     """
-    fine = cells.Cells(3, CASE, (0.11, 0.23))
+    fine = cells.PixelCells(3, CASE, (0.11, 0.23))
     light = np.zeros((2 * 3 + 4, 3 * 3 + 4))
     light[4, 7] = (
         9.0  # the last row of the first cells, the last column of the second ones
@@ -131,7 +131,7 @@ def test_means_follow_the_second_and_fourth_differences_of_a_lone_point():
             )
             parts[:, i // 3, j // 3] += terms  # nine points a cell, and light of nine
     want = parts.sum(0)
-    got, error = cells.integrated(torch.from_numpy(light)[None], fine)
+    got, error = cells.integrate_cells(torch.from_numpy(light)[None], fine)
     assert got[0].numpy() == pytest.approx(want, abs=1e-14)
     first, second, fourth = np.linalg.norm(parts.reshape(3, -1), axis=1)
     assert error == pytest.approx(

@@ -40,11 +40,13 @@ def test_noise_of_the_pillars_adds_up_as_random_phases_do(monkeypatch, tilt_rad)
         "sensor_distance_um": 90.0,
         "angle_rad": (tilt_rad, 0.0),
     }
-    case = propagate.case(
+    case = propagate.make_case(
         level.shape, **place, depths_um=[4000.0], window_um=130.0, samples=128
     )
     maps = torch.zeros(1, 12, 15, dtype=torch.float64), torch.from_numpy(level)[None]
-    compute._windowed(compute.Lit(*maps, [case], [1.0]), torch.float64, 1e-5, None)
+    compute._windowed(
+        compute.IntensityRequest(*maps, [case], [1.0]), torch.float64, 1e-5, None
+    )
     [sample] = seen
     power = []
     for _ in range(400):
@@ -67,9 +69,9 @@ def test_single_maps_are_summed_in_double_a_few_rows_at_a_time_as_if_they_were_d
     phase, level = (
         torch.from_numpy(rng.uniform(0, 1, (300, 211)).astype("f4")) for _ in range(2)
     )
-    case = propagate.case(phase.shape, pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=150.0,
+    case = propagate.make_case(phase.shape, pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=150.0,
                           depths_um=[900.0], window_um=9.0, samples=11)  # fmt: skip
-    made = propagate.plan(case, 1e-6, torch.float64, torch.device("cpu"))
+    made = propagate.plan_window(case, 1e-6, torch.float64, torch.device("cpu"))
     one, _, light = propagate.field_windowed(phase, level, made)
     other, _, same = propagate.field_windowed(phase.double(), level.double(), made)
     assert one.dtype == torch.complex128

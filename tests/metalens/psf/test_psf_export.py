@@ -11,7 +11,7 @@ import tifffile
 from scipy.io import loadmat
 
 from metalens import psf
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 from metalens.psf import export as psf_export
 
 
@@ -34,7 +34,7 @@ def stack():
 
 
 def test_tiff_pages_are_the_psfs_and_the_description_says_which(stack):
-    with tifffile.TiffFile(io.BytesIO(psf_export.tiff(stack))) as file:
+    with tifffile.TiffFile(io.BytesIO(psf_export.write_tiff(stack))) as file:
         pages, about = file.asarray(), json.loads(file.pages[0].description)
     assert pages.dtype == np.float32
     assert about["axes"] == "angle depth y x"
@@ -45,7 +45,7 @@ def test_tiff_pages_are_the_psfs_and_the_description_says_which(stack):
 
 
 def test_matlab_variables_have_the_names_of_the_record(stack):
-    read = loadmat(io.BytesIO(psf_export.matlab(stack)))
+    read = loadmat(io.BytesIO(psf_export.write_matlab(stack)))
     assert np.array_equal(read["intensity"], stack.intensity)
     assert np.array_equal(read["depths_um"].ravel(), stack.depths_um)
     assert read["step_um"].item() == stack.step_um
@@ -74,7 +74,7 @@ def _units(data):
 
 
 def test_fits_images_have_axes_in_um_and_the_energies_beside_them(stack):
-    (about, image), *parts = list(_units(psf_export.fits(stack)))
+    (about, image), *parts = list(_units(psf_export.write_fits(stack)))
     assert np.array_equal(image, stack.intensity.astype("f4"))
     assert about["AXES"] == "angle depth y x"
     assert (about["CTYPE1"], about["CUNIT2"], float(about["CDELT1"])) == (
@@ -97,11 +97,11 @@ def test_same_stack_same_bytes(stack, tmp_path, name):
     written = []
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
-        psf_export.write(tmp_path / folder / name, stack)
+        psf_export.export_psf(tmp_path / folder / name, stack)
         written.append((tmp_path / folder / name).read_bytes())
     assert written[0] == written[1]
 
 
 def test_other_endings_are_refused(stack, tmp_path):
     with pytest.raises(PropagationError, match=r"\.tif"):
-        psf_export.write(tmp_path / "psf.png", stack)
+        psf_export.export_psf(tmp_path / "psf.png", stack)

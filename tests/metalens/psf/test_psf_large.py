@@ -29,7 +29,7 @@ def sampled_error(stack, maps, angle):
     """Relative L2 at every tenth sample of three depths."""
     at = np.arange(3, len(stack.x_um), 10)
     depths = [0, len(stack.depths_um) // 2, len(stack.depths_um) - 1]
-    case = propagate.case(
+    case = propagate.make_case(
         maps[0].shape,
         **GEOMETRY,
         depths_um=stack.depths_um[depths],

@@ -82,10 +82,10 @@ def test_circles_about_the_centre_hold_parts_of_the_samples_at_their_rim():
     near, far = 0.25 * math.sqrt(13) * STEP, 0.75 * math.sqrt(13) * STEP
     radii = np.array([near - 0.4, near + 0.14, near + 0.36, far - 0.14, far + 0.36])
     want = np.array([0.0, 0.75 * (0.2 + 0.5), 0.75, 0.75 + 0.25 * (0.5 - 0.2), 1.0])
-    found = metrics.encircled(PAIR, radii_um=radii)
+    found = metrics.encircled_energy(PAIR, radii_um=radii)
     assert found.shape == (2, 5)
     assert found[0] == pytest.approx(want, abs=1e-12)
-    light = metrics.encircled(PAIR, radii_um=radii, of_window=False)
+    light = metrics.encircled_energy(PAIR, radii_um=radii, of_window=False)
     assert light == pytest.approx(found * np.array([[3.0], [7.0]]), rel=1e-12)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from metalens import psf
-from metalens.ground.errors import PropagationError
+from metalens.core.errors import PropagationError
 
 WAVE, D, PITCH = 0.85, 95.0, 0.37
 K = 2 * np.pi / WAVE

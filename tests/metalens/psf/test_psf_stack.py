@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import propagate, psf
-from metalens.ground.errors import PropagationError, StoreError
+from metalens.core.errors import PropagationError, StoreError
 from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
@@ -206,7 +206,9 @@ def test_metrics_of_gaussians_are_closed_forms():
         assert psf_metrics.mtf(stack, frequencies_per_um=f)[depth, 0] == pytest.approx(
             want, abs=1e-9
         )
-        inside = psf_metrics.encircled(stack, radii_um=np.array([2.0, 4.0]))[depth]
+        inside = psf_metrics.encircled_energy(stack, radii_um=np.array([2.0, 4.0]))[
+            depth
+        ]
         assert inside == pytest.approx(
             1 - np.exp(-np.array([4.0, 16.0]) / (2 * width**2)), abs=5e-3
         )
@@ -245,7 +247,9 @@ def test_polychromatic_psf_converges_with_the_nodes():
     path = np.hypot(19.0, 120.0) - 120.0 + np.hypot(19.0, 1000.0) - 1000.0
     results = []
     for tolerance in (1e-2, 1e-3, 1e-7):
-        found = spectrum.nodes(spectrum.Source(), path_um=path, tolerance=tolerance)
+        found = spectrum.spectral_nodes(
+            spectrum.Source(), path_um=path, tolerance=tolerance
+        )
         maps = np.stack([phase] * len(found.weights))
         other = GEOMETRY | dict(wavelength_um=found.wavelengths_um.tolist())
         results.append(
@@ -270,7 +274,7 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens, answers
     from metalens.pillars import Proxy
-    from metalens.psf.of_lens import incidence
+    from metalens.psf.of_lens import library_incidence
 
     angled = (
         np.array([[[1.3, 4.0]], [[0.4, 0.0]]]),
@@ -282,7 +286,9 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
         DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map"
     )
     phase, level = np.empty((2, 2)), np.empty((2, 2))
-    answers.fill(lens, (0.94, incidence(lens, (0.17, -0.31))), phase, level)
+    answers.fill_response(
+        lens, (0.94, library_incidence(lens, (0.17, -0.31))), phase, level
+    )
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
     tilt = np.arccos(1 / np.linalg.norm(direction))
     share = 2 * (np.sin(tilt) / np.sin(0.5)) ** 2 - 1
@@ -296,7 +302,9 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
         angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
     )  # a library of normal incidence alone
     flat = dataclasses.replace(lens, proxy=upright)
-    answers.fill(flat, (0.94, incidence(flat, (0.17, -0.31))), phase, level)
+    answers.fill_response(
+        flat, (0.94, library_incidence(flat, (0.17, -0.31))), phase, level
+    )
     assert level == pytest.approx(3 * sizes)
 
 
@@ -322,9 +330,9 @@ def test_metrics_of_an_oblong_spot_off_the_middle():
     narrow = (np.cos(angle) / 2.1) ** 2 + (np.sin(angle) / 1.3) ** 2
     inside = (((1 - np.exp(-narrow * 2.7**2 / 2)) / narrow).mean()) / (2.1 * 1.3)
     for share, whole in ((True, 1.0), (False, np.array([3.0, 7.0]))):
-        got = psf_metrics.encircled(stack, radii_um=np.array([2.7]), of_window=share)[
-            :, 0
-        ]
+        got = psf_metrics.encircled_energy(
+            stack, radii_um=np.array([2.7]), of_window=share
+        )[:, 0]
         assert got == pytest.approx(inside * whole, rel=0.01)  # samples cut by the rim
     depth, plain = psf_metrics.axial_information(stack, normalisation="none")
     step_mm = np.diff(stack.depths_um)[0] * 1e-3

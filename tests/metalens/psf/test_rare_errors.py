@@ -15,7 +15,7 @@ from metalens.psf import compute
 
 SIDE = 96
 COUNT = SIDE * SIDE  # 9216 samples, 288 of which are looked at
-CASE = propagate.case(
+CASE = propagate.make_case(
     (30, 30),
     pitch_um=0.4,
     wavelength_um=0.8,
@@ -45,7 +45,7 @@ def stated_over_true(monkeypatch, draw, wrong, size):
         return seen[:, points]
 
     monkeypatch.setattr(estimate, "_direct_light", direct)
-    one = estimate.Sample(CASE, 1.0, np.zeros((5, 6), complex), 0.0, 1)
+    one = estimate.ErrorSample(CASE, 1.0, np.zeros((5, 6), complex), 0.0, 1)
     stated = estimate.relative_error([[one]], [LIGHT.reshape(1, SIDE, SIDE).copy()])
     return stated, float(np.linalg.norm(off) / np.linalg.norm(LIGHT))
 
@@ -76,7 +76,7 @@ def test_errors_as_large_as_the_setting_at_one_sample_in_three_thousand_are_reck
         stated, true = stated_over_true(monkeypatch, draw, 3, setting)
         assert true == pytest.approx(setting * (3 / COUNT) ** 0.5, rel=0.2)
         blind += stated < true
-        seen = compute.Result(torch.ones(1), stated, "", 1.0)
+        seen = compute.IntensityResult(torch.ones(1), stated, "", 1.0)
         told = compute._few_seen(seen, setting).error
         assert true < told < max(3 * stated, 0.1 * setting)
     assert blind > 25

@@ -16,7 +16,7 @@ import pytest
 from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens, answers
 from metalens.pillars import Proxy
-from metalens.psf import Nodes, View, from_lens, spectrum
+from metalens.psf import SpectralNodes, View, from_lens, spectrum
 from metalens.psf.of_lens import PILOT, light_shares, paths_um
 
 PHASE = np.array(
@@ -44,7 +44,7 @@ def lens(count, distance_um):
 def source(tmp_path):
     file = tmp_path / "led.csv"
     np.savetxt(file, LINE)
-    return spectrum.measured([file], within_um=PROXY.wavelengths_um)
+    return spectrum.read_measured_spectrum([file], within_um=PROXY.wavelengths_um)
 
 
 def many():
@@ -52,7 +52,7 @@ def many():
         826, 877, 103
     )  # a step of 0.5 nm: paths of 40 um turn by a sixth of a turn
     share = np.interp(nm, *LINE.T)
-    return Nodes(nm * 1e-3, share / share.sum(), 0.0)
+    return SpectralNodes(nm * 1e-3, share / share.sum(), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
     beside the focus.
     """
     um, share = source.wavelengths_um, source.share
-    two = Nodes(*spectrum.gauss(um, share, 2), 0.0, source)
+    two = SpectralNodes(*spectrum.gauss_rule(um, share, 2), 0.0, source)
     errors = []
     for offset in ((0.0, 0.0), (0.0, 21.0)):
         view = View((300.0,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset)
@@ -127,15 +127,15 @@ def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light
     try of nearly as many.
     """
     made, waves = lens(241, 42.0), []
-    plain = answers.fill
+    plain = answers.fill_response
     monkeypatch.setattr(
         answers,
-        "fill",
+        "fill_response",
         lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)),
     )
     um = np.linspace(0.805, 0.895, 25)
     share = np.exp(-4 * np.log(2) * ((um - 0.849) / 0.031) ** 2)
-    source = spectrum.Measured(um, share / share.sum())
+    source = spectrum.MeasuredSpectrum(um, share / share.sum())
     found = from_lens(
         made,
         View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),
@@ -145,7 +145,7 @@ def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light
     assert len(found.wavelengths_um) > 2 * PILOT
     assert found.budget.spectrum <= 5e-5
     assert len(waves) == PILOT + len(found.wavelengths_um)
-    fine = Nodes(um, source.share, 0.0)
+    fine = SpectralNodes(um, source.share, 0.0)
     want = from_lens(
         made,
         View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),

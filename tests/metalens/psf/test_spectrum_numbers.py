@@ -8,17 +8,17 @@ import re
 import numpy as np
 import pytest
 
-from metalens.ground.errors import MaterialError, PropagationError
+from metalens.core.errors import MaterialError, PropagationError
 from metalens.psf import spectrum
 
 
 def test_a_rule_has_the_whole_weight_and_a_narrow_line_201_points():
     points, share = np.linspace(0.8, 0.9, 41), np.full(41, 3.7 / 41)
-    where, weight = spectrum.gauss(points, share, 4)
+    where, weight = spectrum.gauss_rule(points, share, 4)
     assert weight.sum() == pytest.approx(3.7, rel=1e-12)
     assert weight @ where**3 == pytest.approx(share @ points**3, rel=1e-12)
     assert (
-        len(spectrum.weight(spectrum.Source(850.0, 3.0))[0]) == 201
+        len(spectrum.spectral_weight(spectrum.Source(850.0, 3.0))[0]) == 201
     )  # 5 widths in fortieths
 
 
@@ -28,9 +28,12 @@ def test_weights_add_up_to_one_within_a_millionth(more):
     is 1e-14.
     """
     waves = np.array([0.84, 0.86])
-    assert spectrum.Nodes(waves, np.array([0.3, 0.7 + 0.5e-6]), 0.0).weights[1] > 0.7
+    assert (
+        spectrum.SpectralNodes(waves, np.array([0.3, 0.7 + 0.5e-6]), 0.0).weights[1]
+        > 0.7
+    )
     with pytest.raises(PropagationError, match="need one of 0 or more each, sum 1"):
-        spectrum.Nodes(waves, np.array([0.3, 0.7 + more]), 0.0)
+        spectrum.SpectralNodes(waves, np.array([0.3, 0.7 + more]), 0.0)
 
 
 TAILS = [
@@ -51,7 +54,7 @@ def test_what_a_measured_spectrum_leaves_out_beyond_the_pillars_is_told(tmp_path
     bound."""
     file = tmp_path / "led.csv"
     file.write_text("\n".join(f"{nm},{value}" for nm, value in TAILS))
-    whole = spectrum.measured([file], within_um=(0.7, 1.0))
+    whole = spectrum.read_measured_spectrum([file], within_um=(0.7, 1.0))
     nm, value = np.array(TAILS).T
     assert whole.beside == 0.0
     assert whole.wavelengths_um[[0, -1]] * 1e3 == pytest.approx(
@@ -62,18 +65,18 @@ def test_what_a_measured_spectrum_leaves_out_beyond_the_pillars_is_told(tmp_path
         sum(np.diff(nm) * (value[1:] + value[:-1]) / 2 * _middles(nm, value)) / area,
         rel=1e-12,
     )
-    less = spectrum.measured([file], within_um=(0.8101, 0.88996))
+    less = spectrum.read_measured_spectrum([file], within_um=(0.8101, 0.88996))
     assert less.beside == pytest.approx(
         (10 * 5e-5 + 10 * 9e-5) / area, rel=0.05
     )  # and pieces of two slopes
-    assert spectrum.nodes(less, path_um=0.0, tolerance=1e-3).error == pytest.approx(
-        less.beside
-    )
+    assert spectrum.spectral_nodes(
+        less, path_um=0.0, tolerance=1e-3
+    ).error == pytest.approx(less.beside)
     with pytest.raises(
         PropagationError,
         match=r"light from 810\.\d+ to 889\.\d+ nm, the pillars are known from 820",
     ):
-        spectrum.measured([file], within_um=(0.82, 0.95))
+        spectrum.read_measured_spectrum([file], within_um=(0.82, 0.95))
 
 
 def test_points_from_the_first_to_the_last_that_pillars_are_known_for_are_kept(
@@ -85,7 +88,7 @@ def test_points_from_the_first_to_the_last_that_pillars_are_known_for_are_kept(
     file = tmp_path / "led.csv"
     file.write_text("\n".join(f"{nm},{value}" for nm, value in TAILS))
     nm, value = np.array(TAILS).T
-    less = spectrum.measured([file], within_um=(0.81, 0.89))
+    less = spectrum.read_measured_spectrum([file], within_um=(0.81, 0.89))
     assert less.beside == pytest.approx(
         (10 * 5e-5 + 10 * 9e-5) / np.trapezoid(value, nm), rel=1e-9
     )
@@ -100,7 +103,7 @@ def test_points_from_the_first_to_the_last_that_pillars_are_known_for_are_kept(
             for nm, value in [(830, 0), *TAILS[3:5], (889.8, 0), (950, 0)]
         )
     )
-    dark = spectrum.measured([file], within_um=(0.7, 0.9))
+    dark = spectrum.read_measured_spectrum([file], within_um=(0.7, 0.9))
     assert dark.wavelengths_um[0] > 0.83
     assert 0.88975 < dark.wavelengths_um[-1] < 0.8898  # rows of nothing are no points
     assert dark.beside == pytest.approx(
@@ -111,7 +114,7 @@ def test_points_from_the_first_to_the_last_that_pillars_are_known_for_are_kept(
 def test_pillars_of_one_wavelength_take_all_that_is_lit(tmp_path):
     file = tmp_path / "led.csv"
     file.write_text("\n".join(f"{nm},{value}" for nm, value in TAILS))
-    found = spectrum.measured([file], within_um=(0.85, 0.85))
+    found = spectrum.read_measured_spectrum([file], within_um=(0.85, 0.85))
     assert found.wavelengths_um[[0, -1]] * 1e3 == pytest.approx(
         [810.1, 889.9], abs=0.13
     )  # from 1e-4 of the peak on
@@ -131,12 +134,12 @@ def test_lines_narrower_than_the_step_between_points_are_seen(tmp_path):
     laser, led = tmp_path / "laser.csv", tmp_path / "flat.csv"
     laser.write_text("840,1\n849.9,1\n850.0,41\n850.1,1\n850.2,1\n850.3,1\n850.4,1\n")
     led.write_text("840.1 1\n850.1 1\n")
-    found = spectrum.measured([laser, led], within_um=(0.8, 0.9))
+    found = spectrum.read_measured_spectrum([laser, led], within_um=(0.8, 0.9))
     line = found.share[np.abs(found.wavelengths_um * 1e3 - 850.0) < 0.1].sum()
     assert line == pytest.approx((4.0 + 0.2) / (4.0 + 10.0), rel=1e-9)
     alone = tmp_path / "alone.csv"
     alone.write_text("849.93,0\n849.95,1\n849.97,0\n")
-    assert spectrum.measured(
+    assert spectrum.read_measured_spectrum(
         [alone], within_um=(0.8, 0.9)
     ).wavelengths_um.mean() == pytest.approx(0.84995, rel=1e-9)
 
@@ -170,11 +173,11 @@ def test_wavelengths_are_as_few_as_tell_every_path_of_two_lines():
         for a in p
     )
     assert miss > 0.05
-    source = spectrum.Measured(lines, share)
-    one = spectrum.nodes(source, path_um=reach, tolerance=1.001 * miss)
+    source = spectrum.MeasuredSpectrum(lines, share)
+    one = spectrum.spectral_nodes(source, path_um=reach, tolerance=1.001 * miss)
     assert one.wavelengths_um == pytest.approx([mean])
     assert one.error == pytest.approx(miss, rel=1e-9)
-    two = spectrum.nodes(source, path_um=reach, tolerance=0.999 * miss)
+    two = spectrum.spectral_nodes(source, path_um=reach, tolerance=0.999 * miss)
     assert np.sort(two.wavelengths_um) == pytest.approx(lines, rel=1e-12)
     assert two.weights.sum() == pytest.approx(1, rel=1e-12)
     assert two.error < 1e-9
@@ -193,22 +196,26 @@ def test_parts_of_a_window_miss_what_their_own_paths_miss():
     spans, light = np.array([7.0, p[40]]), np.array([0.2, 0.8])
     want = np.array([off.max(), off[:41].max()])
     assert want[1] < 0.5 * want[0]
-    source = spectrum.Measured(lines, share, 0.003)
-    one = spectrum.Nodes(np.array([mean]), np.ones(1), 0.0, source)
-    assert spectrum.missed(one, spans) == pytest.approx(want + 0.003, rel=1e-9)
+    source = spectrum.MeasuredSpectrum(lines, share, 0.003)
+    one = spectrum.SpectralNodes(np.array([mean]), np.ones(1), 0.0, source)
+    assert spectrum.quadrature_error(one, spans) == pytest.approx(
+        want + 0.003, rel=1e-9
+    )
     whole = math.sqrt(light @ (want + 0.003) ** 2)
-    assert spectrum.nodes(
+    assert spectrum.spectral_nodes(
         source, path_um=spans, tolerance=1.001 * whole, light=light
     ).error == pytest.approx(whole)
     assert (
         len(
-            spectrum.nodes(
+            spectrum.spectral_nodes(
                 source, path_um=spans, tolerance=0.999 * whole, light=light
             ).weights
         )
         == 2
     )
-    assert spectrum.missed(spectrum.Nodes(lines, share, 0.04), spans).tolist() == [
+    assert spectrum.quadrature_error(
+        spectrum.SpectralNodes(lines, share, 0.04), spans
+    ).tolist() == [
         0.04,
         0.04,
     ]
@@ -218,7 +225,7 @@ def test_a_line_has_half_its_light_half_a_width_away():
     """Behind thick silicon every photon counts, so light of equal power counts by its
     wavelength.
     """
-    um, share = spectrum.weight(spectrum.Source(850.0, 30.0, silicon_um=1e6))
+    um, share = spectrum.spectral_weight(spectrum.Source(850.0, 30.0, silicon_um=1e6))
     level = np.interp([0.850, 0.835, 0.865, 0.880], um, share)
     assert level[1:] / level[0] == pytest.approx(
         np.array([835, 865, 880]) / 850 * [0.5, 0.5, 1 / 16], rel=1e-9
@@ -231,11 +238,11 @@ def test_gauss_rule_is_exact_for_polynomials_under_the_weight():
     """Eigenvalues and first components are rounded to eps times the matrix and its
     size, and a moment of order n moves
     by n times that: of a span of the line, to the power n."""
-    um, share = spectrum.weight(spectrum.Source(850.0, 30.0))
+    um, share = spectrum.spectral_weight(spectrum.Source(850.0, 30.0))
     assert share.sum() == pytest.approx(1)
     reach = np.abs(um - 0.85).max()
     for count in (1, 2, 5):
-        x, w = spectrum.gauss(um, share, count)
+        x, w = spectrum.gauss_rule(um, share, count)
         for power in range(2 * count):
             budget = (
                 1e-14 * count * max(power, 1) * max(1.0, 0.85 / reach) * reach**power
@@ -248,14 +255,14 @@ def test_gauss_rule_is_exact_for_polynomials_under_the_weight():
 
 
 def test_diode_line_has_its_peak_and_width():
-    um, share = spectrum.weight(
+    um, share = spectrum.spectral_weight(
         spectrum.Source(850.0, 30.0, silicon_um=1e6)
     )  # thick silicon: flat response times λ
     line = share / um
     half = um[line >= line.max() / 2]
     assert (half[0] + half[-1]) / 2 == pytest.approx(0.85, abs=3e-4)
     assert half[-1] - half[0] == pytest.approx(0.03, abs=6e-4)
-    thin = spectrum.weight(spectrum.Source(850.0, 30.0))[1]
+    thin = spectrum.spectral_weight(spectrum.Source(850.0, 30.0))[1]
     assert (thin * um).sum() < (
         share * um
     ).sum()  # thin silicon sees less of the red side
@@ -268,7 +275,7 @@ def test_a_narrow_line_keeps_its_peak_and_width(peak_nm, fwhm_nm):
     """Cut at 2.5 FWHM a Gaussian loses 4e-9; silicon, below 2 % a nm, moves the mean by
     that times its variance.
     """
-    um, share = spectrum.weight(spectrum.Source(peak_nm, fwhm_nm))
+    um, share = spectrum.spectral_weight(spectrum.Source(peak_nm, fwhm_nm))
     mean = (um * share).sum() * 1e3
     sigma = fwhm_nm / math.sqrt(8 * math.log(2))
     assert mean == pytest.approx(peak_nm, abs=0.02 * sigma**2 + 1e-9)
@@ -287,7 +294,9 @@ def test_the_narrowest_line_is_one_wavelength_to_a_lens_of_a_millimetre():
     """Of 1 mm of path the contrast is 1 - (pi path width / wavelength²)² / (4 ln 2) = 1
     - 6.8e-6.
     """
-    found = spectrum.nodes(spectrum.Source(850.0, 1e-3), path_um=1e3, tolerance=1e-5)
+    found = spectrum.spectral_nodes(
+        spectrum.Source(850.0, 1e-3), path_um=1e3, tolerance=1e-5
+    )
     assert found.wavelengths_um == pytest.approx([0.85], abs=1e-8)
     turn = math.pi * 1e3 * 1e-6 / 0.85**2
     assert found.error == pytest.approx(turn**2 / (4 * math.log(2)), rel=0.02)
@@ -299,16 +308,16 @@ def test_the_narrowest_line_is_one_wavelength_to_a_lens_of_a_millimetre():
 )
 def test_a_line_beyond_the_data_of_silicon_is_refused(fwhm_nm, word):
     with pytest.raises(MaterialError, match=word):
-        spectrum.weight(spectrum.Source(850.0, fwhm_nm))
+        spectrum.spectral_weight(spectrum.Source(850.0, fwhm_nm))
 
 
 def test_as_many_wavelengths_as_the_tolerance_needs():
     source = spectrum.Source(850.0, 30.0)
     few, more = (
-        spectrum.nodes(source, path_um=10.0, tolerance=t) for t in (1e-2, 1e-5)
+        spectrum.spectral_nodes(source, path_um=10.0, tolerance=t) for t in (1e-2, 1e-5)
     )
     assert len(few.weights) < len(more.weights)
-    um, share = spectrum.weight(source)
+    um, share = spectrum.spectral_weight(source)
     for found, tolerance in ((few, 1e-2), (more, 1e-5)):
         for path in (0.0, 3.3, 10.0):
             want = np.exp(2j * np.pi * path / um) @ share
@@ -320,36 +329,36 @@ def test_as_many_wavelengths_as_the_tolerance_needs():
                 <= tolerance
             )
     with pytest.raises(PropagationError, match="wavelengths needed"):
-        spectrum.nodes(source, path_um=3000.0, tolerance=1e-6)
+        spectrum.spectral_nodes(source, path_um=3000.0, tolerance=1e-6)
 
 
 def test_sixty_four_wavelengths_are_the_most():
     """As many lines as that are told exactly, by themselves; one more is refused."""
     share = np.random.default_rng(4).uniform(0.5, 2, 65)
     lines = np.linspace(0.8, 0.9, 64)
-    found = spectrum.nodes(
-        spectrum.Measured(lines, share[:64] / share[:64].sum()),
+    found = spectrum.spectral_nodes(
+        spectrum.MeasuredSpectrum(lines, share[:64] / share[:64].sum()),
         path_um=3000.0,
         tolerance=1e-7,
     )
     assert np.sort(found.wavelengths_um) == pytest.approx(lines, rel=1e-9)
-    more = spectrum.Measured(np.linspace(0.8, 0.9, 65), share / share.sum())
+    more = spectrum.MeasuredSpectrum(np.linspace(0.8, 0.9, 65), share / share.sum())
     with pytest.raises(PropagationError, match="more than 64 wavelengths"):
-        spectrum.nodes(more, path_um=3000.0, tolerance=1e-7)
+        spectrum.spectral_nodes(more, path_um=3000.0, tolerance=1e-7)
 
 
 def test_a_bad_row_is_told_by_its_line(tmp_path):
     file = tmp_path / "led.csv"
     file.write_text("# nm, value\n840,1\n850,2\n860 nm?,3\n")
     with pytest.raises(PropagationError, match="line 4 is '860 nm"):
-        spectrum.measured([file], within_um=(0.8, 0.9))
+        spectrum.read_measured_spectrum([file], within_um=(0.8, 0.9))
 
 
 def test_thin_silicon_sees_what_its_absorption_leaves():
     """17 um of silicon at 800 and 900 nm, half-width either side of the peak: 850 and
     306 per cm (Green 2008).
     """
-    um, share = spectrum.weight(spectrum.Source(850.0, 100.0, silicon_um=17.0))
+    um, share = spectrum.spectral_weight(spectrum.Source(850.0, 100.0, silicon_um=17.0))
     blue, red = (float(np.interp(w, um, share)) for w in (0.8, 0.9))
     seen = [w * (1 - np.exp(-a * 17e-4)) for w, a in ((0.8, 850.0), (0.9, 306.0))]
     assert blue / red == pytest.approx(
@@ -363,8 +372,8 @@ def test_thin_silicon_sees_what_its_absorption_leaves():
 
 def test_error_of_the_nodes_is_the_worst_over_the_paths():
     source = spectrum.Source(850.0, 42.0)
-    um, share = spectrum.weight(source)
-    found = spectrum.nodes(source, path_um=17.0, tolerance=3e-3)
+    um, share = spectrum.spectral_weight(source)
+    found = spectrum.spectral_nodes(source, path_um=17.0, tolerance=3e-3)
     paths = np.linspace(0, 17.0, 400)[:, None]
     worst = np.abs(
         np.exp(2j * np.pi * paths / found.wavelengths_um) @ found.weights
@@ -373,7 +382,7 @@ def test_error_of_the_nodes_is_the_worst_over_the_paths():
     assert found.error == pytest.approx(
         worst.max(), rel=0.02
     )  # the largest is at the longest path, or near
-    fewer = spectrum.gauss(um, share, len(found.weights) - 1)
+    fewer = spectrum.gauss_rule(um, share, len(found.weights) - 1)
     missed = (
         np.exp(2j * np.pi * paths / fewer[0]) @ fewer[1]
         - np.exp(2j * np.pi * paths / um) @ share
@@ -403,9 +412,9 @@ def test_a_diode_beyond_the_library_is_refused_with_its_share_and_what_serves():
     widths of 3.2 nm. What is advised is done and not refused, however many wavelengths
     stand for it."""
     source, within = spectrum.Source(850.0, 30.0), (0.84, 0.858)
-    rule = spectrum.nodes(source, path_um=60.0, tolerance=1e-3)
+    rule = spectrum.spectral_nodes(source, path_um=60.0, tolerance=1e-3)
     with pytest.raises(PropagationError) as told:
-        spectrum.known(rule, source, within)
+        spectrum.nodes_inside_library(rule, source, within)
     share = float(re.search(r"and (0\.\d+) of it lies beyond", str(told.value))[1])
     sigma = 30.0 / math.sqrt(8 * math.log(2))
     assert share == pytest.approx(
@@ -421,15 +430,17 @@ def test_a_diode_beyond_the_library_is_refused_with_its_share_and_what_serves():
         (source, (0.775, 0.925)),
     ):
         for count in (2, 7, 64):
-            made = spectrum.Nodes(*spectrum.gauss(*spectrum.points(light), count), 0.0)
-            assert spectrum.known(made, light, known) is made
+            made = spectrum.SpectralNodes(
+                *spectrum.gauss_rule(*spectrum.spectrum_points(light), count), 0.0
+            )
+            assert spectrum.nodes_inside_library(made, light, known) is made
 
 
 def test_pillars_of_one_wavelength_are_known_for_no_line_of_any_width():
     source = spectrum.Source(850.0, 12.0)
-    rule = spectrum.nodes(source, path_um=60.0, tolerance=1e-2)
+    rule = spectrum.spectral_nodes(source, path_um=60.0, tolerance=1e-2)
     with pytest.raises(
         PropagationError,
         match=r"at 850 nm alone, and 1 of it lies beyond: sweep a library over it",
     ):
-        spectrum.known(rule, source, (0.85, 0.85))
+        spectrum.nodes_inside_library(rule, source, (0.85, 0.85))

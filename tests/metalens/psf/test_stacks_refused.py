@@ -8,10 +8,10 @@ import torch
 
 from metalens import psf
 from metalens.cell import Film, Index
+from metalens.core.errors import PropagationError, SceneError
 from metalens.field import Grid, imager
-from metalens.ground.errors import PropagationError, SceneError
 from metalens.lens import Layers, media
-from metalens.psf.spectrum import measured
+from metalens.psf.spectrum import read_measured_spectrum
 
 PHASE = np.random.default_rng(2).uniform(0, 6, (12, 15))
 ABOUT = dict(
@@ -93,7 +93,7 @@ def test_maps_that_are_no_lens(phase, level, words):
 )
 def test_wavelengths_that_are_no_spectrum(waves, weights, words):
     with pytest.raises(PropagationError, match=words):
-        psf.Nodes(np.array(waves), np.array(weights), 0.0)
+        psf.SpectralNodes(np.array(waves), np.array(weights), 0.0)
 
 
 @pytest.mark.parametrize("spectrum", [None, psf.Source(850.0, 10.0)])
@@ -119,7 +119,7 @@ def test_no_lens_is_looked_at_from_nowhere(spectrum):
 
 def test_curves_of_no_file():
     with pytest.raises(PropagationError, match="spectrum: no file"):
-        measured([], within_um=(0.8, 0.9))
+        read_measured_spectrum([], within_um=(0.8, 0.9))
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from metalens.lens import Media
-from metalens.propagate import Case
+from metalens.propagate import PropagationCase
 from metalens.psf import vector
-from metalens.psf.among import Jones
+from metalens.psf.among import NeighbourJonesFactors
 from tests.metalens.psf.test_fields_beyond_faces import fresnel, ray
 
 Z = np.array([0.0, 0.0, 1.0])
 TANGENTS = (0.21, -0.13)
-PLAIN = Case(
+PLAIN = PropagationCase(
     (5, 6), 2.9, 0.85, 31.0, TANGENTS, (1 / 400,), (4.0, -7.5), 0.6, (9, 11), row_um=3.7
 )
 ORDER = (1.52, 1.0, 1.33)
-COVERED = Case((5, 6), 2.9, 0.85, 31.0, TANGENTS, (1 / 400,), (4.0, -7.5), 0.6, (9, 11),
+COVERED = PropagationCase((5, 6), 2.9, 0.85, 31.0, TANGENTS, (1 / 400,), (4.0, -7.5), 0.6, (9, 11),
                behind=Media(ORDER, (9.0, 15.0, 7.0)), row_um=3.7)  # fmt: skip
 AT = np.array([-5.1, 2.3, 6.8]), np.array([-4.4, 3.7])  # rows and columns of the lens
 RNG = np.random.default_rng(11)
@@ -140,7 +140,7 @@ def test_components_add_up_to_the_power_of_both_polarisations(case, flux, apart)
     """Of maps from x to x, y to y and between; of one map alone the flux of light along
     x stands for both.
     """
-    signs, factors = vector.Mixing(flux, apart=apart).pupils(case)(*AT)
+    signs, factors = vector.PolarizationMixing(flux, apart=apart).pupils(case)(*AT)
     light = np.zeros((2, 2, 3, 2), complex)
     light[0, 0], light[1, 1] = LIGHT[0], LIGHT[1] if apart else LIGHT[0]
     if apart:
@@ -151,7 +151,9 @@ def test_components_add_up_to_the_power_of_both_polarisations(case, flux, apart)
     got = float(signs @ (np.abs((factors * maps).sum((1, 2, 3))) ** 2))
     assert got == pytest.approx(want, rel=1e-9)
     assert (
-        factors.shape[1] == vector.Mixing(flux, apart=apart).maps == (3 if apart else 1)
+        factors.shape[1]
+        == vector.PolarizationMixing(flux, apart=apart).maps
+        == (3 if apart else 1)
     )
     assert len(signs) == (
         4 if flux and not apart and case is PLAIN else 8 if flux else 6
@@ -162,13 +164,15 @@ def test_components_that_are_nothing_are_left_out():
     """Of straight light above the middle of the window no ray leaves the plane of x =
     0: light along x has Ex alone.
     """
-    case = Case((5, 6), 2.9, 0.85, 31.0, (0.0, 0.0), (0.0,), (0.0, -7.5), 0.6, (9, 11))
-    signs, factors = vector.Mixing(False).pupils(case)(AT[0], np.zeros(1))
+    case = PropagationCase(
+        (5, 6), 2.9, 0.85, 31.0, (0.0, 0.0), (0.0,), (0.0, -7.5), 0.6, (9, 11)
+    )
+    signs, factors = vector.PolarizationMixing(False).pupils(case)(AT[0], np.zeros(1))
     assert (
         len(signs) == len(factors) == 3
     )  # Ex of light along x, Ey and Ez of light along y
     assert signs.tolist() == [1.0, 1.0, 1.0]
-    signs, factors = vector.Mixing(True).pupils(case)(AT[0], np.zeros(1))
+    signs, factors = vector.PolarizationMixing(True).pupils(case)(AT[0], np.zeros(1))
     assert signs.tolist() == [1.0, -1.0]
     cosine = 31.0 / np.hypot(31.0, AT[0] + 7.5)
     for got, want in zip(
@@ -194,11 +198,11 @@ def test_squares_of_a_turned_field_add_up_to_twice_one_over_the_cosine():
         torch.from_numpy(COMES),
         torch.from_numpy(np.moveaxis(towards(PLAIN)[:, :, 0], -1, 0).copy()),
     )
-    got = vector.turned(a, b)
+    got = vector.transmitted_polarization(a, b)
     assert (got**2).sum(0).numpy() == pytest.approx((2 / b[2]).numpy(), rel=1e-12)
     want = np.moveaxis(fields(PLAIN), -1, 1).reshape(6, 3, 2)
     assert got.numpy() == pytest.approx(want, rel=1e-12, abs=1e-13)
-    still = vector.turned(
+    still = vector.transmitted_polarization(
         torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
     )
     assert still.tolist() == [1, 0, 0, 0, 1, 0]
@@ -206,20 +210,24 @@ def test_squares_of_a_turned_field_add_up_to_twice_one_over_the_cosine():
 
 def test_power_of_maps_apart_counts_what_goes_between_polarisations_for_both():
     levels = torch.from_numpy(RNG.uniform(0.2, 1, (3, 5, 6)))
-    assert vector.Mixing(True, apart=True).power(
+    assert vector.PolarizationMixing(True, apart=True).power(
         PLAIN, (3.0, 5.0, 11.0), levels
     ) == pytest.approx(1.5 + 2.5 + 11.0)
-    assert vector.Mixing(True).power(PLAIN, (3.0,), levels[:1]) == pytest.approx(3.0)
+    assert vector.PolarizationMixing(True).power(
+        PLAIN, (3.0,), levels[:1]
+    ) == pytest.approx(3.0)
     steep = []
     for level in levels.numpy():
         y, x = (np.arange(5) - 2) * 3.7, (np.arange(6) - 2.5) * 2.9
         cosine = 31.0 / np.sqrt(31.0**2 + (x - 4.0) ** 2 + (y[:, None] + 7.5) ** 2)
         steep.append(float((level**2 / cosine).sum() / (level**2).sum()))
     want = 1.5 * steep[0] + 2.5 * steep[1] + 11 * steep[2]
-    assert vector.Mixing(False, apart=True).power(
+    assert vector.PolarizationMixing(False, apart=True).power(
         PLAIN, (3.0, 5.0, 11.0), levels
     ) == pytest.approx(want, rel=1e-12)
-    dark = vector.Mixing(False, apart=True).power(PLAIN, (3.0, 0.0, 11.0), levels)
+    dark = vector.PolarizationMixing(False, apart=True).power(
+        PLAIN, (3.0, 0.0, 11.0), levels
+    )
     assert dark == pytest.approx(want - 2.5 * steep[1], rel=1e-12)
 
 
@@ -248,7 +256,7 @@ def test_maps_apart_are_the_map_times_each_factor_wavelength_by_wavelength():
     factors = [
         RNG.normal(size=(2, 3, 4)) + 1j * RNG.normal(size=(2, 3, 4)) for _ in range(3)
     ]
-    jones = Jones(*map(torch.from_numpy, factors))
+    jones = NeighbourJonesFactors(*map(torch.from_numpy, factors))
     got = vector.apart_maps((torch.from_numpy(phase), torch.from_numpy(level)), jones)
     made = torch.polar(got[1], got[0]).numpy()
     want = [
@@ -269,8 +277,8 @@ def test_mixtures_keep_the_light_of_the_nodes_and_all_of_them_every_power(count)
     pupils[3] = 2 * pupils[0] - pupils[1]
     signs, weight = np.array([1.0, 1.0, 1.0, -1.0]), RNG.uniform(0.5, 2, 7)
     pupils[3] *= 0.1
-    found = vector.strongest(
-        vector.Mixed(torch.from_numpy(pupils), tuple(signs)),
+    found = vector.dominant_components(
+        vector.VectorPupil(torch.from_numpy(pupils), tuple(signs)),
         torch.from_numpy(weight),
         count,
     )

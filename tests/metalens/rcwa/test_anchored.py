@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell import Cell, Film, Index, Light
-from metalens.ground.errors import CellError
+from metalens.cell import Cell, Film, Incidence, Index
+from metalens.core.errors import CellError
 from metalens.rcwa import anchored
 from metalens.rcwa.anchored import node_diameters, solve_anchored, upright_cell
 
 UPRIGHT = Cell(0.33, 0.61, Index(2.6), Index(1.46), Index(1.04), Index(1.0))
 TILTED = replace(UPRIGHT, sidewall_rad=0.027)
 WAVELENGTH, DIAMETER = 0.87, 0.162
-LIGHT = Light(WAVELENGTH)
+LIGHT = Incidence(WAVELENGTH)
 
 
 def test_upright_limit_is_the_modal_answer():

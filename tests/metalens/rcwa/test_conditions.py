@@ -8,7 +8,7 @@ import pytest
 
 from metalens import rcwa
 from metalens.cell import Cell, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa import conditions
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from metalens import rcwa
-from metalens.cell import Cell, Index, Light
+from metalens.cell import Cell, Incidence, Index
 from metalens.cell.shapes import Rectangle
 from metalens.rcwa import anchored, any_shape, solver, wall
 from metalens.rcwa.anchored import ReferencePillars
@@ -18,7 +18,7 @@ from metalens.rcwa.conditions import disc_case
 from metalens.rcwa.solver import TruncatedResponse
 
 CELL = Cell(0.4, 0.5, Index(3.5), Index(1.45))
-LIGHT = Light(0.85)
+LIGHT = Incidence(0.85)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_bars_hold_where_truncations_swing_slowly(cell, asked, exact):
     """
     found = rcwa.solve(cell, asked[0], asked[1], harmonics=asked[2])
     error = max(abs(found.t - exact[0]), abs(found.r - exact[1]))
-    this = disc_case(cell, Light(asked[1]))
+    this = disc_case(cell, Incidence(asked[1]))
     four = [
         solver.solve_truncated(this, np.array([asked[0]]), n).both
         for n in range(asked[2] - 4, asked[2] + 1)
@@ -359,7 +359,7 @@ def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(
     def truncated(this, reach, stages):
         assert stages == (5 if wall_rad else 0)
         t = np.diag([0.6 + 0.1 / reach**2, 0.5j])
-        return any_shape.Jones(
+        return any_shape.JonesResponse(
             ("x", "y"), t, 0.2 * t, math.nan, np.ones(2), 0, False, ""
         )
 
@@ -388,7 +388,7 @@ def test_a_bar_is_no_wider_than_to_the_farthest_that_a_passive_cell_may_be(
 
     def truncated(this, reach, stages):
         t = np.diag([most * (-1) ** reach, 0.5j])
-        return any_shape.Jones(
+        return any_shape.JonesResponse(
             ("x", "y"), t, 0.2 * t, math.nan, np.ones(2), 0, False, ""
         )
 
@@ -405,7 +405,7 @@ def test_a_round_pillar_s_bar_is_no_wider_either(monkeypatch, most, want):
 
     monkeypatch.setattr(solver, "solve_truncated", truncated)
     (found,) = solver.solve_case(
-        disc_case(CELL, Light(0.85)), np.array([0.23]), tolerance=1e-3, harmonics=9
+        disc_case(CELL, Incidence(0.85)), np.array([0.23]), tolerance=1e-3, harmonics=9
     )
     assert found.t_error == pytest.approx(want, rel=1e-12)
 
@@ -425,7 +425,7 @@ def test_tilted_walls_climb_as_far_as_some_seconds_allow(
     def truncated(this, reach, stages):
         asked.append((reach, bool(stages)))
         t = np.eye(2) * (0.6 + 0.3 / reach)
-        return any_shape.Jones(
+        return any_shape.JonesResponse(
             ("x", "y"), t, t / 2, math.inf, np.ones(2), reach, False, ""
         )
 

@@ -10,7 +10,7 @@ import pytest
 from metalens.cell import Cell, Index
 from metalens.cell.record import Layer
 from metalens.cell.shapes import Rectangle
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa import made, pattern
 
 LAYERS = (Layer(0.12, 0.03), Layer(0.4), Layer(0.08, -0.02))

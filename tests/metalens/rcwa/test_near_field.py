@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell import Cell, Film, Index, Lattice, Light
+from metalens.cell import Cell, Film, Incidence, Index, Lattice
 from metalens.cell.shapes import Rectangle, Ring
-from metalens.ground.errors import CellError
-from metalens.rcwa import Grid, near, near_field, near_fields
+from metalens.core.errors import CellError
+from metalens.rcwa import FieldGrid, near, near_field, near_fields
 
 WAVELENGTH = 0.81
 K0 = 2 * math.pi / WAVELENGTH
@@ -93,7 +93,7 @@ def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(
     medium = Index(slab.real, slab.imag)
     films = {"under": (Film(Index(1.9), 0.07),), "over": (Film(Index(1.3, 0.2), 0.11),)}
     cell = Cell(0.37, 0.47, medium, Index(1.46), Index(1.1), medium, **films)
-    light = Light(WAVELENGTH, 0.5, polarization, 0.6)
+    light = Incidence(WAVELENGTH, 0.5, polarization, 0.6)
     z = np.linspace(-0.43, 0.91, 24)
     got = near_field(
         cell, 0.2, light, x_um=[0.03, 0.11], y_um=[-0.07], z_um=z, harmonics=2
@@ -114,13 +114,13 @@ def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(
 @pytest.mark.parametrize(
     ("light", "incident"),
     [
-        (Light(WAVELENGTH, 0.0, "y"), (0, 1)),
-        (Light(WAVELENGTH, 0.0, "p", 0.7), (math.cos(0.7), math.sin(0.7))),
-        (Light(WAVELENGTH, 0.0, "s", 0.7), (-math.sin(0.7), math.cos(0.7))),
-        (Light(WAVELENGTH, 0.3, "x", math.pi / 2), (1, 0)),
-        (Light(WAVELENGTH, 0.3, "y", math.pi), (0, 1)),
+        (Incidence(WAVELENGTH, 0.0, "y"), (0, 1)),
+        (Incidence(WAVELENGTH, 0.0, "p", 0.7), (math.cos(0.7), math.sin(0.7))),
+        (Incidence(WAVELENGTH, 0.0, "s", 0.7), (-math.sin(0.7), math.cos(0.7))),
+        (Incidence(WAVELENGTH, 0.3, "x", math.pi / 2), (1, 0)),
+        (Incidence(WAVELENGTH, 0.3, "y", math.pi), (0, 1)),
         (
-            Light(WAVELENGTH, 0.3, "p", math.pi),
+            Incidence(WAVELENGTH, 0.3, "p", math.pi),
             (-math.sqrt(1 - (math.sin(0.3) / 1.46) ** 2), 0),
         ),
     ],
@@ -150,7 +150,13 @@ def test_power_through_every_plane_of_a_lossless_cell_is_that_which_leaves():
     """
     x, z = _middles(40, 0.36), [-0.3, -0.01, 0.1, 0.27, 0.44, 0.46, 0.9]
     got = near_field(
-        ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), x_um=x, y_um=x, z_um=z, harmonics=7
+        ROUND,
+        SIZE,
+        Incidence(WAVELENGTH, 0.3, "p"),
+        x_um=x,
+        y_um=x,
+        z_um=z,
+        harmonics=7,
     )
     flux = (got.e[0] * got.h[1].conj() - got.e[1] * got.h[0].conj()).real.mean(
         axis=(1, 2)
@@ -170,7 +176,9 @@ def test_what_the_field_heats_is_what_the_modal_engine_misses():
     cell = dataclasses.replace(ROUND, pillar=Index(3.1, 0.25))
     points, weights = np.polynomial.legendre.leggauss(12)
     x, z = _middles(48, 0.36), (points + 1) / 2 * 0.45
-    got = near_field(cell, SIZE, Light(WAVELENGTH), x_um=x, y_um=x, z_um=z, harmonics=8)
+    got = near_field(
+        cell, SIZE, Incidence(WAVELENGTH), x_um=x, y_um=x, z_um=z, harmonics=8
+    )
     inside = got.index[0].imag > 0
     mean = (np.abs(got.e) ** 2).sum(axis=0)[:, inside].mean(axis=1) @ weights / 2 * 0.45
     share = K0 * (2 * 3.1 * 0.25) * mean * (math.pi / 4 * SIZE**2 / 0.36**2) / 1.46
@@ -187,7 +195,7 @@ def test_fields_of_both_sides_give_the_derivative_of_t_that_the_modal_engine_has
     back = dataclasses.replace(ROUND, substrate=ROUND.cover, cover=ROUND.substrate)
     grid = {"x_um": x, "y_um": x, "z_um": z, "harmonics": 8}
     one, other = (
-        near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, back)
+        near_field(cell, SIZE, Incidence(WAVELENGTH), **grid) for cell in (ROUND, back)
     )
     mirrored = (
         other.e[:, ::-1] * np.array([1, 1, -1])[:, None, None, None]
@@ -214,9 +222,11 @@ def test_fields_keep_maxwells_equations_away_from_the_wall():
     seven per cent off.
     """
     step, middles = 2e-3, ((0.01, 0.02, 0.2), (-0.12, 0.13, 0.1), (0.16, 0.02, 0.3))
-    grids = [Grid(*(c + step * np.arange(-1, 2) for c in middle)) for middle in middles]
+    grids = [
+        FieldGrid(*(c + step * np.arange(-1, 2) for c in middle)) for middle in middles
+    ]
     for got in near_fields(
-        ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), grids, harmonics=10
+        ROUND, SIZE, Incidence(WAVELENGTH, 0.3, "p"), grids, harmonics=10
     ):
         eps = got.index[1, 1, 1] ** 2
         for field, want in ((got.e, 1j * K0 * got.h), (got.h, -1j * K0 * eps * got.e)):
@@ -237,7 +247,7 @@ def test_tangential_fields_are_continuous_and_normal_ones_jump_as_eps_does():
     """
     a = math.radians(40)
     n = np.array([math.cos(a), math.sin(a)])
-    light = Light(WAVELENGTH, 0.0, "x")
+    light = Incidence(WAVELENGTH, 0.0, "x")
     inner, outer = (
         near_field(
             ROUND,
@@ -270,11 +280,11 @@ def test_tangential_fields_are_continuous_and_normal_ones_jump_as_eps_does():
 @pytest.mark.parametrize("lattice", [Lattice("hexagonal"), Lattice("rectangular", 1.2)])
 def test_fields_repeat_from_site_to_site_with_the_phase_of_the_light(lattice):
     cell = dataclasses.replace(ROUND, lattice=lattice, shape=Ring(0.4))
-    light = Light(WAVELENGTH, 0.4, "s", 0.3)
+    light = Incidence(WAVELENGTH, 0.4, "s", 0.3)
     step = np.array((0.18, 0.18 * math.sqrt(3)) if lattice.centred else (0.36, 0.432))
     x, y, z = np.array([0.02, 0.11]), np.array([-0.08, 0.05]), [-0.1, 0.2, 0.6]
-    here = Grid(x, y, z)
-    there = Grid(x + step[0], y + step[1], z)
+    here = FieldGrid(x, y, z)
+    there = FieldGrid(x + step[0], y + step[1], z)
     one, other = near_fields(cell, SIZE, light, [here, there], harmonics=4)
     turn = np.exp(
         1j * K0 * math.sin(0.4) * (math.cos(0.3) * step[0] + math.sin(0.3) * step[1])
@@ -297,13 +307,13 @@ def test_a_cell_turned_by_a_quarter_has_the_field_turned():
         one = near_field(
             flat,
             0.24,
-            Light(WAVELENGTH, angle, "p", 0.0),
+            Incidence(WAVELENGTH, angle, "p", 0.0),
             x_um=x,
             y_um=y,
             z_um=z,
             harmonics=4,
         )
-        light = Light(WAVELENGTH, angle, "p", math.pi / 2)
+        light = Incidence(WAVELENGTH, angle, "p", math.pi / 2)
         other = near_field(
             upright, 0.24, light, x_um=-y[::-1], y_um=x, z_um=z, harmonics=4
         )
@@ -324,7 +334,8 @@ def test_a_wall_in_steps_that_is_all_but_upright_is_the_upright_wall():
     }
     tilted = dataclasses.replace(ROUND, sidewall_rad=1e-6)
     one, other = (
-        near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, tilted)
+        near_field(cell, SIZE, Incidence(WAVELENGTH), **grid)
+        for cell in (ROUND, tilted)
     )
     assert np.abs(one.e - other.e).max() < 1e-4
 
@@ -340,7 +351,7 @@ def test_a_leaning_wall_is_wide_at_its_foot_in_twelve_steps(tilt):
     )
     z = (np.arange(12) + 0.3) / 12 * 0.45
     got = near_field(
-        cell, SIZE, Light(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1
+        cell, SIZE, Incidence(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1
     )
     wide = (got.index[:, 0].real > 1.7).sum(1) * 0.001
     want = SIZE - 2 * ((np.arange(12) + 0.5) / 12 * 0.45 - 0.225) * math.tan(tilt)
@@ -357,19 +368,20 @@ def test_the_error_bar_holds_against_more_orders():
         "z_um": np.linspace(-0.1, 0.6, 15),
     }
     few, many = (
-        near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n) for n in (7, 14)
+        near_field(ROUND, SIZE, Incidence(WAVELENGTH), **grid, harmonics=n)
+        for n in (7, 14)
     )
     error = np.linalg.norm(few.e - many.e) / np.linalg.norm(many.e)
     assert 0.01 < error < few.error < 0.25
     steps = [
-        near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n).e
+        near_field(ROUND, SIZE, Incidence(WAVELENGTH), **grid, harmonics=n).e
         for n in (1, 2, 3, 4, 5, 6)
     ]
     farthest = max(np.linalg.norm(e - steps[4]) for e in steps[:4])
     assert few.error == pytest.approx(
         2.5 * max(np.linalg.norm(e - few.e) for e in steps[2:]) / np.linalg.norm(few.e)
     )
-    rough = near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=5)
+    rough = near_field(ROUND, SIZE, Incidence(WAVELENGTH), **grid, harmonics=5)
     assert rough.error == pytest.approx(
         min(2.0, 7.8 * farthest / np.linalg.norm(rough.e))
     )
@@ -387,11 +399,11 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
         "z_um": np.linspace(-0.1, 0.6, 6),
     }
     runs = [
-        near_field(cell, SIZE, Light(WAVELENGTH), **grid, harmonics=n)
+        near_field(cell, SIZE, Incidence(WAVELENGTH), **grid, harmonics=n)
         for n in (1, 2, 3, 4, 5)
     ]
     monkeypatch.setattr(near, "_STEPS", 2)
-    half = near_field(cell, SIZE, Light(WAVELENGTH), **grid, harmonics=3)
+    half = near_field(cell, SIZE, Incidence(WAVELENGTH), **grid, harmonics=3)
     cut = np.linalg.norm(half.e - runs[2].e) / np.linalg.norm(runs[2].e)
     farthest = max(
         np.linalg.norm(run.e - runs[4].e) for run in runs[:4]
@@ -401,10 +413,10 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
 
 
 def test_what_cannot_be_computed_is_refused():
-    light = Light(WAVELENGTH)
+    light = Incidence(WAVELENGTH)
     for axis in ([], [math.nan], [[0.0]]):
         with pytest.raises(CellError, match="y_um has shape"):
-            Grid([0.0], axis, [0.0])
+            FieldGrid([0.0], axis, [0.0])
     with pytest.raises(CellError, match="9000000 points"):
         near_field(
             ROUND, SIZE, light, x_um=np.zeros(3000), y_um=np.zeros(3000), z_um=[0.0]

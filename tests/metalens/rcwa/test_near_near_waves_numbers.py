@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from metalens.cell import Cell, Film, Index, Lattice, Light
+from metalens.cell import Cell, Film, Incidence, Index, Lattice
 from metalens.cell.record import Layer
 from metalens.cell.shapes import Ellipse, Polygon, Rectangle
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa import near, near_waves, pattern
-from metalens.rcwa.near import Grid
+from metalens.rcwa.near import FieldGrid
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY
 from metalens.rcwa.orders.waves import half_space
@@ -123,7 +123,7 @@ def test_the_wave_that_comes_has_its_field_along_the_axis_that_is_named(
     polarization, angle, azimuth, want
 ):
     assert near_waves.incident_amplitudes(
-        Light(WAVE, angle, polarization, azimuth)
+        Incidence(WAVE, angle, polarization, azimuth)
     ) == pytest.approx(want, abs=1e-15)
 
 
@@ -192,7 +192,7 @@ def test_a_class_that_the_light_has_no_part_in_is_left_out():
         space = mirrors.reduced_orders(1, pattern.lattice_frame(CELL, operations))
         for polarization in "xy":
             one = near_waves.solve_class(
-                this, slabs, Light(WAVE, 0.0, polarization), space
+                this, slabs, Incidence(WAVE, 0.0, polarization), space
             )
             assert (one is not None) is (polarization == held)
 
@@ -207,7 +207,7 @@ def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interfac
     this = cell_problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
     space = mirrors.reduced_orders(1, pattern.lattice_frame(upright, (IDENTITY,)))
-    one = near_waves.solve_class(this, slabs, Light(WAVE, 0.3, "s", 0.7), space)
+    one = near_waves.solve_class(this, slabs, Incidence(WAVE, 0.3, "s", 0.7), space)
     ends = near_waves.interface_heights(this, slabs) / K0
     gap = 1e-9
     below = near_waves._heights(this, slabs, one, ends - gap)
@@ -250,7 +250,7 @@ def test_the_displacement_across_interfaces_is_continuous():
     this = cell_problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
     space = mirrors.reduced_orders(1, pattern.lattice_frame(upright, (IDENTITY,)))
-    one = near_waves.solve_class(this, slabs, Light(WAVE, 0.3, "p", 0.7), space)
+    one = near_waves.solve_class(this, slabs, Incidence(WAVE, 0.3, "p", 0.7), space)
     ends, gap = near_waves.interface_heights(this, slabs) / K0, 1e-9
     sections = [
         mirrors.toeplitz_product(
@@ -314,7 +314,7 @@ def test_points_see_the_media_that_they_lie_in():
     from below.
     """
     slabs = near_waves.slabs_of(THIS, 1)
-    grid = Grid(
+    grid = FieldGrid(
         np.array([0.0, 0.08, 0.15]),
         np.array([0.03, -0.1]),
         np.array([-0.5, -0.07, 0.05, 0.3, 0.5, 0.7]),
@@ -357,7 +357,7 @@ def test_normals_that_lie_between_the_axes_have_all_three_products():
     )
     slabs = near_waves.slabs_of(this, 1)
     x, y = np.array([0.07, -0.1, 0.02]), np.array([0.06, -0.03])
-    looks = near._looks(this, slabs, Grid(x, y, [0.1]))
+    looks = near._looks(this, slabs, FieldGrid(x, y, [0.1]))
     n, weight = pattern.normals_at(
         slabs[2].section.outlines, this.cell, *np.meshgrid(x, y)
     )
@@ -375,7 +375,7 @@ def test_axes_of_points_are_lists_of_finite_lengths(axis):
     good = {"x_um": [0.0], "y_um": [0.1], "z_um": [0.2]}
     for wrong in ([], [[0.0]], [math.nan], [0.0, math.inf]):
         with pytest.raises(CellError, match=f"{axis} has shape"):
-            Grid(**(good | {axis: wrong}))
+            FieldGrid(**(good | {axis: wrong}))
 
 
 def test_the_error_of_a_field_is_the_farthest_truncation_before_times_its_factor():
@@ -383,7 +383,7 @@ def test_the_error_of_a_field_is_the_farthest_truncation_before_times_its_factor
     the field, doubled.
     """
     cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
-    light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
+    light, grid = Incidence(WAVE, 0.0, "x"), FieldGrid([0.02, 0.09], [0.05], [0.1, 0.5])
     fields = {
         n: near.near_fields(cell, SIZE, light, [grid], harmonics=n)[0]
         for n in (1, 2, 3)
@@ -409,7 +409,7 @@ def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_
     harmonics, factor
 ):
     cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
-    light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
+    light, grid = Incidence(WAVE, 0.0, "x"), FieldGrid([0.02, 0.09], [0.05], [0.1, 0.5])
     this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
     stack = near._stack(this, 1, [grid])
     every = [
@@ -435,7 +435,7 @@ def test_a_field_on_one_grid_is_that_of_its_axes():
         Cell(0.36, shape=Rectangle(0.6), **ABOUT),
         ([0.02, 0.09, -0.1], [0.05], [0.1, 0.5]),
     )
-    light = Light(WAVE, 0.3, "p", 0.7)
+    light = Incidence(WAVE, 0.3, "p", 0.7)
     one = near.near_field(
         cell,
         SIZE,
@@ -447,7 +447,7 @@ def test_a_field_on_one_grid_is_that_of_its_axes():
         tolerance=0.3,
     )
     (same,) = near.near_fields(
-        cell, SIZE, light, [Grid(*axes)], harmonics=1, tolerance=0.3
+        cell, SIZE, light, [FieldGrid(*axes)], harmonics=1, tolerance=0.3
     )
     assert one.e.shape == (3, 2, 1, 3)
     assert np.array_equal(one.e, same.e)
@@ -459,7 +459,7 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
     """Of two steps, whose normals are quickly found."""
     monkeypatch.setattr(near, "_STEPS", 2)
     cell = Cell(0.36, shape=Rectangle(0.6), sidewall_rad=0.04, **ABOUT)
-    light, grid = Light(WAVE, 0.0, "x"), Grid([0.02], [0.05], [0.1, 0.5])
+    light, grid = Incidence(WAVE, 0.0, "x"), FieldGrid([0.02], [0.05], [0.1, 0.5])
     this = cell_problem(cell, SIZE, WAVE, 0.0, 0.0)
     fields = {
         (steps, n): near._fields(

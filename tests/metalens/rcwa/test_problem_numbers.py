@@ -9,7 +9,7 @@ import pytest
 
 from metalens.cell import Cell, Film, Index, Lattice
 from metalens.cell.shapes import Polygon, Rectangle
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa import pattern, problem
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY

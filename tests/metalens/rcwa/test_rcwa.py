@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metalens import rcwa
-from metalens.cell.light import Light
+from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
-from metalens.ground.errors import CellError, MaterialError
+from metalens.core.errors import CellError, MaterialError
 from metalens.rcwa.conditions import case_waves, disc_case
 from metalens.rcwa.layer import disc_operators, solve_eigenmodes
 from metalens.rcwa.solver import solve_truncated
@@ -92,7 +92,7 @@ def test_hard_homogeneous_layer_is_the_film_of_the_closed_form(direction, n):
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_hard_pillar_of_air_goes_through_the_modes_and_gives_the_film(direction):
-    this = disc_case(replace(CELL, pillar="air"), Light(WAVELENGTH, **direction))
+    this = disc_case(replace(CELL, pillar="air"), Incidence(WAVELENGTH, **direction))
     got = solve_truncated(this, np.array([0.0, 0.01, 0.2, 0.4]), 4)
     sine = math.sin(direction.get("angle_rad", 0.0))
     t, r = fresnel_stack(
@@ -232,7 +232,7 @@ def test_swap_of_sides_with_a_tilted_wall():
     [("x", DIRECTIONS[0]), ("p", DIRECTIONS[1]), ("s", DIRECTIONS[2])],
 )
 def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
-    this = disc_case(CELL, Light(WAVELENGTH, **direction))
+    this = disc_case(CELL, Incidence(WAVELENGTH, **direction))
     assert this.symmetry == symmetry
     reduced, whole = (
         solve_truncated(some, np.array([0.12, 0.25]), 4)
@@ -243,7 +243,7 @@ def test_symmetry_changes_nothing_but_the_work(symmetry, direction):
 
 
 def test_hard_x_and_y_are_degenerate_without_the_help_of_symmetry():
-    this = replace(disc_case(CELL, Light(WAVELENGTH)), symmetry="none")
+    this = replace(disc_case(CELL, Incidence(WAVELENGTH)), symmetry="none")
     x, y = (
         solve_truncated(replace(this, wave=wave), np.array([0.2]), 4).t[0]
         for wave in "ps"
@@ -418,7 +418,7 @@ def test_many_diameters_are_what_each_one_is_alone():
 
 def plain_slices(cell, diameter_um, harmonics, slices):
     """t of a staircase of upright layers, the plain way."""
-    this = disc_case(cell, Light(WAVELENGTH))
+    this = disc_case(cell, Incidence(WAVELENGTH))
     ways, zero = case_waves(this, harmonics)
     step = cell.height_um * math.tan(cell.sidewall_rad) / slices
     widths = diameter_um - step * (2 * np.arange(slices) + 1 - slices)
@@ -435,7 +435,7 @@ def plain_slices(cell, diameter_um, harmonics, slices):
 @pytest.mark.parametrize("tilt_deg", [2, -2])
 def test_tilted_wall_is_the_limit_of_plain_slices(tilt_deg):
     cell = replace(CELL, sidewall_rad=math.radians(tilt_deg))
-    this = disc_case(cell, Light(WAVELENGTH))
+    this = disc_case(cell, Incidence(WAVELENGTH))
     coarse, fine = (plain_slices(cell, 0.15, 3, slices) for slices in (32, 64))
     limit = fine + (fine - coarse) / 3  # second order, Richardson: 1e-6 left
     t = {

@@ -9,7 +9,7 @@ import pytest
 
 from metalens import rcwa
 from metalens.cell import Cell, Index
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 PLAIN = Cell(0.4, 0.7, pillar=Index(3.6), substrate=Index(1.4525))
 DIFFERENCES = (4 / 5, -1 / 5, 4 / 105, -1 / 280)

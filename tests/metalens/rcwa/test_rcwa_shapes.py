@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from metalens import modal, rcwa
-from metalens.cell import Cell, Film, Index, Lattice, Layer, Light
+from metalens.cell import Cell, Film, Incidence, Index, Lattice, Layer
 from metalens.cell.orders import check_subwavelength
 from metalens.cell.shapes import (
     Circle,
@@ -19,7 +19,7 @@ from metalens.cell.shapes import (
     RegularPolygon,
     Ring,
 )
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa.any_shape import truncation_sequence
 from metalens.rcwa.problem import cell_problem
 
@@ -264,7 +264,7 @@ def test_no_harmonics_at_all_are_refused_by_every_verb(harmonics):
         lambda: rcwa.jones(cell, 0.25, WAVE, **about),
         lambda: rcwa.solve(cell, 0.25, WAVE, **about),
         lambda: rcwa.near_field(
-            cell, 0.25, Light(WAVE), x_um=[0.0], y_um=[0.0], z_um=[0.1], **about
+            cell, 0.25, Incidence(WAVE), x_um=[0.0], y_um=[0.0], z_um=[0.1], **about
         ),
     ):
         with pytest.raises(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from metalens import rcwa
-from metalens.cell import Cell, Index, Layer, Light
+from metalens.cell import Cell, Incidence, Index, Layer
 from metalens.cell.shapes import Rectangle
 from metalens.rcwa import wall
 from metalens.rcwa.conditions import disc_case
@@ -19,7 +19,7 @@ TILTED = Cell(0.31, 0.63, Index(3.5), Index(1.47), Index(1.03), sidewall_rad=0.0
 
 
 def of(cell):
-    return disc_case(cell, Light(0.87))
+    return disc_case(cell, Incidence(0.87))
 
 
 def test_gauss_integrals_are_those_of_polynomials():

@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from metalens.view import (
-    Axis,
-    Classes,
-    Curves,
-    Images,
-    Numbers,
-    Points,
+    ClassMapPanel,
+    CurvePanel,
+    ImagePanel,
+    PointPanel,
+    SliderAxis,
+    TablePanel,
     at_brightest,
     page,
 )
@@ -38,7 +38,7 @@ def _colour(share):
 
 
 def _told(folder, panels, script, *, width=1440):
-    page.write(folder / "page.html", "page", panels)
+    page.write_page(folder / "page.html", "page", panels)
     return told(folder / "page.html", script, width=width)
 
 
@@ -60,7 +60,7 @@ def test_an_image_has_the_colours_of_its_values(tmp_path):
     values[0] *= 0.4  # the first one is shown on its own scale
     drawn = _canvas(
         tmp_path,
-        [Images("psf", values, [Axis("depth", [1.0, 2.0], "mm")], 0.5)],
+        [ImagePanel("psf", values, [SliderAxis("depth", [1.0, 2.0], "mm")], 0.5)],
         "canvas.image",
     )
     wanted = _colour(values[0] / values[0].max())
@@ -77,10 +77,10 @@ def test_images_that_blink_share_a_scale(tmp_path):
     values = np.random.default_rng(6).uniform(0, 1, (2, 2, 5, 5))
     values[1] *= 2.7  # brighter than what is shown first
     axes = [
-        Axis("shown", ["captured", "fitted"], blink=True),
-        Axis("frame", ["a", "b"]),
+        SliderAxis("shown", ["captured", "fitted"], blink=True),
+        SliderAxis("frame", ["a", "b"]),
     ]
-    drawn = _canvas(tmp_path, [Images("frames", values, axes, 0.5)], "canvas.image")
+    drawn = _canvas(tmp_path, [ImagePanel("frames", values, axes, 0.5)], "canvas.image")
     wanted = _colour(values[0, 0] / values[:, 0].max())
     assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
 
@@ -89,10 +89,14 @@ def test_sliders_stand_at_the_image_with_the_highest_peak(tmp_path):
     values = np.random.default_rng(8).uniform(0, 1, (2, 3, 5, 5))
     values[1, 2, 0, 4] = 3.0
     axes = at_brightest(
-        [Axis("field angle", ["a", "b"]), Axis("depth", [1.0, 2.0, 3.0], "mm")], values
+        [
+            SliderAxis("field angle", ["a", "b"]),
+            SliderAxis("depth", [1.0, 2.0, 3.0], "mm"),
+        ],
+        values,
     )
     assert [axis.first for axis in axes] == [1, 2]
-    drawn = _canvas(tmp_path, [Images("psf", values, axes, 0.5)], "canvas.image")
+    drawn = _canvas(tmp_path, [ImagePanel("psf", values, axes, 0.5)], "canvas.image")
     wanted = _colour(values[1, 2] / 3.0)
     assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
 
@@ -107,7 +111,9 @@ def test_a_map_far_away_is_the_mean_over_its_sites_and_shows_no_false_lenses(tmp
         np.uint8
     )
     sizes = np.linspace(80.0, 207.0, 64)
-    drawn = _canvas(tmp_path, [Classes("mask", index, sizes, 0.3, "nm")], "canvas.map")
+    drawn = _canvas(
+        tmp_path, [ClassMapPanel("mask", index, sizes, 0.3, "nm")], "canvas.map"
+    )
     high, wide = drawn.shape[:2]
     scale = min(wide, high) / n * 0.98
     rows, columns = (
@@ -138,15 +144,17 @@ def _everything():
     x = np.linspace(1, 3, 17)
     long = "a word-of-great-length_" * 9
     return [
-        Images(
+        ImagePanel(
             "image",
             np.random.default_rng(4).uniform(0, 1, (3, 40, 40)),
-            [Axis("depth", [1, 2, 3])],
+            [SliderAxis("depth", [1, 2, 3])],
             0.3,
             optics=True,
         ),
-        Curves("line", x, "x", {"y": 0.99999 + 1e-7 * x}, "y", errors={"y": 1e-8 * x}),
-        Numbers(
+        CurvePanel(
+            "line", x, "x", {"y": 0.99999 + 1e-7 * x}, "y", errors={"y": 1e-8 * x}
+        ),
+        TablePanel(
             "table",
             ("name", "value", "from", "to"),
             [(long, 1.2345e-11, -3.25, 4.5), ("b", 2.0, 1.0, 3.0)],
@@ -183,7 +191,7 @@ def test_a_curve_with_gaps_is_drawn_but_for_these(tmp_path, gap):
     wide = []
     for y in (2.0 + x, values):
         drawn = _canvas(
-            tmp_path, [Curves("line", x, "x", {"y": y}, "y")], ".uplot canvas"
+            tmp_path, [CurvePanel("line", x, "x", {"y": y}, "y")], ".uplot canvas"
         )
         wide.append(
             int((np.ptp(drawn, axis=-1) > 40).any(0).sum())
@@ -198,13 +206,13 @@ def test_a_curve_with_gaps_is_drawn_but_for_these(tmp_path, gap):
 def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):
     values = np.random.default_rng(9).uniform(0, 3.25, (7, 11))
     values[2, 3] = 3.25
-    panel = Images("psf", values, [], 0.5, unit="electrons")
+    panel = ImagePanel("psf", values, [], 0.5, unit="electrons")
     words = _told(tmp_path, [panel], "return document.querySelector('.bar').innerText;")
     assert words.split() == ["0", "3.25", "electrons;", "5.5", "×", "3.5", "µm"]
 
 
 def _points():
-    return Points(
+    return PointPanel(
         "Networks", [4.0, 1.0, 9.0, 6.5], [0.5, 0.9, 0.2, 0.8], "cost", "error", ["a", "b", "a", "b"], [1, 0, 2],
         notes=[{"width": 0.4}, {"width": 0.1}, {"width": 0.9}, {"width": 0.65}],
     )  # fmt: skip
@@ -252,10 +260,10 @@ def test_a_map_reaches_the_paper(tmp_path):
     index = np.where(np.hypot(*(np.mgrid[:300, :300] - 150)) < 140, 1, 0).astype(
         np.uint8
     )
-    page.write(
+    page.write_page(
         tmp_path / "page.html",
         "page",
-        [Classes("mask", index, np.array([120.0]), 0.3, "nm")],
+        [ClassMapPanel("mask", index, np.array([120.0]), 0.3, "nm")],
     )
     printed(tmp_path / "page.html", tmp_path / "page.pdf")
     sheets = (tmp_path / "page.pdf").read_bytes()

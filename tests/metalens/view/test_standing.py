@@ -38,7 +38,7 @@ def hexagonal(rows=9, columns=13):
 def test_every_pillar_of_a_hexagonal_lens_is_drawn_on_its_site():
     lens = hexagonal()
     d = lens.diameters
-    panel = standing.drawn(lens)
+    panel = standing.draw_pillars(lens)
     places = np.concatenate([o.places for o in panel.outlines])
     there = d.diameter_um > 0
     want = np.stack(np.meshgrid(d.x_um, d.y_um), axis=-1)[there]
@@ -67,14 +67,14 @@ def test_a_pixel_shows_the_phase_of_the_nearest_site_of_the_lattice():
     at = np.random.default_rng(11).uniform(
         (-1.2, -1.0), (1.2, 1.0), (300, 2)
     )  # inside the outermost sites
-    row, column = standing.nearest(d, at[:, 0], at[:, 1])
+    row, column = standing.nearest_site(d, at[:, 0], at[:, 1])
     assert ((row + column) % 2 == 0).all()
     found = np.hypot(d.y_um[row] - at[:, 0], d.x_um[column] - at[:, 1])
     best = np.hypot(
         d.y_um[sites[:, 0], None] - at[:, 0], d.x_um[sites[:, 1], None] - at[:, 1]
     ).min(axis=0)
     assert np.abs(found - best).max() < 1e-12
-    image = standing.phase(lens)
+    image = standing.draw_phase(lens)
     turns = np.mod(lens.phase_rad() / (2 * np.pi), 1)
     assert set(np.round(np.unique(image.values), 9)) <= set(
         np.round(np.unique(turns), 9)
@@ -118,7 +118,7 @@ def test_of_a_lens_too_large_for_a_page_the_square_about_its_middle_is_drawn(
     size = np.full((31, 18), 0.15, np.float32)
     lens = Lens(DiameterMap(size, 0.3), Cell(0.3, 0.7, Index(3.6)), PROXY, **ABOUT)
     monkeypatch.setattr(standing, "MOST_DRAWN", 40)
-    places = np.concatenate([o.places for o in standing.drawn(lens).outlines])
+    places = np.concatenate([o.places for o in standing.draw_pillars(lens).outlines])
     x, y = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
     inside = (np.abs(x) <= 0.949) & (np.abs(y) <= 0.949)
     want = np.rint(1e3 * np.stack([x[inside], y[inside]], axis=-1)).astype(int)

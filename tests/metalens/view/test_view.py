@@ -15,19 +15,19 @@ from metalens import lens, psf
 from metalens import library as libraries
 from metalens.cell import Cell, Index
 from metalens.commands import view
+from metalens.core import store
+from metalens.core.errors import OutputError, StoreError
 from metalens.design import make
-from metalens.ground import store
-from metalens.ground.errors import OutputError, StoreError
 from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
 from metalens.view import (
-    Axis,
-    Classes,
-    Curves,
-    Images,
-    Numbers,
-    Points,
+    ClassMapPanel,
+    CurvePanel,
+    ImagePanel,
+    PointPanel,
+    SliderAxis,
+    TablePanel,
     artefacts,
     page,
 )
@@ -76,7 +76,7 @@ def folder(tmp_path_factory):
 
 def test_every_pillar_is_in_the_page(folder):
     design = lens.load(folder / "lens.h5")
-    panel = _content(page.html("lens", artefacts.lens_panels(folder / "lens.h5")))[
+    panel = _content(page.page_html("lens", artefacts.lens_panels(folder / "lens.h5")))[
         "panels"
     ][0]
     index, sizes = _unpacked(panel["index"]), np.array([0.0, *panel["sizes"]])
@@ -147,7 +147,7 @@ def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(
 
 def test_psfs_keep_their_axes(folder):
     stack = psf.load(folder / "psf.h5")
-    panel = _content(page.html("psf", artefacts.psf_panels(folder / "psf.h5")))[
+    panel = _content(page.page_html("psf", artefacts.psf_panels(folder / "psf.h5")))[
         "panels"
     ][0]
     values = _unpacked(panel["values"])
@@ -160,7 +160,7 @@ def test_psfs_keep_their_axes(folder):
 
 
 def test_nothing_in_a_page_leads_out_of_it(folder):
-    text = page.html(
+    text = page.page_html(
         "a & b </script><script>alert(1)</script>",
         artefacts.psf_panels(folder / "psf.h5"),
     )
@@ -193,9 +193,9 @@ def test_few_sizes_are_kept_as_they_are_and_many_in_equal_steps():
 
 def test_figures_that_do_not_fit_are_refused():
     with pytest.raises(StoreError, match=r"sliders \(3,\) do not fit"):
-        Images("psf", np.zeros((2, 4, 4)), [Axis("depth", [1, 2, 3])], 1.0)
+        ImagePanel("psf", np.zeros((2, 4, 4)), [SliderAxis("depth", [1, 2, 3])], 1.0)
     with pytest.raises(StoreError, match="class 5 of 2"):
-        Classes("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
+        ClassMapPanel("map", np.array([[5]], np.uint8), np.array([1.0, 2.0]), 0.3, "nm")
 
 
 def test_psfs_of_several_lights_have_a_slider(folder, tmp_path):
@@ -233,9 +233,11 @@ def test_psfs_of_several_lights_have_a_slider(folder, tmp_path):
 
 def test_points_need_a_place_and_a_name_each():
     with pytest.raises(StoreError, match="as many finite x"):
-        Points("networks", [1.0, 2.0], [0.5], "cost", "error", ["a", "b"])
+        PointPanel("networks", [1.0, 2.0], [0.5], "cost", "error", ["a", "b"])
     with pytest.raises(StoreError, match="as many finite x"):
-        Points("networks", [1.0, float("nan")], [0.5, 0.7], "cost", "error", ["a", "b"])
+        PointPanel(
+            "networks", [1.0, float("nan")], [0.5, 0.7], "cost", "error", ["a", "b"]
+        )
 
 
 def test_a_psf_tells_what_its_error_is_made_of(folder):
@@ -313,7 +315,7 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
     if what == "all":
         x = np.linspace(1, 3, 17)
         panels = [
-            Curves(
+            CurvePanel(
                 "line",
                 x,
                 "x",
@@ -322,7 +324,7 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
                 errors={"y": 0.1 * x},
                 bands=[(1.5, 1.7)],
             ),
-            Classes(
+            ClassMapPanel(
                 "map",
                 np.array([[0, 1], [2, 1]], np.uint8),
                 np.array([90.0, 130.0]),
@@ -330,17 +332,17 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
                 "nm",
                 marks=[(0, 0, "m")],
             ),
-            Numbers("table", ("a", "b"), [(1.25, "text"), (float("nan"), "x")]),
+            TablePanel("table", ("a", "b"), [(1.25, "text"), (float("nan"), "x")]),
         ]
     else:
         panels = getattr(artefacts, f"{what}_panels")(folder / f"{what}.h5")
     path = tmp_path / "page.html"
-    page.write(path, what, panels, about={"settings": "x = 1"})
+    page.write_page(path, what, panels, about={"settings": "x = 1"})
     shown = told(path, "return document.documentElement.outerHTML")
     assert 'data-ready="true"' in shown
     assert 'class="failed"' not in shown
     assert shown.count("<section") == len(panels)
-    assert shown.count("<canvas") >= sum(not isinstance(p, Numbers) for p in panels)
+    assert shown.count("<canvas") >= sum(not isinstance(p, TablePanel) for p in panels)
     if what == "psf":  # the number under the cross is that of the file
         stack = psf.load(folder / "psf.h5").intensity
         number = float(

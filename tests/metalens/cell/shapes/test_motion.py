@@ -11,15 +11,15 @@ from metalens.cell.shapes import (
     Circle,
     Cross,
     Ellipse,
-    Loop,
     Outline,
     Polygon,
+    PolygonLoop,
     Rectangle,
     RegularPolygon,
     Ring,
     motion,
 )
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 
 KITE = Polygon(((0.5, -0.3), (-0.5, -0.2), (0.1, 0.6)), 0.3)  # clockwise
 SHAPES = (
@@ -58,9 +58,11 @@ def test_a_moving_rim_changes_the_factors_as_their_differences(shape, name):
     if name in ("ratio", "angle_rad") and not hasattr(shape, name):
         pytest.skip("the shape has no such number")
     made = moving(shape, name)
-    rates = motion.difference(lambda x: motion.numbers(made(x)), 1e-4)
+    rates = motion.sixth_order_difference(
+        lambda x: motion.shape_parameters(made(x)), 1e-4
+    )
     want = differenced(lambda x: made(x).fourier(GX, GY), 3e-4)
-    got = motion.pushed(made(0.0), GX, GY, rates)
+    got = motion.fourier_shape_derivative(made(0.0), GX, GY, rates)
     assert (
         np.abs(got - want).max() < 1e-7 * np.abs(want).max()
     )  # step^4 of the differences
@@ -70,14 +72,16 @@ def test_at_no_wave_number_it_is_the_change_of_area():
     """And a polygon that moves as a whole only turns the phases of its factors."""
     for shape in SHAPES:
         made = moving(shape, "size")
-        rates = motion.difference(lambda x, made=made: motion.numbers(made(x)), 1e-4)
+        rates = motion.sixth_order_difference(
+            lambda x, made=made: motion.shape_parameters(made(x)), 1e-4
+        )
         area = differenced(lambda x, made=made: made(x).area_um2, 1e-3)
         small = np.array([0.0, 4e-3])  # s of 5e-4, whose square is left
-        assert motion.pushed(made(0.0), small, small, rates).real == pytest.approx(
-            area, rel=1e-6
-        )
-    loop = Outline((Loop(((0.1, -0.3), (-0.1, 0.2), (0.25, 0.3)), sign=-1),))
-    got = motion.pushed(loop, GX, GY, np.tile([0.3, -0.7], 3))
+        assert motion.fourier_shape_derivative(
+            made(0.0), small, small, rates
+        ).real == pytest.approx(area, rel=1e-6)
+    loop = Outline((PolygonLoop(((0.1, -0.3), (-0.1, 0.2), (0.25, 0.3)), sign=-1),))
+    got = motion.fourier_shape_derivative(loop, GX, GY, np.tile([0.3, -0.7], 3))
     assert got == pytest.approx(
         -1j * (0.3 * GX - 0.7 * GY) * loop.fourier(GX, GY), rel=1e-9, abs=1e-12
     )
@@ -87,4 +91,6 @@ def test_a_hole_that_is_just_closing_is_refused():
     made = moving(Ring(0.4), "grow")
     closed = 0.4 * 0.23 - 0.011
     with pytest.raises(CellError, match="losing or gaining a part"):
-        motion.difference(lambda x: motion.numbers(made(closed + x)), 1e-4)
+        motion.sixth_order_difference(
+            lambda x: motion.shape_parameters(made(closed + x)), 1e-4
+        )

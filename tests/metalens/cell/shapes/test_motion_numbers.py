@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from metalens.cell.shapes import Conic, Loop, Outline, motion
-from metalens.ground.errors import CellError
+from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop, motion
+from metalens.core.errors import CellError
 
 CLOCKWISE = ((0.11, 0.31), (0.27, 0.05), (-0.19, -0.13))
 ANTICLOCKWISE = ((0.02, 0.03), (0.09, -0.01), (0.12, 0.07), (0.05, 0.11))
@@ -35,22 +35,22 @@ def outline(shift):
     loops = [tuple(map(tuple, part.reshape(-1, 2))) for part in (base[6:12], base[12:])]
     return Outline(
         (
-            Conic(*base[:3]),
-            Conic(*base[3:6], sign=-1),
-            Loop(loops[0], sign=-1),
-            Loop(loops[1]),
+            EllipseArc(*base[:3]),
+            EllipseArc(*base[3:6], sign=-1),
+            PolygonLoop(loops[0], sign=-1),
+            PolygonLoop(loops[1]),
         )
     )
 
 
 def test_numbers_of_parts_follow_one_another():
     want = [0.31, 0.17, 0.4, 0.05, 0.08, -0.9, 0.11, 0.31, 0.27, 0.05, -0.19, -0.13]
-    assert motion.numbers(outline(np.zeros(20)))[:12].tolist() == pytest.approx(
-        want, rel=1e-15
-    )
-    assert motion.numbers(outline(np.zeros(20)))[12:].tolist() == pytest.approx(
-        np.ravel(ANTICLOCKWISE), rel=1e-15
-    )
+    assert motion.shape_parameters(outline(np.zeros(20)))[
+        :12
+    ].tolist() == pytest.approx(want, rel=1e-15)
+    assert motion.shape_parameters(outline(np.zeros(20)))[
+        12:
+    ].tolist() == pytest.approx(np.ravel(ANTICLOCKWISE), rel=1e-15)
 
 
 @pytest.mark.parametrize("number", range(20))
@@ -65,7 +65,7 @@ def test_every_number_moves_the_factor_as_its_difference(number):
     rates = 1.0 * (np.arange(20) == number)
     ends = [outline(s * 1e-5 * rates).fourier(gx, gy) for s in (1, -1)]
     want = (ends[0] - ends[1]) / 2e-5
-    got = motion.pushed(outline(np.zeros(20)), gx, gy, rates + 0j)
+    got = motion.fourier_shape_derivative(outline(np.zeros(20)), gx, gy, rates + 0j)
     assert got == pytest.approx(want, abs=1e-8 * np.abs(want).max())
 
 
@@ -75,9 +75,11 @@ def test_an_ellipse_of_small_wave_number_grows_by_its_area(s):
     1e-3: to s⁴/192 of it, 5e-15.
     """
     a, b, x = 0.31, 0.17, s / 0.31
-    part = Outline((Conic(a, b),))
+    part = Outline((EllipseArc(a, b),))
     got = [
-        motion.pushed(part, np.array([x]), np.array([0.0]), np.eye(3)[k])[0].real
+        motion.fourier_shape_derivative(
+            part, np.array([x]), np.array([0.0]), np.eye(3)[k]
+        )[0].real
         for k in (0, 1)
     ]
     value, slope = 2 * jv(1, s) / s, 2 * jv(2, s)
@@ -113,7 +115,7 @@ def test_differences_are_exact_for_powers_up_to_the_sixth():
         return x**powers * np.array([5.0, 1.7, 3.0, -2.0, 1.3, 0.7, 0.2, 1.0])
 
     step = 0.3
-    got = motion.difference(of, step)
+    got = motion.sixth_order_difference(of, step)
     assert got[:7] == pytest.approx([0, 1.7, 0, 0, 0, 0, 0], abs=1e-14)
     assert got[7] == pytest.approx(36 * step**6, rel=1e-12)
 
@@ -121,7 +123,7 @@ def test_differences_are_exact_for_powers_up_to_the_sixth():
 def test_a_change_of_length_on_one_side_alone_is_refused():
     for side in (1, -1):
         with pytest.raises(CellError, match="no derivative"):
-            motion.difference(
+            motion.sixth_order_difference(
                 lambda x, side=side: np.ones(3 if x * side > 2.5e-3 else 2), 1e-3
             )
 
@@ -133,6 +135,8 @@ def test_corners_that_go_out_from_the_origin_grow_a_polygon_by_twice_its_area():
     for corners in np.random.default_rng(6).normal(size=(24, 3, 2)):
         area = abs(np.linalg.det(corners[1:] - corners[0])) / 2
         for sign in (1, -1):
-            part = Outline((Loop(tuple(map(tuple, corners)), sign=sign),))
-            got = motion.pushed(part, np.zeros(1), np.zeros(1), corners.ravel())
+            part = Outline((PolygonLoop(tuple(map(tuple, corners)), sign=sign),))
+            got = motion.fourier_shape_derivative(
+                part, np.zeros(1), np.zeros(1), corners.ravel()
+            )
             assert got[0] == pytest.approx(sign * 2 * area, rel=1e-9)

@@ -19,8 +19,8 @@ from metalens.cell.shapes import (
     Square,
     straight,
 )
-from metalens.ground import config
-from metalens.ground.errors import CellError, ConfigError
+from metalens.core import config
+from metalens.core.errors import CellError, ConfigError
 
 TRIANGLE = ((-0.5, -0.3), (0.5, -0.3), (0.0, 0.6))
 SHAPES = (

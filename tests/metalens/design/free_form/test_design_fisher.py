@@ -9,38 +9,38 @@ import numpy as np
 import pytest
 import torch
 
+from metalens.core import config
+from metalens.core.errors import ConfigError
 from metalens.design.free_form import search as free
-from metalens.design.free_form.objective import AxialObjective, Robust
-from metalens.design.free_form.refine import refine
-from metalens.design.free_form.search import Fisher
-from metalens.design.free_form.settings import Variation
+from metalens.design.free_form.objective import AxialObjective, RobustObjective
+from metalens.design.free_form.refine import refine_phase
+from metalens.design.free_form.search import FisherSettings
+from metalens.design.free_form.settings import ProcessVariation
 from metalens.design.profiles import Focus
-from metalens.ground import config
-from metalens.ground.errors import ConfigError
 from metalens.image import pupil as pupils
 from metalens.image.pupil import Pupil
 
 SMALL = Pupil(radius_um=400.0, nodes=136)
 FOCUS = Focus(0.85, 2000.0, 20e3)
-QUICK = Fisher(
+QUICK = FisherSettings(
     grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0)
 ).about(FOCUS, 400.0)
 
 
 def test_spline_makes_constants_lines_and_is_smooth():
     x = np.linspace(-1, 1, 401)
-    weights = free.spline(x, 9)
+    weights = free.bspline_weights(x, 9)
     assert np.abs(weights.sum(1) - 1).max() < 1e-14
     line = weights @ (np.arange(9) - 4.0)  # linear coefficients make a straight line
     assert np.abs(np.diff(line, 2)).max() < 1e-12
-    bump = free.spline(x, 9) @ np.eye(9)[4]
+    bump = free.bspline_weights(x, 9) @ np.eye(9)[4]
     assert np.abs(np.diff(bump, 3)).max() < 1e-3  # second derivative continuous
 
 
 def test_vortices_carry_their_charges():
     turn = np.linspace(-math.pi, math.pi, 1000, endpoint=False)
     for radius, charge in ((100.0, 1), (390.0, 3)):
-        phase = free.vortices(
+        phase = free.vortex_phase(
             radius * np.cos(turn), radius * np.sin(turn), radius_um=400.0, zones=2
         )
         winding = np.angle(np.exp(1j * np.diff(phase))).sum() / (2 * math.pi)
@@ -49,8 +49,8 @@ def test_vortices_carry_their_charges():
 
 def test_a_short_design_gains_information_and_keeps_the_energy():
     flat = torch.zeros(136, 136, dtype=torch.float64)
-    before = free.score(flat, SMALL, focus_um=20e3, settings=QUICK)
-    made = free.optimise(SMALL, QUICK)
+    before = free.score_phase(flat, SMALL, focus_um=20e3, settings=QUICK)
+    made = free.optimize_free_form(SMALL, QUICK)
     assert made.converged
     assert float(made.score.encircled.min()) >= 0.499
     assert float(made.score.information.mean()) > 1.15 * float(
@@ -72,9 +72,10 @@ def test_depths_that_no_image_tells_apart_are_worth_the_least_logarithm():
 
 
 def test_the_same_seed_gives_the_same_phase():
-    brief = Fisher(grids=(5,), iterations=2, starts=1).about(FOCUS, 400.0)
+    brief = FisherSettings(grids=(5,), iterations=2, starts=1).about(FOCUS, 400.0)
     assert torch.equal(
-        free.optimise(SMALL, brief).controls, free.optimise(SMALL, brief).controls
+        free.optimize_free_form(SMALL, brief).controls,
+        free.optimize_free_form(SMALL, brief).controls,
     )
 
 
@@ -82,25 +83,27 @@ def test_the_lens_phase_is_the_designed_one():
     """The function of position and the pupil model give the same phase at the same
     places.
     """
-    quick = Fisher(
+    quick = FisherSettings(
         grids=(5,), iterations=1, starts=1, zones=(0,), focus_mm=(20.0, 20.0)
     )
     phase, found = free.fisher_profile(
         Focus(0.85, 2000.0, 20e3), radius_um=300.0, settings=quick
     )
     x = np.array([-200.0, 0.0, 123.0])
-    from metalens.design.profiles import hyperbolic
+    from metalens.design.profiles import hyperbolic_phase
 
-    extra = phase(x, x) - hyperbolic(x, x[:, None], Focus(0.85, 2000.0, found.focus_um))
-    weights = free.spline(x / 300.0, 5)
+    extra = phase(x, x) - hyperbolic_phase(
+        x, x[:, None], Focus(0.85, 2000.0, found.focus_um)
+    )
+    weights = free.bspline_weights(x / 300.0, 5)
     assert np.abs(extra - weights @ found.controls.numpy() @ weights.T).max() < 1e-9
 
 
 def test_the_phase_of_cells_is_that_of_the_nearest_node():
-    brief = Fisher(
+    brief = FisherSettings(
         grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0
     ).about(FOCUS, 400.0)
-    found = free.optimise(SMALL, brief)
+    found = free.optimize_free_form(SMALL, brief)
     assert found.cells
     x, y = (c.numpy() for c in pupils.coordinates(SMALL))
     there = free.free_form(found.controls.numpy(), SMALL, cells=True)(
@@ -111,7 +114,7 @@ def test_the_phase_of_cells_is_that_of_the_nearest_node():
 
 
 def test_nlopt_lowers_the_loss_and_holds_the_energy():
-    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12).about(
+    settings = FisherSettings(grids=(6,), zones=(0,), encircled=0.6, refine=12).about(
         FOCUS, 400.0
     )
     objective = AxialObjective(SMALL, settings)
@@ -119,7 +122,7 @@ def test_nlopt_lowers_the_loss_and_holds_the_energy():
     start = 0.3 * torch.randn(
         6, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
-    better = refine(start, build, objective, settings, 20e3)
+    better = refine_phase(start, build, objective, settings, 20e3)
     before, after = (objective.loss(build(c), 20e3, None) for c in (start, better))
     assert float(after[0]) < float(before[0]) - 0.02
     assert float(after[1].min()) > 0.6 - 2e-3
@@ -127,14 +130,16 @@ def test_nlopt_lowers_the_loss_and_holds_the_energy():
 
 
 def test_a_design_for_the_process_judges_its_worst_lens():
-    settings = Fisher(encircled=0.0).about(FOCUS, 400.0)
+    settings = FisherSettings(encircled=0.0).about(FOCUS, 400.0)
     plain = AxialObjective(SMALL, settings)
     flat = torch.zeros(136, 136, dtype=torch.float64)
-    still = Robust(plain, SMALL, Variation()).judge(flat, 20e3)
+    still = RobustObjective(plain, SMALL, ProcessVariation()).judge(flat, 20e3)
     assert torch.allclose(
         still.information, plain.judge(flat, 20e3).information, rtol=1e-4
     )
-    moved = Robust(plain, SMALL, Variation(distance_um=40.0)).judge(flat, 20e3)
+    moved = RobustObjective(plain, SMALL, ProcessVariation(distance_um=40.0)).judge(
+        flat, 20e3
+    )
     nominal = plain.judge(flat, 20e3)
     assert bool((moved.encircled <= nominal.encircled + 1e-6).all())
     # a sensor 40 um further off is in focus for nearer sources: 1/z = 1/f - 1/d puts 20
@@ -159,14 +164,14 @@ def test_impossible_wishes_are_refused():
     )
     for wish in wishes:
         with pytest.raises(ConfigError, match=wish.split(" ")[0]):
-            config.loads(wish, Fisher)
+            config.loads(wish, FisherSettings)
 
 
 def test_what_is_left_out_follows_the_lens():
     """The paper's lens as it was; depths scale as the aperture squared, spots as
     wavelength over NA.
     """
-    paper = Fisher().about(Focus(0.85, 2000.0, 20e3), 500.0)
+    paper = FisherSettings().about(Focus(0.85, 2000.0, 20e3), 500.0)
     assert (paper.depths_mm, paper.focus_mm, paper.radius_um) == (
         (16.0, 26.0),
         (18.0, 22.0),
@@ -179,7 +184,7 @@ def test_what_is_left_out_follows_the_lens():
         0.75,
         200.0,
     )
-    half = Fisher(pixel_um=1.3).about(Focus(0.633, 1500.0, 20e3), 250.0)
+    half = FisherSettings(pixel_um=1.3).about(Focus(0.633, 1500.0, 20e3), 250.0)
     waves = [250.0**2 * abs(1e-3 / z - 1 / 20e3) / (2 * 0.633) for z in half.depths_mm]
     assert waves == pytest.approx([1.75, 1.75], rel=0.08)  # depths of two digits
     assert (
@@ -191,7 +196,7 @@ def test_what_is_left_out_follows_the_lens():
     )
     assert half.radius_um == pytest.approx(5.3 * 0.633 * 1500 / 250, rel=0.03)
     assert half.sample_um == pytest.approx(1.3 / 4, rel=0.03)
-    own = Fisher(depths_mm=(7.0, 8.0)).about(Focus(0.85, 2000.0, 20e3), 500.0)
+    own = FisherSettings(depths_mm=(7.0, 8.0)).about(Focus(0.85, 2000.0, 20e3), 500.0)
     assert 7.0 < own.focus_mm[0] < own.focus_mm[1] < 8.0
     assert (
         own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99
@@ -203,12 +208,14 @@ def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
     NA 0.24, lost half of it.
     """
     focus, radius = Focus(0.85, 133.0, 2e3), 100.0
-    asked = Fisher(pixel_um=1.1).about(focus, radius)
+    asked = FisherSettings(pixel_um=1.1).about(focus, radius)
     pupil = free.design_pupil(focus, radius, asked)
     flat = torch.zeros(pupil.nodes, pupil.nodes, dtype=torch.float64)
     fine = dataclasses.replace(asked, sample_um=asked.sample_um / 2)
     got, want = (
-        free.score(flat, pupil, focus_um=2e3, settings=s, depths=3).information.mean()
+        free.score_phase(
+            flat, pupil, focus_um=2e3, settings=s, depths=3
+        ).information.mean()
         for s in (asked, fine)
     )
     assert float(got) == pytest.approx(
@@ -218,7 +225,7 @@ def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
 
 def test_pixels_wider_than_a_spot_are_refused():
     with pytest.raises(ConfigError, match="pixel_um = 40"):
-        Fisher(pixel_um=40.0).about(Focus(0.85, 2000.0, 20e3), 500.0)
+        FisherSettings(pixel_um=40.0).about(Focus(0.85, 2000.0, 20e3), 500.0)
 
 
 @pytest.mark.parametrize("even", [0.0, 0.3, 1.0])

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from metalens import cli, lens
+from metalens.core import config
+from metalens.core.errors import ConfigError
 from metalens.design import Focus
 from metalens.design.free_form import report as design_fisher_report
 from metalens.design.free_form import search as free
 from metalens.design.free_form import simple_lenses as baselines
-from metalens.design.free_form.search import Fisher
-from metalens.ground import config
-from metalens.ground.errors import ConfigError
+from metalens.design.free_form.search import FisherSettings
 from metalens.image.pupil import Pupil
 
 SMALL = Pupil(radius_um=150.0, nodes=80)
@@ -56,31 +56,34 @@ def test_the_command_compares_with_tuned_lenses_and_draws(
 
 
 def test_the_table_names_every_angle_and_the_energy():
-    settings = Fisher(
+    settings = FisherSettings(
         angles_deg=(0.0, 8.0), iterations=4, starts=1, grids=(5,), encircled=0.0
     ).about(FOCUS, 150.0)
-    made = free.optimise(SMALL, settings)
+    made = free.optimize_free_form(SMALL, settings)
     assert made.score.information.shape == (2, 11)
     flat = torch.zeros(80, 80, dtype=torch.float64)
     scores = [
-        free.score(p, SMALL, focus_um=20e3, settings=settings)
+        free.score_phase(p, SMALL, focus_um=20e3, settings=settings)
         for p in (free.phase_on(SMALL, made), flat)
     ]
     lenses = tuple(
-        design_fisher_report.Judged(n, flat, 20e3, s)
+        design_fisher_report.JudgedLens(n, flat, 20e3, s)
         for n, s in zip("ab", scores, strict=True)
     )
-    text = design_fisher_report.text(lenses, settings)
+    text = design_fisher_report.report_text(lenses, settings)
     assert "8°" in text
     assert f"{float(scores[0].information[1].mean()):.3f}" in text
-    assert f"{design_fisher_report.times(lenses):.2f} x the better baseline" in text
+    assert (
+        f"{design_fisher_report.information_gain(lenses):.2f} x the better baseline"
+        in text
+    )
 
 
 def test_a_design_for_field_angles_gains_at_both():
     """From random noise, 24 steps: more information off axis than a focused lens, the
     energy kept at all angles.
     """
-    settings = Fisher(
+    settings = FisherSettings(
         depths_mm=(16.0, 26.0),
         pixel_um=3.0,
         radius_um=18.0,  # closer than this lens tells apart by itself
@@ -91,8 +94,8 @@ def test_a_design_for_field_angles_gains_at_both():
         encircled=0.4,
         focus_mm=(20.0, 20.0),
     ).about(FOCUS, 150.0)
-    made = free.optimise(SMALL, settings)
-    plain = free.score(
+    made = free.optimize_free_form(SMALL, settings)
+    plain = free.score_phase(
         torch.zeros(80, 80, dtype=torch.float64),
         SMALL,
         focus_um=20e3,
@@ -107,4 +110,4 @@ def test_a_design_for_field_angles_gains_at_both():
 def test_angles_that_no_lens_sees_are_refused():
     for wish in ("angles_deg = []", "angles_deg = [50.0]", "angles_deg = [-5.0]"):
         with pytest.raises(ConfigError, match="angles_deg"):
-            config.loads(wish, Fisher)
+            config.loads(wish, FisherSettings)

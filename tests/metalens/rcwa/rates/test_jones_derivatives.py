@@ -19,7 +19,7 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
-from metalens.ground.errors import CellError
+from metalens.core.errors import CellError
 from metalens.rcwa import any_shape, pattern
 from metalens.rcwa.problem import cell_problem
 from metalens.rcwa.rates import verb

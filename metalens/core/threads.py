@@ -24,21 +24,21 @@ _MOST = 16  # items side by side, each with memory of its own
 _BESIDE = threading.local()  # stop: set for a thread that works beside others
 
 
-class Stopped(Exception):  # no error: nobody waits for what is stopped any more
-    """Raised within an item of :func:`each` that is no longer wanted."""
+class WorkStopped(Exception):  # no error: nobody waits for what is stopped any more
+    """Raised within an item of :func:`run_each` that is no longer wanted."""
 
 
-def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """``work`` of every item, in their order: side by side, one thread each,
-    :func:`split` within them included.
+    :func:`run_split` within them included.
 
     For work that consists of calls which release the interpreter lock, and that shares
     nothing it changes. An
-    interrupt or the first failure stops the others at their next :func:`split`, and is
+    interrupt or the first failure stops the others at their next :func:`run_split`, and is
     raised when they have ended.
     """
     items = list(items)
-    count = min(threads(), len(items), _MOST)
+    count = min(thread_count(), len(items), _MOST)
     if count <= 1:
         return [work(item) for item in items]
     stop = threading.Event()
@@ -60,19 +60,19 @@ def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
             raise
 
 
-def split(count: int, work: Callable[[int, int], object]) -> None:
+def run_split(count: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads
-    (see :func:`threads`).
+    (see :func:`thread_count`).
     """
     stop = getattr(_BESIDE, "stop", None)
     if stop is not None and stop.is_set():
-        raise Stopped
-    _shared(count, min(threads(), count), work)
+        raise WorkStopped
+    _shared(count, min(thread_count(), count), work)
 
 
-def beside(*works: Callable[[], Any]) -> list[Any]:
+def run_concurrently(*works: Callable[[], Any]) -> list[Any]:
     """Results of several calls, side by side where there are threads; see
-    :func:`split`.
+    :func:`run_split`.
     """
     out = dict[int, Any]()
 
@@ -80,12 +80,12 @@ def beside(*works: Callable[[], Any]) -> list[Any]:
         for i in range(start, stop):
             out[i] = works[i]()
 
-    split(len(works), some)
+    run_split(len(works), some)
     return [out[i] for i in range(len(works))]
 
 
-def apart(count: int, work: Callable[[int, int], object]) -> None:
-    """As :func:`split`, for work of many small calls of torch: each part has one of its
+def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:
+    """As :func:`run_split`, for work of many small calls of torch: each part has one of its
     threads to itself.
 
     Together they would wait for each other at every call. ``work`` may carry no
@@ -120,7 +120,7 @@ def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
         job.result()
 
 
-def threads() -> int:
+def thread_count() -> int:
     """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this
     process; one within `each`.
     """

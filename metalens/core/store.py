@@ -17,10 +17,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from metalens.ground import lock, reading
-from metalens.ground.arrays import Array
-from metalens.ground.errors import DAMAGE as DAMAGE
-from metalens.ground.errors import StoreError
+from metalens.core import lock, reading
+from metalens.core.arrays import Array
+from metalens.core.errors import DAMAGE as DAMAGE
+from metalens.core.errors import StoreError
 
 Attribute = str | int | float | bool
 _FORMAT = (
@@ -54,7 +54,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stored:
+class StoredArtefact:
     """The content of an artefact file: ``arrays`` by name (``group/name``),
     ``attributes`` of the header.
     """
@@ -81,7 +81,7 @@ def sha256(path: str | Path) -> str:
 
 
 @contextlib.contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replace_atomically(path: str | Path) -> Iterator[Path]:
     """Give a scratch path beside ``path``; flush it and rename it over ``path`` only if
     the block succeeds.
 
@@ -91,7 +91,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     time do not meet.
     """
     path = Path(path)
-    clear(path)
+    clear_scratch(path)
     handle, part = _part(path)
     try:
         os.fchmod(handle, 0o666 & ~_umask())
@@ -118,7 +118,7 @@ def _part(path: Path) -> tuple[int, Path]:
         os.close(handle)  # cleared away before it was locked
 
 
-def clear(path: Path) -> None:
+def clear_scratch(path: Path) -> None:
     """Remove scratch files of writers that are gone."""
     start, end = f".{path.name}.", ".part"
     for entry in os.scandir(path.parent):
@@ -139,12 +139,12 @@ def _umask() -> int:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file (UTF-8) whole or not at all."""
-    write_bytes(path, reading.shown(text).encode())
+    write_bytes(path, reading.to_valid_utf8(text).encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole or not at all."""
-    with replacing(path) as part, open(part, "wb") as file:
+    with replace_atomically(path) as part, open(part, "wb") as file:
         file.write(content)
 
 
@@ -161,7 +161,7 @@ def append_line(path: Path, line: str) -> None:
         if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
             file.seek(0)
             file.truncate(file.read().rfind(b"\n") + 1)
-        file.write(reading.shown(line).encode() + b"\n")
+        file.write(reading.to_valid_utf8(line).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
@@ -196,7 +196,7 @@ def save(
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    with replacing(path) as part, reading.Through(part, "wb+") as file:
+    with replace_atomically(path) as part, reading.CheckedFile(part, "wb+") as file:
         _write(
             file,
             kind,
@@ -215,7 +215,7 @@ def load(
     *,
     version: int = 1,
     without: Collection[str] = (),
-) -> Stored:
+) -> StoredArtefact:
     """Read an artefact and check its header.
 
     Args:
@@ -234,7 +234,7 @@ def load(
     path = Path(path)
     if not path.is_file():
         raise StoreError(
-            f"{path}: {reading.absent(path)}; need a {kind or 'toolchain'} file"
+            f"{path}: {reading.missing_reason(path)}; need a {kind or 'toolchain'} file"
         )
     try:
         return reading.read_hdf5(
@@ -243,7 +243,7 @@ def load(
     except StoreError:
         raise
     except DAMAGE as error:
-        if found := reading.foreign(path):
+        if found := reading.foreign_format(path):
             raise StoreError(
                 f"{path}: {found}, need an HDF5 file of this toolchain"
             ) from error
@@ -269,7 +269,7 @@ def _read(
     kind: str | None,
     version: int,
     without: Collection[str],
-) -> Stored:
+) -> StoredArtefact:
     found = _plain(file.attrs.get("kind"))
     if found is None:
         raise StoreError(
@@ -296,7 +296,9 @@ def _read(
         for k, v in file.attrs.items()
         if k not in ("kind", "version", "units")
     }
-    return Stored(str(found), number, arrays, attributes, _read_provenance(file))
+    return StoredArtefact(
+        str(found), number, arrays, attributes, _read_provenance(file)
+    )
 
 
 def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
@@ -356,7 +358,7 @@ class _Held(dict[str, Any]):
 
 
 def _write(
-    through: reading.Through,
+    through: reading.CheckedFile,
     kind: str,
     version: int,
     attributes: Mapping[str, Attribute],
@@ -381,7 +383,7 @@ def _write(
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
     if array.dtype.kind == "U":
         encoded = np.array(
-            [reading.shown(text).encode() for text in array.flat], "S"
+            [reading.to_valid_utf8(text).encode() for text in array.flat], "S"
         ).reshape(array.shape)
         array = encoded.astype(
             h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1))
@@ -406,7 +408,10 @@ def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
     apart, without a checksum.
     """
     if isinstance(value, str):
-        encoded, name = reading.shown(value).encode(), reading.shown(name)
+        encoded, name = (
+            reading.to_valid_utf8(value).encode(),
+            reading.to_valid_utf8(name),
+        )
         item.attrs.create(
             name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1))
         )

@@ -7,17 +7,17 @@ import functools
 import numpy as np
 from scipy.special import roots_legendre
 
-from metalens.ground.arrays import Array
+from metalens.core.arrays import Array
 
 
 @functools.lru_cache(maxsize=64)
-def nodes(count: int) -> tuple[Array, Array]:
+def gauss_legendre_nodes(count: int) -> tuple[Array, Array]:
     """(count,) Gauss-Legendre nodes and weights on [-1, 1]; treat as read-only."""
     t, w = roots_legendre(count)
     return np.asarray(t), np.asarray(w)
 
 
-def values(count: int, t: Array) -> Array:
+def legendre_values(count: int, t: Array) -> Array:
     """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by
     the stable recurrence.
     """
@@ -34,11 +34,11 @@ def values(count: int, t: Array) -> Array:
     return np.asarray(np.ascontiguousarray(np.moveaxis(out, 0, -1)) * scale)
 
 
-def interpolation(count: int, t: Array) -> Array:
-    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`nodes`: L_a =
+def interpolation_matrix(count: int, t: Array) -> Array:
+    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`gauss_legendre_nodes`: L_a =
     w_a Σ_m P̂_m(t_a) P̂_m(t).
     """
-    return np.asarray(values(count, t) @ to_nodes(count))
+    return np.asarray(legendre_values(count, t) @ to_nodes(count))
 
 
 @functools.lru_cache(maxsize=64)
@@ -46,20 +46,20 @@ def to_nodes(count: int) -> Array:
     """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in
     the modes.
     """
-    t, w = nodes(count)
-    return values(count, t).T * w
+    t, w = gauss_legendre_nodes(count)
+    return legendre_values(count, t).T * w
 
 
-def mapped(count: int, low: float, high: float) -> Array:
+def mapped_nodes(count: int, low: float, high: float) -> Array:
     """(count,) Gauss-Legendre nodes on [low, high]."""
-    return (low + high) / 2 + (high - low) / 2 * nodes(count)[0]
+    return (low + high) / 2 + (high - low) / 2 * gauss_legendre_nodes(count)[0]
 
 
-def needed(samples: Array, tolerance: float) -> int:
+def needed_node_count(samples: Array, tolerance: float) -> int:
     """Number of nodes that represent all lines to ``tolerance``.
 
     Args:
-        samples: (line, count) complex values on :func:`nodes` (count), count well above
+        samples: (line, count) complex values on :func:`gauss_legendre_nodes` (count), count well above
             what is needed.
         tolerance: of the root mean square over lines and position, relative to that of
             the samples.

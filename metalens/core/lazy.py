@@ -2,7 +2,7 @@
 
 A folder's ``__init__`` lists its public names twice: under ``TYPE_CHECKING``, where
 type checkers and editors read
-them, and in the table that :func:`attach` takes. A test holds that the two agree.
+them, and in the table that :func:`attach_lazy_exports` takes. A test holds that the two agree.
 """
 
 import importlib
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def attach(
+def attach_lazy_exports(
     package: str, names: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names load when
@@ -24,7 +24,7 @@ def attach(
             (``"layout.formats.oasis_write:write"``); ``""`` for
             a module of the package that is itself public.
 
-    >>> load, listed, public = attach("metalens.ground", {"units": "", "Console": "console"})
+    >>> load, listed, public = attach("metalens.core", {"units": "", "Console": "console"})
     >>> listed(), load("Console").__name__
     (['Console', 'units'], 'Console')
     """

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from metalens import __version__
-from metalens.ground import store
+from metalens.core import store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Figure:
     """A picture with a caption that says what to see in it.
 
-    png: the file's bytes; see :func:`png`.
+    png: the file's bytes; see :func:`figure_png`.
     """
 
     png: bytes
@@ -194,7 +194,7 @@ def in_figures(value: Any, digits: int = 4) -> str:
     return str(value)
 
 
-def png(figure: "Canvas", *, dpi: int = 220) -> bytes:
+def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
     """The bytes of a matplotlib figure as PNG, the same for the same drawing; the
     figure is closed.
 
@@ -215,7 +215,7 @@ def png(figure: "Canvas", *, dpi: int = 220) -> bytes:
     return buffer.getvalue()
 
 
-def canvas(
+def make_figure(
     rows: int = 1,
     columns: int = 1,
     *,
@@ -249,7 +249,7 @@ def canvas(
         )
 
 
-def write(
+def write_report(
     path: str | Path,
     title: str,
     sections: Sequence[Section],

@@ -92,7 +92,7 @@ class TrainingError(MetalensError):
     """A co-design run cannot start, resume or go on."""
 
 
-def nearest(
+def nearest_name_hint(
     name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None
 ) -> str:
     """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known

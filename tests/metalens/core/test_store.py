@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from metalens.ground import reading, store
-from metalens.ground.errors import StoreError
+from metalens.core import reading, store
+from metalens.core.errors import StoreError
 
 ARRAYS = {
     "a": np.arange(6.0).reshape(2, 3),
@@ -114,7 +114,7 @@ def test_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     path.write_text("old")
 
     def fail():
-        with store.replacing(path) as part:
+        with store.replace_atomically(path) as part:
             part.write_text("half")
             raise RuntimeError("cut")
 
@@ -136,7 +136,7 @@ def test_disk_full_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     script = textwrap.dedent(f"""
         import resource, signal
         import numpy as np
-        from metalens.ground import reading, store
+        from metalens.core import reading, store
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
         try:
@@ -172,7 +172,7 @@ def test_the_library_never_sees_that_a_write_was_refused(tmp_path):
     told later, none is tried.
     """
     (tmp_path / "f").write_bytes(b"abcde")
-    with reading.Through(tmp_path / "f", "rb") as file:
+    with reading.CheckedFile(tmp_path / "f", "rb") as file:
         assert file.write(bytearray(b"fgh")) == 3
         first = file.refused
         assert file.write(bytearray(b"i")) == 1
@@ -189,7 +189,7 @@ def test_terminated_while_writing_leaves_the_old_file_whole(tmp_path):
     before = path.read_bytes()
     script = textwrap.dedent(f"""
         import numpy as np, sys, signal
-        from metalens.ground import reading, store
+        from metalens.core import reading, store
         arrays = {{"x": np.random.default_rng(0).random((4000, 4000))}}
         print("ready", flush=True)
         while True:

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from metalens.ground import lock, manifest, store
-from metalens.ground.errors import OutputError
+from metalens.core import lock, manifest, store
+from metalens.core.errors import OutputError
 
 ROOM = 1 << 22  # bytes that every output may need
 UNFINISHED, JOURNAL = (
@@ -24,7 +24,7 @@ UNFINISHED, JOURNAL = (
 
 
 @dataclass(frozen=True, slots=True)
-class Draft:
+class OutputDraft:
     """A claimed output.
 
     path: where to write it; companions of a file go beside this path under their own
@@ -39,7 +39,7 @@ class Draft:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Terms:
+class ClaimTerms:
     """What a claim allows.
 
     force: whether what exists may be replaced, if it is ours. inputs: files and folders
@@ -55,9 +55,9 @@ class Terms:
 
 
 @contextlib.contextmanager
-def file(
-    target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()
-) -> Iterator[Draft]:
+def claim_file(
+    target: Path, *, beside: Sequence[str] = (), terms: ClaimTerms = ClaimTerms()
+) -> Iterator[OutputDraft]:
     """Claim a file and its companions, give a scratch path, and put all in place if the
     block succeeds.
 
@@ -79,9 +79,9 @@ def file(
         _refuse(target, names, terms, is_folder=False)
         new = scratch / "new"
         new.mkdir()
-        yield Draft(new / target.name, target)
+        yield OutputDraft(new / target.name, target)
         made = sorted(p.name for p in new.iterdir())
-        manifest.flush(new)
+        manifest.sync_files(new)
         _refuse(target, {*names, *made} - {target.name}, terms, is_folder=False)
         (new / target.name).replace(target)
         for name in {*names, *made} - {target.name}:
@@ -94,7 +94,9 @@ def file(
 
 
 @contextlib.contextmanager
-def folder(target: Path, *, terms: Terms = Terms()) -> Iterator[Draft]:
+def claim_folder(
+    target: Path, *, terms: ClaimTerms = ClaimTerms()
+) -> Iterator[OutputDraft]:
     """Claim a folder, give a scratch folder to fill, and put it in place with a
     manifest if the block succeeds.
 
@@ -110,22 +112,22 @@ def folder(target: Path, *, terms: Terms = Terms()) -> Iterator[Draft]:
         _refuse(target, (), terms, is_folder=True)
         new = scratch / "new"
         new.mkdir()
-        yield Draft(new, target)
+        yield OutputDraft(new, target)
         _finish(new)
         _refuse(target, (), terms, is_folder=True)
         _put(scratch, new, target)
 
 
 @contextlib.contextmanager
-def long_work(
+def claim_long_work(
     target: Path,
     *,
     keep: Sequence[str],
     resume: bool = False,
     grow: bool = False,
-    terms: Terms = Terms(),
-) -> Iterator[Draft]:
-    """As :func:`folder` for work of minutes to days: it is done in ``NAME.unfinished``
+    terms: ClaimTerms = ClaimTerms(),
+) -> Iterator[OutputDraft]:
+    """As :func:`claim_folder` for work of minutes to days: it is done in ``NAME.unfinished``
     beside the target.
 
     That folder survives an interruption if it holds a file that matches a pattern of
@@ -147,13 +149,13 @@ def long_work(
     """
     target = _followed(target)
     with _claim(target, terms, is_folder=True) as scratch:
-        work = unfinished(target)
+        work = unfinished_path(target)
         if not (resume or grow):
             _refuse(target, (), terms, is_folder=True)
         check_room(target, terms.room)
         resumed = _open_work(scratch, target, terms, resume=resume or grow, grow=grow)
         try:
-            yield Draft(work, target, resumed=resumed)
+            yield OutputDraft(work, target, resumed=resumed)
             _finish(work)
             if not (resume or grow):
                 _refuse(target, (), terms, is_folder=True)
@@ -167,7 +169,7 @@ def long_work(
             raise
 
 
-def unfinished(target: Path) -> Path:
+def unfinished_path(target: Path) -> Path:
     """Where the work on a folder is done until it is finished."""
     target = _followed(target)
     return target.with_name(target.name + UNFINISHED)
@@ -201,7 +203,7 @@ def _followed(target: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _claim(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[Path]:
+def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path]:
     """Lock an output and give a scratch folder beside it, which goes in the end."""
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(
@@ -242,7 +244,7 @@ def _scratch(target: Path) -> Iterator[Path]:
             for left in target.parent.glob(".*.part-*"):
                 if left.name[1:].rpartition(".part-")[0] == target.name:
                     shutil.rmtree(left, ignore_errors=True)
-            store.clear(target.with_name(target.name + JOURNAL))
+            store.clear_scratch(target.with_name(target.name + JOURNAL))
             prefix = f".{target.name}.part-"
             scratch = Path(tempfile.mkdtemp(prefix=prefix, dir=target.parent))
         except OSError as error:
@@ -254,7 +256,7 @@ def _scratch(target: Path) -> Iterator[Path]:
 
 
 def _refuse(
-    target: Path, beside: Iterable[str], terms: Terms, *, is_folder: bool
+    target: Path, beside: Iterable[str], terms: ClaimTerms, *, is_folder: bool
 ) -> None:
     """Refuse an output that is an input, exists without --force, is none of ours, or
     finds no room.
@@ -288,7 +290,7 @@ def _refuse(
             continue
         if not terms.force:
             raise OutputError(f"{path} exists; give --force to overwrite it")
-        why = manifest.foreign(path)
+        why = manifest.foreign_reason(path)
         if why:
             raise OutputError(
                 f"{path} {why}: not overwritten, not even with --force; move it or give another name"
@@ -305,17 +307,17 @@ def _is_taken(path: Path) -> bool:
 
 def _finish(folder: Path) -> None:
     """Give a folder its manifest, and sync all that is in it."""
-    begun = manifest.read(folder)
+    begun = manifest.read_manifest(folder)
     others = begun["others"] if begun else ()
-    manifest.write(folder, lock.COMMAND.get(), others=others)
-    manifest.flush(folder)
+    manifest.write_manifest(folder, lock.COMMAND.get(), others=others)
+    manifest.sync_files(folder)
 
 
 def _put(scratch: Path, new: Path, target: Path) -> None:
     """Exchange a finished folder with what stands."""
     if not target.exists():
         new.rename(target)
-    elif lock.exchange(new, target):
+    elif lock.exchange_names(new, target):
         new.rename(scratch / "old")
     else:
         target.rename(scratch / "old")
@@ -324,11 +326,11 @@ def _put(scratch: Path, new: Path, target: Path) -> None:
 
 
 def _open_work(
-    scratch: Path, target: Path, terms: Terms, *, resume: bool, grow: bool
+    scratch: Path, target: Path, terms: ClaimTerms, *, resume: bool, grow: bool
 ) -> bool:
     """Make or find the folder of unfinished work; whether it holds some already."""
-    work = unfinished(target)
-    found = manifest.read(work) if work.is_dir() else None
+    work = unfinished_path(target)
+    found = manifest.read_manifest(work) if work.is_dir() else None
     if work.exists() and found is None:
         raise OutputError(
             f"{work} is in the way and was not made by metalens; move it or give another name"
@@ -344,16 +346,16 @@ def _open_work(
     fresh = scratch / "work"
     copied, others = resume and _is_taken(target), set[str]()
     if copied:
-        others = manifest.strange(target)
-        if others and manifest.read(target) is None:
+        others = manifest.unlisted_files(target)
+        if others and manifest.read_manifest(target) is None:
             raise OutputError(
                 f"{target} holds {min(others)} and no {manifest.NAME}: not made by metalens"
             )
         if not grow:
-            manifest.check(target)
+            manifest.check_manifest(target)
         shutil.copytree(target, fresh, symlinks=True)
     else:
         fresh.mkdir()
-    manifest.write(fresh, lock.COMMAND.get(), finished=False, others=others)
+    manifest.write_manifest(fresh, lock.COMMAND.get(), finished=False, others=others)
     fresh.rename(work)
     return copied

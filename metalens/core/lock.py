@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
-from metalens.ground.errors import OutputError
+from metalens.core.errors import OutputError
 
 COMMAND: ContextVar[str] = ContextVar(
     "COMMAND", default=""
@@ -66,7 +66,7 @@ def _is_locked(handle: int, path: Path, target: Path) -> bool:
         return False
 
 
-def exchange(one: Path, other: Path) -> bool:
+def exchange_names(one: Path, other: Path) -> bool:
     """Swap two names in one step; False where the system cannot."""
     if not sys.platform.startswith("linux"):
         return False

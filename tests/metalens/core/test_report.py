@@ -5,15 +5,15 @@ import re
 import numpy as np
 import pytest
 
-from metalens.ground import report
-from metalens.ground.report import Figure, KeyFigure, Markup, Section, Table
+from metalens.core import report
+from metalens.core.report import Figure, KeyFigure, Markup, Section, Table
 
 
 @pytest.fixture
 def page(tmp_path):
-    figure, axes = report.canvas()
+    figure, axes = report.make_figure()
     axes.plot([0, 1], [0, 1])
-    picture = Figure(report.png(figure), "A line <b>rising</b>")
+    picture = Figure(report.figure_png(figure), "A line <b>rising</b>")
     table = Table(("name", "value"), (("t", 0.123456), ("<script>", 3)), "numbers")
     sections = [
         Section(
@@ -29,7 +29,7 @@ def page(tmp_path):
         KeyFigure("checked", "yes", good=True),
         KeyFigure("left", "1", good=False),
     ]
-    report.write(
+    report.write_report(
         tmp_path / "report.html", "A lens", sections, lead="Lead.", key_figures=keys
     )
     return (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -58,9 +58,9 @@ def test_paragraphs_tables_keys_and_contents_are_there(page):
 
 def test_same_drawing_gives_the_same_bytes():
     def draw():
-        figure, axes = report.canvas()
+        figure, axes = report.make_figure()
         axes.imshow(np.eye(5))
-        return report.png(figure)
+        return report.figure_png(figure)
 
     assert draw() == draw()
 
@@ -84,8 +84,8 @@ def test_keys_are_said_in_plain_words_with_their_unit(key, said):
 
 
 def test_a_picture_has_two_pixels_for_each_of_the_page(fine_pictures):
-    figure, _ = report.canvas(size=(4.0, 3.0))
-    width = int.from_bytes(report.png(figure)[16:20], "big")
+    figure, _ = report.make_figure(size=(4.0, 3.0))
+    width = int.from_bytes(report.figure_png(figure)[16:20], "big")
     assert width == pytest.approx(2 * 4.0 * 110, rel=0.1)  # cut to what is drawn
 
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from metalens.ground.errors import DAMAGE, MetalensError, StoreError
+from metalens.core.errors import DAMAGE, MetalensError, StoreError
 
 Made = TypeVar("Made")
 _WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
@@ -28,7 +28,7 @@ _noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar(
 
 
 @contextlib.contextmanager
-def remembered() -> Iterator[None]:
+def remember_inputs() -> Iterator[None]:
     """Remember inputs from their first reading on, until the block (a command) ends."""
     token = _noted.set({})
     try:
@@ -56,7 +56,7 @@ def read_text(path: str | Path) -> str:
     return decode_text(Path(path).read_bytes())
 
 
-def parting(line: str) -> tuple[str | None, bool]:
+def column_separator(line: str) -> tuple[str | None, bool]:
     """What parts the columns of a line of a table (None for blanks and tabs), and
     whether its commas are decimal.
 
@@ -73,14 +73,14 @@ def parting(line: str) -> tuple[str | None, bool]:
     return ("," if "," in line else None), False
 
 
-def columns(line: str) -> list[str]:
+def split_columns(line: str) -> list[str]:
     """The words of such a line, decimals with points."""
-    mark, decimal = parting(line)
+    mark, decimal = column_separator(line)
     line = line.replace(",", ".") if decimal else line
     return (line if mark is None else line.replace(mark, " ")).split()
 
 
-def stamp(path: str | Path) -> Stamp:
+def file_stamp(path: str | Path) -> Stamp:
     """Which file it is, its bytes and the time of its last change; of a folder, also of
     all that lies in it.
 
@@ -107,31 +107,31 @@ def check_same(path: str | Path, before: Stamp) -> None:
     Raises:
         StoreError: naming it.
     """
-    if stamp(path) != before:
+    if file_stamp(path) != before:
         raise StoreError(
             f"{path} was changed or replaced while it was being read: run again when it stands still"
         )
 
 
 @contextlib.contextmanager
-def steady(path: str | Path) -> Iterator[None]:
+def refuse_changes(path: str | Path) -> Iterator[None]:
     """Refuse an input that another program writes to while the block reads it.
 
     Raises:
         StoreError: see :func:`check_same`, in place of what the block made of such an
             input.
     """
-    before = stamp(path)
+    before = file_stamp(path)
     try:
         yield
     except (*DAMAGE, IndexError, ArithmeticError):
         check_same(path, before)
         raise
     check_same(path, before)
-    note(path, before)
+    note_input(path, before)
 
 
-def note(path: str | Path, before: Stamp, content: bytes | None = None) -> None:
+def note_input(path: str | Path, before: Stamp, content: bytes | None = None) -> None:
     """Note what an input was when this command first read it; with its content, its
     hash too.
     """
@@ -148,7 +148,9 @@ def sha256(path: str | Path) -> str:
     Raises:
         StoreError: it was replaced since; OSError: it cannot be read.
     """
-    before, digest = (_noted.get() or {}).get(os.path.abspath(path), (stamp(path), ""))
+    before, digest = (_noted.get() or {}).get(
+        os.path.abspath(path), (file_stamp(path), "")
+    )
     if not digest:
         with open(path, "rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -156,7 +158,7 @@ def sha256(path: str | Path) -> str:
     return digest
 
 
-class Through(io.FileIO):
+class CheckedFile(io.FileIO):
     """A file for the HDF5 library, which may crash the process where a write fails, as
     on a full disk.
 
@@ -186,7 +188,7 @@ class Through(io.FileIO):
         return 0 if self.refused is not None else super().truncate(size)
 
 
-def reader(load: Callable[..., Made]) -> Callable[..., Made]:
+def typed_reader(load: Callable[..., Made]) -> Callable[..., Made]:
     """A ``load(path, ...)`` whose every failure on a damaged or edited file is a
     StoreError that names the file.
     """
@@ -255,12 +257,14 @@ def read_hdf5(path: str | Path, read: Callable[[Any], Made]) -> Made:
 
     plain = os.path.isfile(path)
     if os.path.exists(path) and not (plain or os.path.isdir(path)):
-        raise StoreError(f"{path}: {absent(Path(path))}")  # a pipe would be waited for
-    with steady(path), h5py.File(path, "r") as file:
+        raise StoreError(
+            f"{path}: {missing_reason(Path(path))}"
+        )  # a pipe would be waited for
+    with refuse_changes(path), h5py.File(path, "r") as file:
         return read(file)
 
 
-def shown(text: str) -> str:
+def to_valid_utf8(text: str) -> str:
     """A text whose every character is one of UTF-8, of one that may hold names of files in bytes of no known locale.
 
     Python keeps such bytes as lone surrogates. Where they are UTF-8 they become what they stand for; others, codes.
@@ -276,7 +280,7 @@ def shown(text: str) -> str:
         return text.encode("utf-8", "backslashreplace").decode()
 
 
-def absent(path: Path) -> str:
+def missing_reason(path: Path) -> str:
     """What is wrong with a path that is no plain file, in words."""
     if path.is_dir():
         return "a folder"
@@ -296,7 +300,7 @@ _FOREIGN = {  # first bytes of what is often given in place of an artefact, in w
 }
 
 
-def foreign(path: str | Path) -> str:
+def foreign_format(path: str | Path) -> str:
     """What a file is that begins as another program's, in words; empty for any other."""
     start = b""
     with contextlib.suppress(OSError), open(path, "rb") as file:

@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 
-def longer(length: Any, more: Any) -> Any:
+def hypot_minus_length(length: Any, more: Any) -> Any:
     """sqrt(length² + more) - length, for a length of 0 or more; operands broadcast.
 
     Accuracy: three roundings of the type that came in.
@@ -33,7 +33,7 @@ def path_difference(radius2_um2: Any, distance_um: Any) -> Any:
     return (
         radius2_um2 * 0.0
         if math.isinf(distance_um)
-        else longer(distance_um, radius2_um2)
+        else hypot_minus_length(distance_um, radius2_um2)
     )
 
 
@@ -58,4 +58,4 @@ def sensor_path(x: Any, y: Any, centre: Any, distance: Any) -> Any:
     """
     cx, cy = centre
     r0 = (cx * cx + cy * cy + distance * distance) ** 0.5
-    return longer(r0, x * x + y * y - 2 * (x * cx + y * cy))
+    return hypot_minus_length(r0, x * x + y * y - 2 * (x * cx + y * cy))

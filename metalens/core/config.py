@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from metalens.ground import reading
-from metalens.ground.errors import ConfigError, nearest
+from metalens.core import reading
+from metalens.core.errors import ConfigError, nearest_name_hint
 
 Record = TypeVar("Record")
 _LARGEST = 1 << 24  # bytes of a config
@@ -69,12 +69,12 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
     path = Path(path)
     try:
         with open(path, "rb") as file:
-            before, content = reading.stamp(path), file.read(_LARGEST + 1)
+            before, content = reading.file_stamp(path), file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
             raise ConfigError(
                 f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})"
             )
-        reading.note(path, before, content)
+        reading.note_input(path, before, content)
         text = reading.decode_text(content)
     except FileNotFoundError:
         raise ConfigError(
@@ -111,10 +111,10 @@ def from_table(
     return typing.cast(Record, _build(table, record, where, ""))
 
 
-def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def merge_tables(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """``base`` with the entries of ``over`` in their place, table by table."""
     both = {
-        k: merged(base[k], v)
+        k: merge_tables(base[k], v)
         if isinstance(v, dict) and isinstance(base.get(k), dict)
         else v
         for k, v in over.items()
@@ -158,7 +158,7 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
         if key not in fields:
             elsewhere: dict[str, str] = getattr(record, "ELSEWHERE", {})
             raise ConfigError(
-                f"{where}: unknown key {prefix + key!r}{nearest(key, fields, elsewhere)}"
+                f"{where}: unknown key {prefix + key!r}{nearest_name_hint(key, fields, elsewhere)}"
             )
     values = {}
     for key, value in table.items():
@@ -196,12 +196,12 @@ def _meaning(record: type[Any], key: str) -> Iterator[None]:
         raise
     except ConfigError as error:
         text = textwrap.shorten(
-            described(record).get(key, ""), _TEXT, placeholder=" ..."
+            describe_fields(record).get(key, ""), _TEXT, placeholder=" ..."
         )
         raise _Meant(f"{error} ({key}: {text})" if text else str(error)) from None
 
 
-def described(record: type[Any]) -> dict[str, str]:
+def describe_fields(record: type[Any]) -> dict[str, str]:
     """{field: what the docstring of a record says of it}: ``name: text`` or ``name,
     other: text``, to an empty line.
     """
@@ -329,7 +329,7 @@ def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
     if origin is typing.Literal:
         if value not in options:
             raise ConfigError(
-                f"{where}: {key} is {_shown(value)}{nearest(_shown(value), map(str, options))}"
+                f"{where}: {key} is {_shown(value)}{nearest_name_hint(_shown(value), map(str, options))}"
             )
         return value
     if origin is tuple:
@@ -360,7 +360,7 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
         kind = value.get("kind")
         if not isinstance(kind, str) or kind not in kinds:
             raise ConfigError(
-                f"{where}: {key}.kind is {_shown(kind)}{nearest(_shown(kind), kinds)}"
+                f"{where}: {key}.kind is {_shown(kind)}{nearest_name_hint(_shown(kind), kinds)}"
             )
         return _convert(value, kinds[kind], where, key)
     errors = []

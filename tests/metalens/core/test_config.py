@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from metalens.cell.record import Cell, Film, Index
-from metalens.ground import config
-from metalens.ground.errors import ConfigError
+from metalens.core import config
+from metalens.core.errors import ConfigError
 
 
 @dataclass(frozen=True)

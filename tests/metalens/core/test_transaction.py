@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from metalens.ground import manifest, store, transaction
-from metalens.ground.errors import OutputError, StoreError
-from metalens.ground.transaction import Terms
+from metalens.core import manifest, store, transaction
+from metalens.core.errors import OutputError, StoreError
+from metalens.core.transaction import ClaimTerms
 
-FORCE = Terms(force=True)
+FORCE = ClaimTerms(force=True)
 
 
 def tree(folder):
@@ -33,14 +33,14 @@ def tree(folder):
 
 
 def put(target, **contents):
-    with transaction.folder(target, terms=FORCE) as draft:
+    with transaction.claim_folder(target, terms=FORCE) as draft:
         for name, text in contents.items():
             (draft.path / name).write_text(text)
 
 
 def save(target, value, *, force=True):
-    with transaction.file(
-        target, beside=(".png", "_old.png"), terms=Terms(force=force)
+    with transaction.claim_file(
+        target, beside=(".png", "_old.png"), terms=ClaimTerms(force=force)
     ) as draft:
         store.save(draft.path, "lens", {}, attributes={"value": value})
         draft.path.with_suffix(".png").write_bytes(
@@ -49,15 +49,15 @@ def save(target, value, *, force=True):
 
 
 def test_a_folder_appears_whole_with_its_manifest(tmp_path):
-    with transaction.folder(tmp_path / "out") as draft:
+    with transaction.claim_folder(tmp_path / "out") as draft:
         (draft.path / "sub").mkdir()
         (draft.path / "sub" / "b.txt").write_text("two")
         assert not (tmp_path / "out").exists()
-    found = manifest.read(tmp_path / "out")
+    found = manifest.read_manifest(tmp_path / "out")
     assert list(found["files"]) == ["sub/b.txt"]
     assert found["files"]["sub/b.txt"]["bytes"] == 3
     assert sorted(os.listdir(tmp_path)) == ["out"]
-    manifest.check(tmp_path / "out")
+    manifest.check_manifest(tmp_path / "out")
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -65,8 +65,8 @@ def test_whatever_ends_the_block_leaves_what_was_there(tmp_path, error):
     put(tmp_path / "out", a="old")
     save(tmp_path / "f.h5", 1)
     before = tree(tmp_path)
-    for claim in (transaction.folder, transaction.file):
-        target = tmp_path / ("out" if claim is transaction.folder else "f.h5")
+    for claim in (transaction.claim_folder, transaction.claim_file):
+        target = tmp_path / ("out" if claim is transaction.claim_folder else "f.h5")
         with pytest.raises(error), claim(target, terms=FORCE) as draft:
             (draft.path / "half" if draft.path.is_dir() else draft.path).write_text(
                 "half"
@@ -86,7 +86,7 @@ def test_force_replaces_only_what_is_ours(tmp_path):
     for name, what in (("thesis", "chapter.tex"), ("mixed", "photo.jpg")):
         with (
             pytest.raises(OutputError, match=what),
-            transaction.folder(tmp_path / name, terms=FORCE),
+            transaction.claim_folder(tmp_path / name, terms=FORCE),
         ):
             pass
     with pytest.raises(OutputError, match=r"photo\.png was not made by metalens"):
@@ -109,7 +109,7 @@ def test_nothing_is_replaced_without_force(tmp_path):
         with pytest.raises(OutputError, match="--force"):
             save(tmp_path / name, 2, force=False)
     assert tree(tmp_path) == before
-    with transaction.folder(tmp_path / "empty") as draft:
+    with transaction.claim_folder(tmp_path / "empty") as draft:
         (draft.path / "a").write_text("x")
     assert (tmp_path / "empty" / "a").exists()
 
@@ -121,16 +121,16 @@ def test_an_output_is_never_an_input(tmp_path):
     put(tmp_path / "shots", a="1")
     before = tree(tmp_path)
     for name in ("lens.h5", "soft.h5", "hard.h5"):
-        terms = Terms(force=True, inputs=(tmp_path / "lens.h5",))
+        terms = ClaimTerms(force=True, inputs=(tmp_path / "lens.h5",))
         with (
             pytest.raises(OutputError, match="also an input"),
-            transaction.file(tmp_path / name, terms=terms),
+            transaction.claim_file(tmp_path / name, terms=terms),
         ):
             pass
-    terms = Terms(force=True, inputs=(tmp_path / "shots" / "a",))
+    terms = ClaimTerms(force=True, inputs=(tmp_path / "shots" / "a",))
     with (
         pytest.raises(OutputError, match="holds the input"),
-        transaction.folder(tmp_path / "shots", terms=terms),
+        transaction.claim_folder(tmp_path / "shots", terms=terms),
     ):
         pass
     assert tree(tmp_path) == before
@@ -139,27 +139,27 @@ def test_an_output_is_never_an_input(tmp_path):
 def test_refusals_come_before_the_work(tmp_path):
     (tmp_path / "file").write_text("x")
     cases = (
-        (transaction.folder, tmp_path / "file", "is a file"),
-        (transaction.folder, tmp_path / "no" / "out", "does not exist"),
-        (transaction.file, Path("a\0b.h5"), "need the name"),
+        (transaction.claim_folder, tmp_path / "file", "is a file"),
+        (transaction.claim_folder, tmp_path / "no" / "out", "does not exist"),
+        (transaction.claim_file, Path("a\0b.h5"), "need the name"),
     )
     for claim, target, words in cases:
         with pytest.raises(OutputError, match=words), claim(target):
             pytest.fail("the work began")
-    huge = Terms(room=1 << 60)
+    huge = ClaimTerms(room=1 << 60)
     with (
         pytest.raises(OutputError, match="MB free, need"),
-        transaction.file(tmp_path / "f", terms=huge),
+        transaction.claim_file(tmp_path / "f", terms=huge),
     ):
         pytest.fail("the work began")
 
 
 def test_a_second_writer_is_told_who_is_first(tmp_path):
-    with transaction.folder(tmp_path / "out") as draft:
+    with transaction.claim_folder(tmp_path / "out") as draft:
         (draft.path / "a").write_text("first")
         with (
             pytest.raises(OutputError, match=f"process {os.getpid()} "),
-            transaction.folder(tmp_path / "out"),
+            transaction.claim_folder(tmp_path / "out"),
         ):
             pytest.fail("two writers")
     assert (tmp_path / "out" / "a").read_text() == "first"
@@ -170,25 +170,25 @@ def test_long_work_survives_an_interruption_and_goes_on(tmp_path):
     put(target, old="old")
     with (
         pytest.raises(KeyboardInterrupt) as stopped,
-        transaction.long_work(target, keep=keep, terms=FORCE) as draft,
+        transaction.claim_long_work(target, keep=keep, terms=FORCE) as draft,
     ):
         (draft.path / "check").write_text("half way")
         raise KeyboardInterrupt
     assert "--resume" in stopped.value.__notes__[0]
     assert (target / "old").read_text() == "old"
     with pytest.raises(StoreError, match="unfinished"):
-        manifest.check(draft.path)
-    with transaction.long_work(target, keep=keep, resume=True) as draft:
+        manifest.check_manifest(draft.path)
+    with transaction.claim_long_work(target, keep=keep, resume=True) as draft:
         assert draft.resumed
         (draft.path / "end").write_text((draft.path / "check").read_text())
     assert sorted(os.listdir(tmp_path)) == ["run"]
-    assert sorted(manifest.read(target)["files"]) == ["check", "end"]
+    assert sorted(manifest.read_manifest(target)["files"]) == ["check", "end"]
 
 
 def test_long_work_without_anything_to_keep_leaves_nothing(tmp_path):
     with (
         pytest.raises(OSError, match="bad"),
-        transaction.long_work(tmp_path / "run", keep=("check",)),
+        transaction.claim_long_work(tmp_path / "run", keep=("check",)),
     ):
         raise OSError("bad")
     assert os.listdir(tmp_path) == []
@@ -197,17 +197,19 @@ def test_long_work_without_anything_to_keep_leaves_nothing(tmp_path):
 def test_unfinished_work_is_not_thrown_away_unasked(tmp_path):
     with (
         pytest.raises(OSError, match="x"),
-        transaction.long_work(tmp_path / "run", keep=("c",)) as draft,
+        transaction.claim_long_work(tmp_path / "run", keep=("c",)) as draft,
     ):
         (draft.path / "c").write_text("hours")
         raise OSError("x")
     with (
         pytest.raises(OutputError, match="--resume"),
-        transaction.long_work(tmp_path / "run", keep=("c",)),
+        transaction.claim_long_work(tmp_path / "run", keep=("c",)),
     ):
         pass
     assert (draft.path / "c").read_text() == "hours"
-    with transaction.long_work(tmp_path / "run", keep=("c",), terms=FORCE) as draft:
+    with transaction.claim_long_work(
+        tmp_path / "run", keep=("c",), terms=FORCE
+    ) as draft:
         assert not draft.resumed
     assert sorted(os.listdir(tmp_path)) == ["run"]
 
@@ -224,12 +226,12 @@ def test_what_others_put_into_a_folder_stays_theirs_when_the_work_on_it_goes_on(
     for turn in (1, 2):  # interrupted once, then finished
         with (
             contextlib.suppress(KeyboardInterrupt),
-            transaction.long_work(target, keep=("ours",), **how) as draft,
+            transaction.claim_long_work(target, keep=("ours",), **how) as draft,
         ):
             (draft.path / "more").write_text(str(turn))
             if turn == 1:
                 raise KeyboardInterrupt
-    found = manifest.read(target)
+    found = manifest.read_manifest(target)
     assert set(found["files"]) == {"ours", "more", "part/inner", "part/manifest.json"}
     assert found["others"] == ["notes.txt", "part/photo.jpg"]
     with pytest.raises(OutputError, match=r"notes\.txt, which metalens did not make"):
@@ -242,15 +244,15 @@ def test_a_folder_of_others_does_not_grow(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years")
     before = tree(tmp_path)
-    grown = transaction.long_work(tmp_path / "thesis", keep=(), grow=True)
+    grown = transaction.claim_long_work(tmp_path / "thesis", keep=(), grow=True)
     with pytest.raises(OutputError, match=r"chapter\.tex"), grown:
         pass
     assert tree(tmp_path) == before
     (tmp_path / "thesis" / "chapter.tex").unlink()
     put(tmp_path / "thesis" / "part", inner="ours")
-    with transaction.long_work(tmp_path / "thesis", keep=(), grow=True) as draft:
+    with transaction.claim_long_work(tmp_path / "thesis", keep=(), grow=True) as draft:
         (draft.path / "more").write_text("x")
-    assert set(manifest.read(tmp_path / "thesis")["files"]) == {
+    assert set(manifest.read_manifest(tmp_path / "thesis")["files"]) == {
         "more",
         "part/inner",
         "part/manifest.json",
@@ -260,17 +262,17 @@ def test_a_folder_of_others_does_not_grow(tmp_path):
 def test_a_changed_folder_is_refused_by_name(tmp_path):
     put(tmp_path / "out", a="1", b="2")
     (tmp_path / "out" / "added").write_text("a note")
-    manifest.check(tmp_path / "out")
+    manifest.check_manifest(tmp_path / "out")
     (tmp_path / "out" / "a").write_text("3")
     with pytest.raises(StoreError, match="a is not what was written"):
-        manifest.check(tmp_path / "out")
+        manifest.check_manifest(tmp_path / "out")
     (tmp_path / "out" / "a").unlink()
     with pytest.raises(StoreError, match="a is missing"):
-        manifest.check(tmp_path / "out")
+        manifest.check_manifest(tmp_path / "out")
     for text in ("{", "[]", json.dumps({"kind": "metalens folder"}), "[" * 100_000):
         (tmp_path / "out" / manifest.NAME).write_text(text)
         with pytest.raises(StoreError, match="no manifest"):
-            manifest.check(tmp_path / "out")
+            manifest.check_manifest(tmp_path / "out")
 
 
 def test_scratch_files_of_the_dead_are_cleared_by_the_next_save(tmp_path):
@@ -337,7 +339,7 @@ def test_kills_at_random_moments_mix_nothing_and_leave_nothing(tmp_path, kind):
         child.wait()
         child.stdout.close()
         if kind == "folder" and (work / "out").exists():
-            manifest.check(work / "out")
+            manifest.check_manifest(work / "out")
             assert (
                 len(
                     {

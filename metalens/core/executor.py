@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
-from metalens.ground import threads
-from metalens.ground.errors import ConfigError, WorkerError
+from metalens.core import threads
+from metalens.core.errors import ConfigError, WorkerError
 
 Common = TypeVar("Common")
 Task = TypeVar("Task")
@@ -41,7 +41,7 @@ _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = (
 _MOST = 1024  # processes of one machine
 
 
-def cores() -> int:
+def usable_cores() -> int:
     """Cores that this process may use."""
     return (
         len(os.sched_getaffinity(0))
@@ -51,12 +51,12 @@ def cores() -> int:
 
 
 @contextlib.contextmanager
-def on(processes: int | None = None) -> Iterator[None]:
+def run_on(processes: int | None = None) -> Iterator[None]:
     """Do the tasks of the block in so many processes of this machine.
 
     Args:
-        processes: None: each verb has its own way, :func:`run` a process a core,
-            :func:`gather` threads of this process.
+        processes: None: each verb has its own way, :func:`run_parallel` a process a core,
+            :func:`gather_parallel` threads of this process.
 
     Raises:
         ConfigError: no such number of processes.
@@ -74,7 +74,7 @@ def on(processes: int | None = None) -> Iterator[None]:
             _PLACE.reset(token)
 
 
-def run(
+def run_parallel(
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     *,
@@ -84,7 +84,7 @@ def run(
 
     Args:
         work: a function of a module (workers import it by name).
-        processes: where :func:`on` says nothing; by default one a core.
+        processes: where :func:`run_on` says nothing; by default one a core.
 
     Raises:
         WorkerError: a worker process died, with its cause. Whatever ``work`` raises.
@@ -95,11 +95,11 @@ def run(
     if place is not None:
         yield from place(_plain, work, tasks)
         return
-    with _pool(min(processes or cores(), len(tasks))) as pool:
+    with _pool(min(processes or usable_cores(), len(tasks))) as pool:
         yield from _here(pool, _plain, work, tasks)
 
 
-def gather(
+def gather_parallel(
     work: Callable[[Common, Task], Result],
     common: Common,
     tasks: Sequence[Task],
@@ -110,13 +110,13 @@ def gather(
 
     Args:
         work: a function of a module. common: what all tasks need.
-        beside: where :func:`on` names no workers, side by side in threads of this
+        beside: where :func:`run_on` names no workers, side by side in threads of this
             process, for work that mostly
             consists of calls which release the interpreter lock; else one after the
             other, each with all threads.
 
     Raises:
-        WorkerError: as :func:`run`. Whatever ``work`` raises.
+        WorkerError: as :func:`run_parallel`. Whatever ``work`` raises.
     """
     place = _PLACE.get()
     if place is not None and tasks:
@@ -124,7 +124,11 @@ def gather(
         return [found[i] for i in range(len(tasks))]
     alone = functools.partial(work, common)
     with threads.one_blas_thread():
-        return threads.each(alone, tasks) if beside else [alone(task) for task in tasks]
+        return (
+            threads.run_each(alone, tasks)
+            if beside
+            else [alone(task) for task in tasks]
+        )
 
 
 def _plain(work: Callable[[Task], Result], task: Task) -> Result:

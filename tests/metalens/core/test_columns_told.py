@@ -2,7 +2,7 @@
 
 import pytest
 
-from metalens.ground import reading
+from metalens.core import reading
 
 
 @pytest.mark.parametrize(
@@ -28,5 +28,5 @@ from metalens.ground import reading
 def test_commas_are_decimal_where_every_number_has_one_or_a_semicolon_parts(
     line, told, words
 ):
-    assert reading.parting(line) == told
-    assert reading.columns(line) == words
+    assert reading.column_separator(line) == told
+    assert reading.split_columns(line) == words

@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from metalens.ground.errors import OutputError
+from metalens.core.errors import OutputError
 
 Item = TypeVar("Item")
 
 
-def flush(text: str = "") -> None:
+def flush_output(text: str = "") -> None:
     """Write to standard output and flush it; a reader that went away (``| head``) is no
     failure of the work.
 
@@ -27,13 +27,13 @@ def flush(text: str = "") -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
     except BrokenPipeError:
-        silence()
+        silence_output()
     except OSError as error:
-        silence()
+        silence_output()
         raise OutputError(f"standard output: {error.strerror}") from error
 
 
-def silence() -> None:
+def silence_output() -> None:
     """Standard output leads nowhere from here on, what it still holds included."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     with contextlib.suppress(OSError, ValueError):  # one that is no file
@@ -55,12 +55,12 @@ class Console:
     def say(self, text: str) -> None:
         """One line for a person."""
         if not (self.quiet or self.json):
-            flush(text + "\n")
+            flush_output(text + "\n")
 
     def result(self, values: dict[str, Any], text: str) -> None:
         """The outcome: ``values`` with --json, else ``text``."""
         if self.json:
-            flush(json.dumps(values, indent=1, default=float) + "\n")
+            flush_output(json.dumps(values, indent=1, default=float) + "\n")
         else:
             self.say(text)
 

@@ -4,7 +4,7 @@ through.
 
 import json
 
-from metalens.ground.console import Console
+from metalens.core.console import Console
 
 
 def test_plain_lines_and_results(capsys):

@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import store
-from metalens.ground.errors import StoreError
+from metalens.core import store
+from metalens.core.errors import StoreError
 
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
 _LARGEST = 1 << 26  # bytes of a manifest
@@ -35,7 +35,7 @@ _MARKS = (
 )
 
 
-def write(
+def write_manifest(
     folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()
 ) -> None:
     """Write the manifest of everything in a folder but ``others``, which are not ours
@@ -44,7 +44,7 @@ def write(
     Unfinished: of a folder that is still being made.
     """
     listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
-              for name in (sorted({*files(folder)} - {*others}) if finished else ())}  # fmt: skip
+              for name in (sorted({*iterate_files(folder)} - {*others}) if finished else ())}  # fmt: skip
     about = {
         "kind": KIND,
         "version": VERSION,
@@ -57,7 +57,7 @@ def write(
     store.write_text(folder / NAME, json.dumps(about, indent=1) + "\n")
 
 
-def read(folder: Path) -> dict[str, Any] | None:
+def read_manifest(folder: Path) -> dict[str, Any] | None:
     """The manifest of a folder; None where it has none.
 
     Raises:
@@ -94,7 +94,7 @@ def read(folder: Path) -> dict[str, Any] | None:
         ) from None
 
 
-def check(folder: Path) -> None:
+def check_manifest(folder: Path) -> None:
     """Refuse a folder of ours that is unfinished or no longer what was written; one
     without a manifest passes.
 
@@ -103,7 +103,7 @@ def check(folder: Path) -> None:
     Raises:
         StoreError: what is missing or differs, and what to do.
     """
-    found = read(folder)
+    found = read_manifest(folder)
     if found is None:
         return
     if not found["finished"]:
@@ -126,7 +126,7 @@ def check(folder: Path) -> None:
             )
 
 
-def flush(folder: Path) -> None:
+def sync_files(folder: Path) -> None:
     """Flush a folder and all that is in it."""
     for place, _, names in os.walk(folder):
         for name in names:
@@ -138,7 +138,7 @@ def flush(folder: Path) -> None:
         store.sync_folder(Path(place))
 
 
-def files(folder: Path) -> Iterator[str]:
+def iterate_files(folder: Path) -> Iterator[str]:
     """Names of all files below a folder, the manifest aside; folders that hold nothing
     end in a slash.
     """
@@ -154,7 +154,7 @@ def files(folder: Path) -> Iterator[str]:
         )
 
 
-def empty(folder: Path) -> None:
+def empty_folder(folder: Path) -> None:
     """Remove all that is in a folder but its manifest."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
@@ -163,7 +163,7 @@ def empty(folder: Path) -> None:
             path.unlink()
 
 
-def foreign(path: Path) -> str:
+def foreign_reason(path: Path) -> str:
     """Why a file or folder may not be replaced as one of ours; '' where it may.
 
     A folder is ours with a manifest and no file beyond those that it lists; a file by
@@ -185,7 +185,7 @@ def foreign(path: Path) -> str:
     return "" if store.kind_of(path) else "was not made by metalens"
 
 
-def journal(path: Path, title: str) -> list[str]:
+def open_journal(path: Path, title: str) -> list[str]:
     """Whole lines of the journal of a piece of work after its title, its first; other
     work's is begun afresh.
 
@@ -206,11 +206,11 @@ def journal(path: Path, title: str) -> list[str]:
 
 
 def _foreign_folder(path: Path) -> str:
-    present = set(files(path))
+    present = set(iterate_files(path))
     if not present and not (path / NAME).exists():
         return ""
     try:
-        found = read(path)
+        found = read_manifest(path)
     except StoreError as error:
         return str(error)
     if found is None:
@@ -221,15 +221,15 @@ def _foreign_folder(path: Path) -> str:
     return ""
 
 
-def strange(folder: Path) -> set[str]:
+def unlisted_files(folder: Path) -> set[str]:
     """Files that neither the manifest of a folder lists nor that of a folder inside it.
 
     Raises:
         StoreError: a manifest is damaged.
     """
-    present = set(files(folder))
+    present = set(iterate_files(folder))
     for place in (folder, *(path.parent for path in folder.rglob(NAME))):
-        found, inside = read(place), place.relative_to(folder)
+        found, inside = read_manifest(place), place.relative_to(folder)
         present -= (
             {(inside / name).as_posix() for name in (*found["files"], NAME)}
             if found
