@@ -22,7 +22,7 @@ __getattr__, __dir__, __all__ = attach_lazy_exports(
         "DEFAULT_CELL": "metalens.pillars.record",
         "PillarLibrary": "metalens.pillars.record",
         "Sweep": "metalens.pillars.record",
-        "check": "metalens.pillars.record",
+        "check_sweep": "metalens.pillars.record",
         "load": "metalens.pillars.record",
         "proxy_of": "metalens.pillars.fit",
         "save": "metalens.pillars.record",

@@ -18,8 +18,8 @@ __getattr__, __dir__, __all__ = attach_lazy_exports(
         "Material": "metalens.cell.materials",
         "NAMES": "metalens.cell.materials",
         "index": "metalens.cell.materials",
-        "material": "metalens.cell.materials",
+        "find_material": "metalens.cell.materials",
         "read_csv": "metalens.cell.materials",
-        "slope": "metalens.cell.materials",
+        "index_dispersion": "metalens.cell.materials",
     },
 )

@@ -21,9 +21,9 @@ __getattr__, __dir__, __all__ = attach_lazy_exports(
         "DoubleHelix": "metalens.design.profiles",
         "Focus": "metalens.design.profiles",
         "PhaseMap": "metalens.design.profiles",
-        "cubic": "metalens.design.profiles",
-        "double_helix": "metalens.design.profiles",
-        "hyperbolic": "metalens.design.profiles",
+        "cubic_phase": "metalens.design.profiles",
+        "double_helix_phase": "metalens.design.profiles",
+        "hyperbolic_phase": "metalens.design.profiles",
         "path_difference": "metalens.core.paths",
     },
 )

@@ -79,7 +79,10 @@ def _face(package):
     """
     table, typed = {}, {}
     for node in _nodes(package):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "attach":
+        if (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "id", "") == "attach_lazy_exports"
+        ):
             for key, value in zip(node.args[1].keys, node.args[1].values, strict=True):
                 module, _, there = value.value.partition(":")
                 module = module if "." in module else f"{package}.{module}".rstrip(".")
@@ -96,7 +99,7 @@ def _face(package):
 FACES = [
     name
     for name, path in MODULES.items()
-    if "attach(" in path.read_text(encoding="utf-8") and _face(name)[0]
+    if "attach_lazy_exports(" in path.read_text(encoding="utf-8") and _face(name)[0]
 ]
 
 

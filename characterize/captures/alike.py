@@ -64,7 +64,8 @@ def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameSpectra:
-    """Frames as :func:`normalized_cross_correlation` correlates them: spectra (n, u, v) of twice the side,
+    """Frames as :func:`normalized_cross_correlation` correlates them: spectra (n, u, v)
+    of twice the side,
     norms (n,) freed of noise.
     """
 

@@ -346,7 +346,8 @@ def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
 
 
 def write_fields(lens: Lens) -> Array:
-    """(fields, modes and known phases) of :func:`smooth_phase_changes` and the wave-front parameters
+    """(fields, modes and known phases) of :func:`smooth_phase_changes` and the
+    wave-front parameters
     for 1 um along x, then y.
 
     Four fields across the lens each way. What is no smooth phase is left out: it

@@ -141,7 +141,8 @@ class FitSolution:
     information: (p, p) Fisher information of the data alone.
     image, residual_sigma: (n, y, x) model, and (data - model) / sigma, 0 where masked
     or silent.
-    chi2_per_dof: reduced chi-square of the pixels within ``huber``, over its expectation.
+    chi2_per_dof: reduced chi-square of the pixels within ``huber``, over its
+    expectation.
     merit: robust chi-square with priors, to
     compare starts.
     converged, reason: why it stopped.

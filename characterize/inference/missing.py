@@ -245,7 +245,8 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
 
 
 def to_fit(found: list[ScoreTest], *, stuck: bool = False) -> list[ScoreTest]:
-    """Causes that free parameters describe and that may be fitted next, likeliest first.
+    """Causes that free parameters describe and that may be fitted next, likeliest
+    first.
 
     Those that the residuals lean to beyond chance; else those that are likelier there
     than not.

@@ -59,7 +59,8 @@ class SearchTask:
     found: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes
     (``characterize.model.UNFITTED``).
-    left_out: what is added to images and slopes of the model; see :func:`correct_surrogate`.
+    left_out: what is added to images and slopes of the model; see
+    :func:`correct_surrogate`.
     """
 
     model: ForwardModel

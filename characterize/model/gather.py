@@ -35,7 +35,8 @@ def even_interpolation(
 
 
 def node_stretch(count: int, tolerance: float) -> float:
-    """Of :func:`even_nodes`: how near its branch may come to the ends of the nodes, for a
+    """Of :func:`even_nodes`: how near its branch may come to the ends of the nodes, for
+    a
     wave as steep as they hold.
     """
     return 1 / math.cosh((math.log(1e5 / tolerance) + count / 60) / count)

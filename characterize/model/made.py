@@ -126,7 +126,8 @@ def built_lens(design: Lens, x: Array) -> Lens:
     """The design with the as-built diameters, wavelength and distance; they are clipped
     to the proxy's domain.
 
-    Height, index, sidewall and wave-front errors are no diameters: :func:`as_built_transmission` and
+    Height, index, sidewall and wave-front errors are no diameters:
+    :func:`as_built_transmission` and
     :func:`psf_stack` hold them.
     """
     d = design.diameters

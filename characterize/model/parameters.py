@@ -1,7 +1,8 @@
 """The parameters of an as-built lens and its bench: what each means, in which unit, and
 what is known beforehand.
 
-Those of the lens are the table of :mod:`metalens.fabrication.perturbations`; those of the bench stand
+Those of the lens are the table of :mod:`metalens.fabrication.perturbations`; those of
+the bench stand
 here.
 """
 
@@ -36,8 +37,10 @@ class FitParameter:
     any metrology (inf: none).
     low, high: bounds. free: fitted unless told otherwise. plausible: standard deviation
     that is reckoned with where
-    it is neither fitted nor stated; sigma where 0. effect: as a cause in words, where it
-    is looked for while it is held; probe: so much of it is tried then. extra: fitted too
+    it is neither fitted nor stated; sigma where 0. effect: as a cause in words, where
+    it
+    is looked for while it is held; probe: so much of it is tried then. extra: fitted
+    too
     where the usual ones do not explain the frames. reversible: near focus the opposite
     sign looks alike. measured_by: what settles it beside the frames.
     """

@@ -42,19 +42,23 @@ _SOURCES = (
 def log_response_slopes(
     lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()
 ) -> Sensitivity:
-    """d ln t by the answering causes of :mod:`metalens.fabrication.perturbations` over the diameters
+    """d ln t by the answering causes of :mod:`metalens.fabrication.perturbations` over
+    the diameters
     of a lens, or t itself.
 
     Upright round pillars whose proxy is that of the cell: t by the modal method at
     every diameter that a bias can lead to and at five heights and seven indices within
-    the bounds of the fit (:class:`metalens.fabrication.Solved`), to 3e-3 there and up to 0.03
+    the bounds of the fit (:class:`metalens.fabrication.Solved`), to 3e-3 there and up
+    to 0.03
     between them where a resonance moves by. The slopes beside the table are polynomials
     of the least degree below 15 that meets ``tolerance`` at held-out diameters.
 
     Other round ones: derivatives by RCWA at a fixed truncation
-    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` adds what the
+    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` adds what
+    the
     truncation leaves. Cells that no solver takes get the effective-index slopes of
-    :func:`metalens.fabrication.sensitivity`, pillars that are not round those of their own
+    :func:`metalens.fabrication.sensitivity`, pillars that are not round those of their
+    own
     shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
     lens.
 

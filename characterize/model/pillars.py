@@ -333,7 +333,8 @@ class PillarResponse:
 
 
 class PairedPillars(PillarResponse):
-    """As :class:`PillarResponse`, of two sizes: functions of the kinds of pillars that the
+    """As :class:`PillarResponse`, of two sizes: functions of the kinds of pillars that
+    the
     lens has, one after the other.
 
     A bias moves all edges, so both sizes alike, along the table of the lens; the

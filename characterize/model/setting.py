@@ -108,7 +108,8 @@ def pixel_brightness(
 def brightness_slopes(
     x: Array, setting: FrameSetting, centre_um: float, films: FilmStack = AIR
 ) -> dict[str, Array]:
-    """(n,) relative changes of :func:`pixel_brightness` by the stage: light falls as the
+    """(n,) relative changes of :func:`pixel_brightness` by the stage: light falls as
+    the
     square of the depth.
     """
     rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))

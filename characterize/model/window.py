@@ -87,7 +87,8 @@ class CouplingTerms:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DerivativeOperators:
-    """Coarse samples to derivatives of the field: :func:`derivative_operators` along (y, x) up to a
+    """Coarse samples to derivatives of the field: :func:`derivative_operators` along
+    (y, x) up to a
     degree, real.
 
     bands: (y, x) rad/um that directions are counted in; kernel: of which field.

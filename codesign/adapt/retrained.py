@@ -69,7 +69,8 @@ def lens_of(path: Path) -> str:
 
 
 def load_retrained(path: Path) -> FinishedRun:
-    """A finished run as :func:`codesign.adapt.source.load_finished_run` has it; of a retraining its
+    """A finished run as :func:`codesign.adapt.source.load_finished_run` has it; of a
+    retraining its
     network and the made lens.
 
     Args:

@@ -165,7 +165,8 @@ def sensor_irradiance(
 def _elsewhere(
     frames: SingleSurfaceFrames, optics: UniformImager, *, margin: int
 ) -> Tensor:
-    """As :func:`sensor_irradiance` of flat frames, all at once on another device than the
+    """As :func:`sensor_irradiance` of flat frames, all at once on another device than
+    the
     processor.
     """
     light, depth = (

@@ -30,7 +30,8 @@ class FramePool:
     coverage without the margin.
     place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3)
     the same as the camera sees it.
-    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.EyePose`. here_um:
+    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.EyePose`.
+    here_um:
     (3,) nominal place.
     depths_um: (2,) range of the depth.
     """

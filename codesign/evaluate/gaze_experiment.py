@@ -507,7 +507,9 @@ def calibrate_subjects(
     config: ExperimentConfig,
     how: PersonCalibrator,
 ) -> dict[int, CalibratedPerson]:
-    """Every subject's calibration by number, on the stimuli of :func:`calibration_frames`."""
+    """Every subject's calibration by number, on the stimuli of
+    :func:`calibration_frames`.
+    """
     known = calibration_frames(trial, config)
     mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
     return {

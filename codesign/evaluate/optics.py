@@ -115,7 +115,8 @@ class MeasurementSettings:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedSettings(MeasurementSettings):
-    """A :class:`MeasurementSettings` with nothing left to the lens. step_um: of the difference in
+    """A :class:`MeasurementSettings` with nothing left to the lens. step_um: of the
+    difference in
     Eq. 11.
     """
 

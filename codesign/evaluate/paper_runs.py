@@ -119,7 +119,8 @@ def _read(
 
 
 def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
-    """Table 2 from gaze.json, {folder: {rows of :func:`gaze_errors`}}: the first run is the
+    """Table 2 from gaze.json, {folder: {rows of :func:`gaze_errors`}}: the first run is
+    the
     proposed one. Networks of others are not rebuilt here.
     """
     for entry in told.values():

@@ -23,7 +23,8 @@ read 3 % better after 24 turns
 with a step of 0.15 rad, and 5 % with 0.6 rad (one seed).
 
 The branch is thrown away: what the lens is worth says a reader that begins anew
-(:func:`codesign.evaluate.reader.train_reader`), and of the lenses passed, the start among them,
+(:func:`codesign.evaluate.reader.train_reader`), and of the lenses passed, the start
+among them,
 the best is kept
 (:func:`best_round`).
 """
@@ -249,7 +250,8 @@ def best_round(
     the first of equal ones.
 
     Args:
-        path: (turns + 1, polynomials) of :func:`train_lens`. error_mm: of a lens on frames
+        path: (turns + 1, polynomials) of :func:`train_lens`. error_mm: of a lens on
+            frames
             that trained nothing.
     """
     told = {turn: error_mm(path[turn]) for turn in dict.fromkeys((0, *turns))}

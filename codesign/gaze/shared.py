@@ -9,7 +9,8 @@ gaze follows them as
 
 (Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all,
 u_p is of one person. β, τ²
-and σ² come from people whom nobody judges (:func:`learn_population`: expectation maximisation); a
+and σ² come from people whom nobody judges (:func:`learn_population`: expectation
+maximisation); a
 person's u_p is its mean under
 that prior, given a few frames. So terms by which people hardly differ, as how a network
 misreads large slippage, need

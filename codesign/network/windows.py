@@ -57,7 +57,9 @@ def step_of(size: int) -> int:
 
 
 def spectra_macs(size: int) -> int:
-    """Multiply-accumulates of :func:`window_spectra` for a square frame of ``size`` pixels."""
+    """Multiply-accumulates of :func:`window_spectra` for a square frame of ``size``
+    pixels.
+    """
     step = step_of(size)
     kinds = 2 * WAVES + 1  # cosines and sines
     return ((GRID + 1) * step * GRID + GRID**2 * COLUMNS * 2) * kinds * step

@@ -158,7 +158,8 @@ def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
 
 
 def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
-    """See :func:`codesign.optics.stack.scatter_loss`; the shadow's light falls on all samples
+    """See :func:`codesign.optics.stack.scatter_loss`; the shadow's light falls on all
+    samples
     alike.
     """
     light = lens.scatter_loss(

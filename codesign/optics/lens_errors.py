@@ -44,7 +44,8 @@ class LensErrors(_Entries):  # type: ignore[misc]
     lens, waves at the rim.
     astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process
     spreads, in the names of
-    :class:`metalens.fabrication.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k,
+    :class:`metalens.fabrication.Spread`, ``bias_nm`` and ``height_nm`` first.
+    correlation: (k,
     k) between the first k of them,
     rows one after the other; empty for none.
     bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of

@@ -80,7 +80,8 @@ def finer_frames(
     *,
     stack: PixelPsfStack | None = None,
 ) -> SensorFrames | None:
-    """:func:`sensor_frames` of the same scenes and noise on the :func:`finer_image` image; None
+    """:func:`sensor_frames` of the same scenes and noise on the :func:`finer_image`
+    image; None
     where there is none, or this lens cannot be imaged so precisely.
     """
     optics = finer_image(trainer.optics)

@@ -61,7 +61,8 @@ def finished_budgets(run: CodesignRun) -> list[BudgetResult]:
     ``axial_coverage_90``: share of test frames within the network's calibrated 90 %
     interval, whose mean half width is
     ``axial_interval_mm``. ``window_depth_mm``: mean error of the depth of the windows.
-    ``finer_axial_slip_mm``, ``finer_lateral_slip_mm``, ``finer_iou``: the same frames on
+    ``finer_axial_slip_mm``, ``finer_lateral_slip_mm``, ``finer_iou``: the same frames
+    on
     an image formed at a quarter of the training tolerance, and ``finer_ratio`` of the
     axial errors: near 1 where the result does not depend on the tolerance.
     Batch statistics are measured on training frames through the final lens, never on

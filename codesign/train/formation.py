@@ -100,7 +100,8 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
 
     The last pixels then reach beyond the image, by half a pixel at most; a network sees
     the frame and tells places in
-    it, so its labels are those of the frame (:func:`codesign.network.losses.mask_in_frame`).
+    it, so its labels are those of the frame
+    (:func:`codesign.network.losses.mask_in_frame`).
     """
     wide = (
         camera.pixel_count(samples, sample_um, pitch_um)

@@ -60,7 +60,9 @@ def flatten_shapes(content: MaskContent, top: str) -> Iterator[PolygonCopies]:
 
 
 def flatten_stacks(content: MaskContent, top: str) -> Iterator[PolygonStack]:
-    """As :func:`flatten_shapes`, polygons of a cell that have equally many corners together."""
+    """As :func:`flatten_shapes`, polygons of a cell that have equally many corners
+    together.
+    """
     for name, x, y, turn in _cells(content, top, (0, 0), QUARTERS[0], ()):
         cell = content.cells[name]
         drawn = {layer: list(polygons) for layer, polygons in cell.polygons.items()}

@@ -27,7 +27,8 @@ def path_outline(
     open.
 
     Args:
-        points: (m, 2), m >= 1; where all are equal, the path runs along x. begin, end: lengths by which it goes
+        points: (m, 2), m >= 1; where all are equal, the path runs along x. begin, end:
+            lengths by which it goes
             on beyond its ends.
         rounded: with half circles at the ends.
     """

@@ -32,7 +32,8 @@ class ExposedBodies:
     far: (y, x) on the nodes with the wanted doses; alone: with dose 1. near,
     near_alone: (rows, columns) for each
     body, the middle ranges; empty lists where there is none.
-    own: (pieces,) as in :func:`layout.pec.rects.self_exposure`; points, piece: outer edges of
+    own: (pieces,) as in :func:`layout.pec.rects.self_exposure`; points, piece: outer
+    edges of
     the pieces and whose they are.
     spots: points, areas and pieces that stand for the rectangles on the nodes.
     """

@@ -139,7 +139,8 @@ class DrawnOutlines:
         return np.array([_wider(each) if each else 0.0 for each in self.contours])
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`DrawnKinds`; to 5e-4 of itself (pixels of a sixth of the narrowest
+        """As in :class:`DrawnKinds`; to 5e-4 of itself (pixels of a sixth of the
+        narrowest
         Gaussian).
         """
         found = np.zeros((2, len(self.contours)))

@@ -361,7 +361,8 @@ class Process:
 
         Args:
             written_nm: equal-area diameter of the drawn polygon.
-            isolation: of each pillar, see :func:`layout.process.isolation.isolation_map`.
+            isolation: of each pillar, see
+                :func:`layout.process.isolation.isolation_map`.
         """
         written = np.asarray(written_nm, float)
         return self.bias.made_nm(written - self._rounding_nm(written), isolation)

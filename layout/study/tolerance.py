@@ -98,7 +98,9 @@ class ToleranceReport:
     seed: int
 
     def band(self, name: str, percent: tuple[float, ...] = (5, 50, 95)) -> Array:
-        """(percent, ...) percentiles of a quantity of :class:`ToleranceOutcome` over the draws."""
+        """(percent, ...) percentiles of a quantity of :class:`ToleranceOutcome` over
+        the draws.
+        """
         return np.asarray(np.percentile(getattr(self.draws, name), percent, axis=0))
 
 

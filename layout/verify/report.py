@@ -84,7 +84,8 @@ class ExposureReport:
 
     pillars: the dose test too. tally: sums over those that are judged. box_um: left,
     bottom, right, top of
-    the map. edges: of the other shapes. lean_nm: foot less half-height diameter. tolerance: of the
+    the map. edges: of the other shapes. lean_nm: foot less half-height diameter.
+    tolerance: of the
     exposure, relative.
     undosed: layers with shapes and no dose.
     sampled: largest |exposure - 1| by direct sums at sample pillars. error: largest

@@ -360,7 +360,8 @@ def _make(wanted: DesignSettings, options: Options, path: Path) -> "DesignOutcom
 
 @dataclass(frozen=True, slots=True)
 class DesignOutcome:
-    """What a design is worth. wanted: as it was filled in; check: of its focus; figures:
+    """What a design is worth. wanted: as it was filled in; check: of its focus;
+    figures:
     of its PSF; judged: of a free form; conversion: of
     circular light; unlike: what neighbours leave of the efficiency; beside: of the
     other wavelengths; loss: mean share that is absorbed or in other orders."""

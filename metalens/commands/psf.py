@@ -26,7 +26,8 @@ from metalens.core.report import write_report
 from metalens.core.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
 
-# by kind of file, the module whose ``load`` gives a :class:`AsBuiltSource`; filled by the
+# by kind of file, the module whose ``load`` gives a :class:`AsBuiltSource`; filled by
+# the
 # command line
 SOURCES: dict[str, str] = {}
 CAPTIONS = {

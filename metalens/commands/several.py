@@ -57,7 +57,8 @@ def check_single_wavelength_profile(
 def designs_by_wavelength(
     wanted: Any, made_of: PillarLibrary
 ) -> Iterator[tuple[Any, float]]:
-    """The design (:class:`metalens.commands.design.DesignSettings`) as each wavelength is to
+    """The design (:class:`metalens.commands.design.DesignSettings`) as each wavelength
+    is to
     see it, and its weight; its own
     first. Nothing where there is no other.
 

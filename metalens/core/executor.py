@@ -55,7 +55,8 @@ def run_on(processes: int | None = None) -> Iterator[None]:
     """Do the tasks of the block in so many processes of this machine.
 
     Args:
-        processes: None: each verb has its own way, :func:`run_parallel` a process a core,
+        processes: None: each verb has its own way, :func:`run_parallel` a process a
+            core,
             :func:`gather_parallel` threads of this process.
 
     Raises:

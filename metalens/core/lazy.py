@@ -2,7 +2,8 @@
 
 A folder's ``__init__`` lists its public names twice: under ``TYPE_CHECKING``, where
 type checkers and editors read
-them, and in the table that :func:`attach_lazy_exports` takes. A test holds that the two agree.
+them, and in the table that :func:`attach_lazy_exports` takes. A test holds that the two
+agree.
 """
 
 import importlib
@@ -24,7 +25,7 @@ def attach_lazy_exports(
             (``"layout.formats.oasis_write:write"``); ``""`` for
             a module of the package that is itself public.
 
-    >>> load, listed, public = attach("metalens.core", {"units": "", "Console": "console"})
+    >>> load, listed, public = attach_lazy_exports("metalens.core", {"units": "", "Console": "console"})
     >>> listed(), load("Console").__name__
     (['Console', 'units'], 'Console')
     """

@@ -35,7 +35,8 @@ def legendre_values(count: int, t: Array) -> Array:
 
 
 def interpolation_matrix(count: int, t: Array) -> Array:
-    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`gauss_legendre_nodes`: L_a =
+    """(*t, count) values at ``t`` of the Lagrange polynomials on
+    :func:`gauss_legendre_nodes`: L_a =
     w_a Σ_m P̂_m(t_a) P̂_m(t).
     """
     return np.asarray(legendre_values(count, t) @ to_nodes(count))
@@ -59,7 +60,8 @@ def needed_node_count(samples: Array, tolerance: float) -> int:
     """Number of nodes that represent all lines to ``tolerance``.
 
     Args:
-        samples: (line, count) complex values on :func:`gauss_legendre_nodes` (count), count well above
+        samples: (line, count) complex values on :func:`gauss_legendre_nodes` (count),
+            count well above
             what is needed.
         tolerance: of the root mean square over lines and position, relative to that of
             the samples.

@@ -34,7 +34,8 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
 
     For work that consists of calls which release the interpreter lock, and that shares
     nothing it changes. An
-    interrupt or the first failure stops the others at their next :func:`run_split`, and is
+    interrupt or the first failure stops the others at their next :func:`run_split`, and
+    is
     raised when they have ended.
     """
     items = list(items)
@@ -85,7 +86,8 @@ def run_concurrently(*works: Callable[[], Any]) -> list[Any]:
 
 
 def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:
-    """As :func:`run_split`, for work of many small calls of torch: each part has one of its
+    """As :func:`run_split`, for work of many small calls of torch: each part has one of
+    its
     threads to itself.
 
     Together they would wait for each other at every call. ``work`` may carry no

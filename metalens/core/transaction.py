@@ -127,7 +127,8 @@ def claim_long_work(
     grow: bool = False,
     terms: ClaimTerms = ClaimTerms(),
 ) -> Iterator[OutputDraft]:
-    """As :func:`claim_folder` for work of minutes to days: it is done in ``NAME.unfinished``
+    """As :func:`claim_folder` for work of minutes to days: it is done in
+    ``NAME.unfinished``
     beside the target.
 
     That folder survives an interruption if it holds a file that matches a pattern of

@@ -142,10 +142,12 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
 
 
 def focus_figures(lens: Lens) -> FocusMetrics:
-    """FWHM, Strehl ratio, MTF50 and focusing efficiency of the PSF of the design source.
+    """FWHM, Strehl ratio, MTF50 and focusing efficiency of the PSF of the design
+    source.
 
     The PSF is that of :func:`metalens.psf.from_lens` about the place where the rays
-    meet: films, stop, losses of the pillars and solved neighbours are in it. Spots wider
+    meet: films, stop, losses of the pillars and solved neighbours are in it. Spots
+    wider
     than the window of 8 wavelength / NA get one of four times the width.
     """
     meets = lens_meeting_um(lens)

@@ -34,7 +34,8 @@ _GAPS = 12  # sizes along each axis at which the gap to the neighbours is worked
 class PolarizationMetrics:
     """What a lens of two sizes makes of light along x and along y.
 
-    x, y: quality for either; their ``wavefront_efficiency`` is the share of that light in its
+    x, y: quality for either; their ``wavefront_efficiency`` is the share of that light
+    in its
     focus. wavefront_efficiency_error: bar of
     each, from the error bars of the pillars. leaked: mean power that leaves with the
     other polarisation, for x and y.

@@ -1,4 +1,5 @@
-"""Assignment of diameters for several wavelengths: achromatic lenses, and another target
+"""Assignment of diameters for several wavelengths: achromatic lenses, and another
+target
 for each wavelength; least squares over wavelengths (:mod:`metalens.design.candidates`).
 """
 
@@ -38,7 +39,8 @@ _STEP_RAD = 0.05
 class WavelengthTarget:
     """What light of a wavelength is to see.
 
-    phase: :func:`metalens.design.phase_of` of the focus. weight: of its squared error, above 0.
+    phase: :func:`metalens.design.phase_of` of the focus. weight: of its squared error,
+    above 0.
     """
 
     phase: PhaseOf
@@ -56,7 +58,8 @@ def assign_multi_wavelength(
     profile: str = "map",
     provenance: Provenance | None = None,
 ) -> tuple[Lens, tuple[Quality, ...]]:
-    """Fill a round aperture with the pillars of least squared error over all wavelengths.
+    """Fill a round aperture with the pillars of least squared error over all
+    wavelengths.
 
     Args:
         wanted: of every wavelength, the design's own first. proxy: of pillars at all of

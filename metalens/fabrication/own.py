@@ -27,7 +27,8 @@ _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 class OwnRates:
     """Logarithmic derivatives of t at some sizes.
 
-    rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0 of
+    rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0
+    of
     what such pillars cannot have.
     edges: (n,) by a bias of all edges, less that by the size, which is what a proxy
     knows: 0 where a shape keeps its
@@ -125,7 +126,8 @@ def _derived(
     about: tuple[float, dict[str, float], tuple[Array, ...]],
     task: tuple[Cell, float, int],
 ) -> list[list[complex]]:
-    """For each weighting: derivatives of ln t by every pillar-response error, and by the
+    """For each weighting: derivatives of ln t by every pillar-response error, and by
+    the
     edges less by the size.
     """
     from metalens.rcwa import jones_derivatives

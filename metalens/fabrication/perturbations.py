@@ -492,7 +492,8 @@ def named(
 
 
 def with_missing(rows: Sequence[Array]) -> Array:
-    """(pillar-response errors, *shape) of the first rows of the table: those that are not
+    """(pillar-response errors, *shape) of the first rows of the table: those that are
+    not
     there are 0.
     """
     return np.stack(

@@ -1,4 +1,5 @@
-"""What the pillar-response errors do to every pillar: derivatives of ln t over the diameter,
+"""What the pillar-response errors do to every pillar: derivatives of ln t over the
+diameter,
 and t itself under a change.
 """
 
@@ -41,7 +42,8 @@ class Sensitivity:
     """First-order change of ln t with the pillar-response errors, as polynomials of the
     diameter.
 
-    coefficients: (pillar-response errors, degree + 1) complex power series in (D - center_um)
+    coefficients: (pillar-response errors, degree + 1) complex power series in (D -
+    center_um)
     of d ln t by the base unit
         (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row
         that is not there.
@@ -107,7 +109,8 @@ class Sensitivity:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """Pillars of given diameters under the pillar-response errors: t over that of the proxy
+    """Pillars of given diameters under the pillar-response errors: t over that of the
+    proxy
     at the design's wavelength.
 
     slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
@@ -149,7 +152,9 @@ class Slopes(Protocol):
     """Anything that knows d ln t by the answering perturbations."""
 
     def at(self, diameter_um: Array) -> Array:
-        """(pillar-response errors, *shape) derivatives of ln t by the base unit of each."""
+        """(pillar-response errors, *shape) derivatives of ln t by the base unit of
+        each.
+        """
         ...
 
     def by_edges(self, diameter_um: Array) -> Array | None:
@@ -196,7 +201,8 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
 
 
 def _of_its_own(lens: Lens) -> Sensitivity:
-    """From :func:`metalens.fabrication.own.own_rates` at Chebyshev sizes, as polynomials of
+    """From :func:`metalens.fabrication.own.own_rates` at Chebyshev sizes, as
+    polynomials of
     degree 5.
     """
     low, high = lens.proxy.domain_um

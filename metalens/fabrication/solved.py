@@ -16,7 +16,8 @@ class Solved:
     diameters.
 
     wavelength_um: that it was solved at. diameter_um: (n,) rising.
-    powers: (causes, orders, n) of t in powers of the amount of each pillar-response error
+    powers: (causes, orders, n) of t in powers of the amount of each pillar-response
+    error
     (um, rad, 1), in the table's order;
         the first is the designed t, the others are 0 for a cause that was not solved.
         Between the amounts that were

@@ -69,7 +69,8 @@ class State:
         return bool(self._of(WavefrontError).any())
 
     def answers(self) -> Array:
-        """(pillar-response errors,) amounts in um, rad and 1, as the pillars' derivatives
+        """(pillar-response errors,) amounts in um, rad and 1, as the pillars'
+        derivatives
         take them.
         """
         return self._of(ResponseError) * [row.unit for _, row in of_kind(ResponseError)]

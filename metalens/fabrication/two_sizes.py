@@ -137,7 +137,8 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairSensitivities:
-    """Logarithmic derivatives of t by the pillar-response errors, of pillars of two sizes and
+    """Logarithmic derivatives of t by the pillar-response errors, of pillars of two
+    sizes and
     one polarisation.
 
     width_um, length_um: (n,) pairs that were solved. rates: (pillar-response errors, n)

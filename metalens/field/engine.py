@@ -56,7 +56,8 @@ def imager(
     Args:
         lens: a lens file's content, or a wave (:class:`SmoothWave`,
             :class:`PillarWave`).
-        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.read_measured_spectrum`),
+        spectrum: a diode, curves as measured
+            (:func:`metalens.psf.spectrum.read_measured_spectrum`),
             wavelengths with weights, or
             None for the design wavelength alone.
         layers: films around the lens; by default those of the lens file with the cover

@@ -35,7 +35,8 @@ def factors(
 ) -> VectorPupil:
     """Both polarisations on the nodes, float64: of the flux through the sensor's plane
     (8), or of |E|² (6 as
-    :func:`metalens.psf.transmitted_polarization`); squares with their signs add up to 2, and to 2 / cos
+    :func:`metalens.psf.transmitted_polarization`); squares with their signs add up to
+    2, and to 2 / cos
     θ.
 
     Args:

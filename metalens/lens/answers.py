@@ -62,7 +62,8 @@ def fill_response_of(
     level: Array,
     turned: Array | None = None,
 ) -> None:
-    """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad that is
+    """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad
+    that is
     added.
     """
     loop, numbers = _fill, response_polynomials(proxy, d, at)

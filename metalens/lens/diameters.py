@@ -131,7 +131,8 @@ class DiameterMap:
 
     @property
     def grid(self) -> "SiteSpacing":
-        """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on a
+        """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on
+        a
         square lattice.
         """
         square = self.lattice.kind == "square" and not self.row_um

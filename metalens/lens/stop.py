@@ -144,10 +144,12 @@ def stop_shadow(
     a place; numpy arrays.
 
     Args:
-        media_um: before and between, tangents: as in :func:`stop_crossing`. at_um: (x, y) of
+        media_um: before and between, tangents: as in :func:`stop_crossing`. at_um: (x,
+            y) of
             the pillars, broadcast.
 
-    Accuracy: of a PSF of sum 1, by :func:`stop_model_error`; energies are 0.18 / N short, N the
+    Accuracy: of a PSF of sum 1, by :func:`stop_model_error`; energies are 0.18 / N
+    short, N the
     Fresnel number there.
     """
     x, y = stop_crossing(*media_um, tangents, *at_um)

@@ -145,7 +145,8 @@ def _saddle(
 def _settled(
     behind: Media, wavenumber: float, w: Array, light: Light
 ) -> tuple[Array, Array]:
-    """(n,) :func:`plane_wave_correction` with as many as suit each ray, and by how much fewer differ:
+    """(n,) :func:`plane_wave_correction` with as many as suit each ray, and by how much
+    fewer differ:
     steep rays through thin films
     settle at first, and part again where nodes lie beyond what the ray alone governs.
     """

@@ -243,7 +243,9 @@ def second_order_bound(first: float) -> float:
 
 
 def damped_change(found: MeshSolution, before: MeshSolution) -> float:
-    """:func:`contracted_change` over the damping: at most ``AMPLIFIED`` times the change."""
+    """:func:`contracted_change` over the damping: at most ``AMPLIFIED`` times the
+    change.
+    """
     most = AMPLIFIED * mesh_change(found, before)
     return min(
         most, contracted_change(found, before) / min(1.0, max(found.damping, 1e-9))

@@ -155,7 +155,9 @@ class ResponseCurve:
 def starting_diameters(
     low_um: float, high_um: float, count: int = FIRST
 ) -> list[float]:
-    """Diameters that :func:`sample_adaptively` solves first: Chebyshev points with both ends."""
+    """Diameters that :func:`sample_adaptively` solves first: Chebyshev points with both
+    ends.
+    """
     middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
     start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
     start[[0, -1]] = low_um, high_um

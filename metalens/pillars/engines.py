@@ -59,7 +59,8 @@ def solver_at_fixed_discretization(
     tolerance: float,
     engine: str,
 ) -> Callable[[float], Response]:
-    """As :func:`solve_to_tolerance`, on one discretisation for all diameters of ``span_um``, so
+    """As :func:`solve_to_tolerance`, on one discretisation for all diameters of
+    ``span_um``, so
     far as it goes.
     """
     return solvers_at_common_discretization(
@@ -75,7 +76,8 @@ def solvers_at_common_discretization(
     tolerance: float,
     engine: str,
 ) -> list[Callable[[float], Response]]:
-    """:func:`solver_at_fixed_discretization` for several lights, on the discretisation that all of them need.
+    """:func:`solver_at_fixed_discretization` for several lights, on the discretisation
+    that all of them need.
 
     It is the least that meets the tolerance at three probes, which a curve over the
     span solves anyhow: answers are
@@ -122,7 +124,8 @@ def has_upright_walls(cell: Cell, engine: str) -> bool:
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`solver_at_fixed_discretization` took the finest discretisation there is, by the errors of
+    """Whether :func:`solver_at_fixed_discretization` took the finest discretisation
+    there is, by the errors of
     the nodes that came of it (the
     first ones as a curve begins with): a pillar solved by itself has no less error
     then."""

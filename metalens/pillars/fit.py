@@ -328,7 +328,9 @@ def _best(data: FitData, wanted: ProxyTolerances, terms: int) -> Proxy | None:
 
 
 def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
-    """As :func:`tolerance_ratio`; infinite where the phase turns back (the library's does not)."""
+    """As :func:`tolerance_ratio`; infinite where the phase turns back (the library's
+    does not).
+    """
     middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
     monotone = all(
         proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}

@@ -137,7 +137,8 @@ class Proxy:
 
         Accuracy:
             phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
-            gradients are exact. A diameter in one of ``gaps_um`` moves to its nearer end.
+            gradients are exact. A diameter in one of ``gaps_um`` moves to its nearer
+            end.
 
         Raises:
             DomainError: the phase is not monotone within ``within_um``, or no pillar

@@ -333,7 +333,8 @@ def draw_pixels(
     Args:
         normalised: (depth, pixel) of sum 1; the chance follows it, its root times
             ``edges``, and ``near`` if given.
-        order: (pixel,) as :func:`morton_scan`, so that the sample is even over the window.
+        order: (pixel,) as :func:`morton_scan`, so that the sample is even over the
+            window.
         count: of points in all depths together.
     """
     depths, pixels = normalised.shape

@@ -121,7 +121,8 @@ def ray_amplitude_parts(
 
 
 def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]:
-    """Amplitudes of s and of p light behind films over :func:`ray_amplitude`, of rays of w
+    """Amplitudes of s and of p light behind films over :func:`ray_amplitude`, of rays
+    of w
     = p²; complex.
     """
     behind, k = case.behind, case.wavenumber
@@ -242,7 +243,8 @@ def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) ->
 
 
 def _slopes(case: PropagationCase, p: Any, far: Any, X: Any, Y: Any) -> Array:
-    """As :func:`kernel_derivatives` through films: the cover takes what the distance gains; by
+    """As :func:`kernel_derivatives` through films: the cover takes what the distance
+    gains; by
     complex steps.
     """
     h = 1e-30

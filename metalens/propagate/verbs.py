@@ -242,7 +242,8 @@ def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
 
     in float64, |U_in| = 1 with phase 0 at the lens centre (Goodman, Introduction to
     Fourier Optics, eq. 3-43, time factor exp(-iωt)). Through films d/(2πr²)(1/r - ik)
-    exp(ikr) becomes the stationary phase of the plane waves along the refracted ray. The
+    exp(ikr) becomes the stationary phase of the plane waves along the refracted ray.
+    The
     reference for every faster method; its time grows as pillars times samples.
 
     Args:

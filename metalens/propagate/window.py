@@ -125,7 +125,8 @@ def plan_window(
     ``KEPT_BYTES``.
 
     Args:
-        moving: for use with :class:`MovingGeometry`. smooth: with factors (``Pupils``) on the
+        moving: for use with :class:`MovingGeometry`. smooth: with factors (``Pupils``)
+            on the
             light of the nodes.
 
     Raises:

@@ -92,7 +92,8 @@ class Budget:
         light that goes twice between
         two faces. proxy: of pillars that answer by a curve, which follows those of
         their library to some error, and of
-        what their solver knows of them; of two sizes that alone. posterior: of a lens that
+        what their solver knows of them; of two sizes that alone. posterior: of a lens
+        that
     was fitted to captures, what its parameters leave open.
     outside: share of the light that falls beside the window, worst over angles and
     depths; a PSF of sum 1 does not

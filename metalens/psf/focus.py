@@ -41,7 +41,8 @@ def focus_metrics(
 
     Args:
         stack: PSFs (angle, depth, y, x) of the lens.
-        lens: the lens, for its aperture and |T|; for a lens that was fitted, its design.
+        lens: the lens, for its aperture and |T|; for a lens that was fitted, its
+            design.
         power_error: relative error of the power behind the pillars.
 
     Returns:

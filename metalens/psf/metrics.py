@@ -202,7 +202,8 @@ class FocusMetrics:
 def diffraction_limit(
     numerical_aperture: float, wavelength_um: float
 ) -> DiffractionLimit:
-    """Airy pattern of a numerical aperture (Born and Wolf, Principles of Optics, 8.5.2).
+    """Airy pattern of a numerical aperture (Born and Wolf, Principles of Optics,
+    8.5.2).
 
     Args:
         numerical_aperture: n sin θ of the image side.

@@ -48,7 +48,8 @@ class SpectralNodes:
     """wavelengths_um and weights (sum 1), and the error of the quadrature on the band
     that was asked for.
 
-    source: the spectrum that they stand for, by which :func:`quadrature_error` judges them on any
+    source: the spectrum that they stand for, by which :func:`quadrature_error` judges
+    them on any
     path; None for wavelengths as
         such.
 
@@ -385,7 +386,9 @@ def outside_library_text(
     source: Source | MeasuredSpectrum | SpectralNodes | None,
     within_um: tuple[float, float],
 ) -> str:
-    """Words for :func:`share_outside_library` light; empty where that is less than 1e-4 of it."""
+    """Words for :func:`share_outside_library` light; empty where that is less than 1e-4
+    of it.
+    """
     share = share_outside_library(source, within_um)
     if share < 1e-4:
         return ""

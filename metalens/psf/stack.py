@@ -91,7 +91,8 @@ def psf_stack(
     separately, without derivatives in the geometry.
 
     Returns:
-        PsfStack: ``intensity`` (…, [angle,] depth, y, x), each PSF of sum 1, of the kind
+        PsfStack: ``intensity`` (…, [angle,] depth, y, x), each PSF of sum 1, of the
+            kind
         and dtype that came in; ``energy_um2``, ``error``, ``budget``.
 
     Raises:
@@ -99,7 +100,8 @@ def psf_stack(
             geometry, no light in the window, a tolerance not above 0, a window that no
             method reaches, a source of finite size in um at infinity.
 
-    Accuracy: ``error`` is 1 to 3 times the true error, measured at points of the window.
+    Accuracy: ``error`` is 1 to 3 times the true error, measured at points of the
+    window.
     Reference: :func:`metalens.propagate.exact`, the same sum pillar by pillar.
 
     >>> import numpy as np

@@ -29,7 +29,8 @@ class FocusScan:
     shift_um: (n,) of the plane from the sensor's, positive away from the lens.
     slices: (n, x) irradiance along x through the window's middle, for unit irradiance
     of the lens; x_um: its places.
-    peak: (n,) largest irradiance of the plane. fwhm_um: (n,) full width at half maximum.
+    peak: (n,) largest irradiance of the plane. fwhm_um: (n,) full width at half
+    maximum.
     """
 
     shift_um: Array

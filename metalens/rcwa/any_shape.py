@@ -135,7 +135,8 @@ class TruncationSequence:
     crosses, holes, hollows. Walls of
     less than a fiftieth of the pitch are resolved by no truncation; there the factor
     rises to two, for gaps as
-    :func:`metalens.rcwa.solver.gap_factor` has it. Of 72 rings and crosses with walls of
+    :func:`metalens.rcwa.solver.gap_factor` has it. Of 72 rings and crosses with walls
+    of
     0.004 to 0.2 pitches, at 7 to
     15 orders against 21, two of 648 errors lay above a bar that went by outlines alone,
     by up to 2.3 times; now none
@@ -228,7 +229,8 @@ def _both(found: JonesResponse) -> Array:
 
 
 def estimate_error(history: list[Array], reach: int, before: int) -> float:
-    """Error of the last truncation: :func:`metalens.rcwa.solver.safety_factor` times the
+    """Error of the last truncation: :func:`metalens.rcwa.solver.safety_factor` times
+    the
     farthest of those before it, of each
     what it tells of the last (:func:`_told`)."""
     earlier = history[-1 - before : -1][::-1]

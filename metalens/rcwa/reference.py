@@ -15,7 +15,8 @@ class OrderResponse:
 
     m, n: (k,) orders along x and y.
     t, r: (2, 2) power-normalised zero-order Jones matrices, row: leaving, column:
-        incident; x, y at normal incidence, else s, p (as in ``metalens.rcwa.JonesResponse``).
+        incident; x, y at normal incidence, else s, p (as in
+        ``metalens.rcwa.JonesResponse``).
     transmitted, reflected: (k, 2) power of each order for unit power incident.
     """
 

@@ -220,7 +220,8 @@ def safety_factor(reach: int) -> float:
 
 
 def gap_factor(gap_um: float | Array, pitch_um: float) -> Array:
-    """Factor on :func:`safety_factor` for pillars that all but touch: fields between them are
+    """Factor on :func:`safety_factor` for pillars that all but touch: fields between
+    them are
     seen late by any order.
 
     Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest
@@ -236,7 +237,8 @@ def _estimate(t: Array, reach: int, lags: Array) -> Array:
     """Error of the last of the results, t and r (rungs, 2, d): some times the farthest
     of the truncations before.
 
-    lags: (d,) how many, see :func:`compared_truncations`. Truncation errors fall as reach^-2 and
+    lags: (d,) how many, see :func:`compared_truncations`. Truncation errors fall as
+    reach^-2 and
     swing with the number of orders
     that fit across the disc; a swing takes up to four rungs where nothing is narrow.
     For 52 diameters in three cells
@@ -246,7 +248,8 @@ def _estimate(t: Array, reach: int, lags: Array) -> Array:
     orders it is more: up to 4.8 of it
     below 8, and with a factor of 3 at 8 to 10 orders 3 of 200 cells (``python -m
     benchmarks engines``) lay apart from
-    the modal method by up to 1.5 times both bars. Hence :func:`safety_factor`: 6 at 8 orders,
+    the modal method by up to 1.5 times both bars. Hence :func:`safety_factor`: 6 at 8
+    orders,
     3 from 13 on.
     """
     if len(t) < 2:

@@ -1,4 +1,5 @@
-"""Rows of different pillars as one supercell: the exact answer that the locally periodic
+"""Rows of different pillars as one supercell: the exact answer that the locally
+periodic
 approximation leaves out.
 
 Rows run along the lattice, or along its diagonal, where every other pillar stands half

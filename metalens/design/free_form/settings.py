@@ -177,7 +177,8 @@ class FisherSettings:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedFisherSettings(FisherSettings):
-    """A :class:`FisherSettings` with nothing left to the lens: what a search climbs, and what
+    """A :class:`FisherSettings` with nothing left to the lens: what a search climbs,
+    and what
     its results are judged by.
 
     window_um, climb_window_um: widths of the PSFs. sample_um: of their intensities.

@@ -152,7 +152,8 @@ def sweep_two_sizes(
         they and twelve more are.
 
     Raises:
-        ConfigError, CellError, MaterialError: see :func:`metalens.pillars.axes.check_axes_sweep`.
+        ConfigError, CellError, MaterialError: see
+            :func:`metalens.pillars.axes.check_axes_sweep`.
     """
     check_axes_sweep(cell, settings)
     settings = settings.settled(cell)

@@ -169,7 +169,8 @@ def solve_rotations(
     the mirror of the lattice.
 
     Raises:
-        CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or that meets its
+        CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or
+            that meets its
             neighbours when turned.
     """
     check_geometric_phase(cell, size_um)

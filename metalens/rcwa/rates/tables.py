@@ -91,7 +91,8 @@ def section_parameters(this: pattern.PillarSection) -> Array:
 def coefficient_rates(
     this: pattern.PillarSection, cell: Cell, reach: tuple[int, int], rates: Array
 ) -> Tables:
-    """Derivatives of the coefficients of eps and 1/eps, as :func:`section_parameters` change at
+    """Derivatives of the coefficients of eps and 1/eps, as :func:`section_parameters`
+    change at
     these rates.
     """
     x, y = cell.lattice.periods_um(cell.pitch_um)

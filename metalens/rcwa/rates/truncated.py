@@ -32,7 +32,8 @@ class ParameterMotion:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TruncatedRates:
-    """both: (2, 2, 2) t and r of :class:`metalens.rcwa.JonesResponse`; energy: (2,); by: (2, 2,
+    """both: (2, 2, 2) t and r of :class:`metalens.rcwa.JonesResponse`; energy: (2,);
+    by: (2, 2,
     2) derivatives of both.
     """
 
@@ -55,7 +56,8 @@ def slab_at(
     wavelength_um: float,
     share: float,
 ) -> pattern.PillarSection:
-    """The cross-section of one of :func:`metalens.rcwa.made.sections_with_growth` at a share of its
+    """The cross-section of one of :func:`metalens.rcwa.made.sections_with_growth` at a
+    share of its
     height.
     """
     layer, grow = section

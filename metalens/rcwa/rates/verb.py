@@ -34,7 +34,8 @@ from metalens.rcwa.rates.truncated import (
 class ParameterDerivative:
     """Derivative by one number, per um, rad or 1 as its name says.
 
-    t, r: (2, 2) as of :class:`metalens.rcwa.JonesResponse`. error: estimate of the largest
+    t, r: (2, 2) as of :class:`metalens.rcwa.JonesResponse`. error: estimate of the
+    largest
     |rate - exact| of both.
     """
 
