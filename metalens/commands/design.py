@@ -496,7 +496,7 @@ def _printable(path: Path, cell: Cell, limits: Limits) -> Limits:
     line names.
     """
     module = importlib.import_module(OBJECTIVES["process"])
-    thinnest, gap = module.printable(
+    thinnest, gap = module.printable_limits(
         path, pitch_um=cell.pitch_um, height_um=cell.height_um
     )
     return replace(limits, min_diameter_nm=thinnest, min_gap_nm=gap)

@@ -52,8 +52,8 @@ def run(options: Options) -> int:
         return 0
     if _is_drawing(options.file) and "mask" in TOLD:
         module = importlib.import_module(TOLD["mask"])
-        told = module.told(options.file, options.top)
-        options.console.result(told, module.text(told))
+        told = module.mask_summary(options.file, options.top)
+        options.console.result(told, module.mask_summary_text(told))
         return 0
     if (listed := manifest_entry(options.file)) is not None:
         options.console.result(listed, _member_text(listed))

@@ -83,7 +83,7 @@ def _printable(path: Path, study: CellStudy) -> CellStudy:
     module = importlib.import_module(OBJECTIVES["process"])
     shapes = itertools.product(study.pitches_um, study.heights_um)
     found = [
-        module.printable(path, pitch_um=pitch, height_um=height)
+        module.printable_limits(path, pitch_um=pitch, height_um=height)
         for pitch, height in shapes
     ]
     thinnest, gap = (max(values) for values in zip(*found, strict=True))

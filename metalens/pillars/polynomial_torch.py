@@ -10,14 +10,14 @@ from metalens.pillars import polynomial
 from metalens.pillars.polynomial import ChebyshevCurve
 
 
-def value(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
+def evaluate_curve(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """p(D) on the device and in the dtype of ``diameter``; differentiable by backward,
     forward and vmap.
     """
     return cast(torch.Tensor, _Polynomial.apply(diameter, p, 0))  # type: ignore[no-untyped-call]
 
 
-def slope(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
+def evaluate_slope(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """dp/dD, differentiable again."""
     return cast(torch.Tensor, _Polynomial.apply(diameter, p, 1))  # type: ignore[no-untyped-call]
 
@@ -25,9 +25,10 @@ def slope(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
 def _bend(p: ChebyshevCurve, diameter: torch.Tensor) -> torch.Tensor:
     """d²p/dD², in differentiable operations: x' = a D^m gives p'' x'² + p' x''."""
     m = p.power - 1
-    bend = value(p.slope.slope, diameter) * (p.inner_slope * diameter**m) ** 2
+    bend = evaluate_curve(p.slope.slope, diameter) * (p.inner_slope * diameter**m) ** 2
     return (
-        bend + value(p.slope, diameter) * (p.inner_slope * m * diameter ** (m - 1))
+        bend
+        + evaluate_curve(p.slope, diameter) * (p.inner_slope * m * diameter ** (m - 1))
         if m
         else bend
     )

@@ -95,26 +95,32 @@ class Proxy:
             DomainError: a diameter, the wavelength or the angle lies outside the
                 proxy's domain.
         """
-        return self._verb("value", self.at(wavelength_um, angle_rad), diameter_um)
+        return self._verb(
+            "evaluate_curve", self.at(wavelength_um, angle_rad), diameter_um
+        )
 
     def transmission(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Magnitude |T| in [0, 1]; otherwise as :meth:`phase_rad`."""
-        return self._verb("value", self.level_at(wavelength_um, angle_rad), diameter_um)
+        return self._verb(
+            "evaluate_curve", self.level_at(wavelength_um, angle_rad), diameter_um
+        )
 
     def dphase_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of the phase, rad/um; otherwise as :meth:`phase_rad`."""
-        return self._verb("slope", self.at(wavelength_um, angle_rad), diameter_um)
+        return self._verb(
+            "evaluate_slope", self.at(wavelength_um, angle_rad), diameter_um
+        )
 
     def dtransmission_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of |T|, 1/um; otherwise as :meth:`phase_rad`."""
         curve = self._curve(self.transmission_coefficients, wavelength_um, angle_rad)
-        return self._verb("slope", curve, diameter_um)
+        return self._verb("evaluate_slope", curve, diameter_um)
 
     def diameter_um(
         self,

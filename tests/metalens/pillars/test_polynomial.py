@@ -73,7 +73,10 @@ def test_outside_the_domain_is_refused(bad):
     for verb, values in (
         (polynomial.evaluate_curve, np.array([0.1, bad])),
         (polynomial.evaluate_slope, np.array([0.1, bad])),
-        (polynomial_torch.value, torch.tensor([0.1, bad], dtype=torch.float64)),
+        (
+            polynomial_torch.evaluate_curve,
+            torch.tensor([0.1, bad], dtype=torch.float64),
+        ),
     ):
         with pytest.raises(DomainError, match=r"the proxy holds from 0\.08 to 0\.21"):
             verb(p, values)
@@ -84,7 +87,7 @@ def test_torch_derivatives_of_all_kinds():
     d = torch.linspace(0.09, 0.2, 6, dtype=torch.float64, requires_grad=True)
 
     def f(x):
-        return polynomial_torch.value(p, x)
+        return polynomial_torch.evaluate_curve(p, x)
 
     assert torch.autograd.gradcheck(f, d, check_forward_ad=True, eps=1e-7)
     assert torch.autograd.gradgradcheck(f, d, eps=1e-7)
@@ -99,7 +102,7 @@ def test_torch_derivatives_of_all_kinds():
 def test_ceiling_takes_off_rounding_alone():
     p = polynomial.chebyshev_curve(np.array([1.0 + 1e-9]), (LOW, HIGH), 1, 1.0)
     assert polynomial.evaluate_curve(p, np.array([0.1])) == 1.0
-    assert polynomial_torch.value(p, torch.tensor([0.1])) == 1.0
+    assert polynomial_torch.evaluate_curve(p, torch.tensor([0.1])) == 1.0
 
 
 @pytest.mark.parametrize("power", [1, 3])
@@ -128,16 +131,18 @@ def test_tensors_stay_on_their_device():
     p = polynomial.chebyshev_curve(COEFFICIENTS, (LOW, HIGH), 3)
     host = torch.linspace(0.09, 0.2, 1000, dtype=torch.float64)
     d = host.cuda().requires_grad_()
-    value = polynomial_torch.value(p, d)
+    value = polynomial_torch.evaluate_curve(p, d)
     value.sum().backward()
     assert value.is_cuda
     assert d.grad is not None
     assert torch.allclose(
-        value.detach().cpu(), polynomial_torch.value(p, host), rtol=1e-13
+        value.detach().cpu(), polynomial_torch.evaluate_curve(p, host), rtol=1e-13
     )
-    assert torch.allclose(d.grad.cpu(), polynomial_torch.slope(p, host), rtol=1e-12)
+    assert torch.allclose(
+        d.grad.cpu(), polynomial_torch.evaluate_slope(p, host), rtol=1e-12
+    )
     with pytest.raises(DomainError):
-        polynomial_torch.value(p, 2 * d.detach())
+        polynomial_torch.evaluate_curve(p, 2 * d.detach())
 
 
 @pytest.mark.parametrize("shape", [(5,), (200_000,), (3, 40)])
@@ -152,7 +157,8 @@ def test_backward_in_one_pass_is_the_slope_times_the_weight(shape):
     )
     leaf = torch.from_numpy(d).requires_grad_()
     (once,) = torch.autograd.grad(
-        (torch.from_numpy(weight) * polynomial_torch.value(p, leaf)).sum(), leaf
+        (torch.from_numpy(weight) * polynomial_torch.evaluate_curve(p, leaf)).sum(),
+        leaf,
     )
     assert np.array_equal(once.numpy(), want * weight)
 
