@@ -66,12 +66,18 @@ class _Polynomial(torch.autograd.Function):
                 ctx.curve, diameter.detach().numpy(), weight.detach().numpy()
             )
             return torch.from_numpy(fused), None, None
-        return weight * (_bend if ctx.order else slope)(ctx.curve, diameter), None, None
+        return (
+            weight * (_bend if ctx.order else evaluate_slope)(ctx.curve, diameter),
+            None,
+            None,
+        )
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
         (diameter,) = ctx.saved_tensors
-        return tangents[0] * (_bend if ctx.order else slope)(ctx.curve, diameter)
+        return tangents[0] * (_bend if ctx.order else evaluate_slope)(
+            ctx.curve, diameter
+        )
 
     @staticmethod
     def vmap(
@@ -81,7 +87,7 @@ class _Polynomial(torch.autograd.Function):
         p: ChebyshevCurve,
         order: int,
     ) -> tuple[Any, Any]:
-        return (slope if order else value)(p, diameter), in_dims[0]
+        return (evaluate_slope if order else evaluate_curve)(p, diameter), in_dims[0]
 
 
 def _on_device(diameter: torch.Tensor, p: ChebyshevCurve, order: int) -> torch.Tensor:
