@@ -87,7 +87,8 @@ truth = HiddenLens(
     camera=BenchCamera(pixel_um=2.0, pixels=32),
 )
 shots = bench.simulate_frames(design, truth, sensitivity(design))
-command_capture.write_capture_folder(work / "captures", shots, truth, design)
+(work / "captures").mkdir()
+command_capture.write_captures(work / "captures", shots, truth, design)
 
 # %% [markdown]
 # ## 4. The lens as built

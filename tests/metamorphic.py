@@ -153,7 +153,7 @@ def psf_mirror(rng):
     phase, level, how = optics(rng)
     there = psf.psf_stack(phase, level, **how)
     ax, ay = how["angle_rad"]
-    sides = [one[:, ::-1].copy() for one in (phase, level)]
+    sides = [one[:, ::-1] for one in (phase, level)]
     back = psf.psf_stack(*sides, **how | {"angle_rad": (-ax, ay)})
     return pictures(moved(back, lambda p: p[..., ::-1]), there)
 
@@ -162,7 +162,7 @@ def psf_quarter_turn(rng):
     phase, level, how = optics(rng)
     there = psf.psf_stack(phase, level, **how)
     ax, ay = how["angle_rad"]
-    turned = [np.rot90(one, -1).copy() for one in (phase, level)]  # +x to +y
+    turned = [np.rot90(one, -1) for one in (phase, level)]  # +x to +y
     back = psf.psf_stack(*turned, **how | {"angle_rad": (-ay, ax)})
     return pictures(moved(back, lambda p: np.rot90(p, 1, axes=(-2, -1))), there)
 

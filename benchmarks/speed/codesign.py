@@ -314,11 +314,7 @@ def _rate(seconds: float) -> str:
 
 
 def _trainer(
-    made: pool.FramePool,
-    member: Architecture | None,
-    of: OpticsConfig,
-    *,
-    live: bool,
+    made: pool.FramePool, member: Architecture | None, of: OpticsConfig, *, live: bool
 ) -> Trainer:
     lens, pitch = (
         LearningRateSchedule(rate if live else 0.0, 0.0, 0.9) for rate in (0.02, 0.005)

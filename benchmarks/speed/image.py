@@ -12,15 +12,7 @@ import torch
 from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
-from metalens.field import (
-    Grid,
-    Layers,
-    Optics,
-    PillarWave,
-    SmoothWave,
-    Window,
-    imager,
-)
+from metalens.field import Grid, Layers, Optics, PillarWave, SmoothWave, Window, imager
 from metalens.field.left_out import Judged, neglected, unpolarised
 from metalens.field.plan import spectral
 from metalens.image import Frames

@@ -152,20 +152,8 @@ def _file_rows(target: Path) -> list[Row]:
     free, symmetric = plan(), plan(freeform=False)
     cases = [
         ("free-form", "GDSII", free, "m.gds", "write <= 1.3x a raw write"),
-        (
-            "free-form",
-            "OASIS",
-            free,
-            "s.oas",
-            "<= 3.0 MB (2.0), <= 1 s",
-        ),
-        (
-            "symmetric",
-            "OASIS",
-            symmetric,
-            "y.oas",
-            "<= 0.36 MB, <= 0.15 s",
-        ),
+        ("free-form", "OASIS", free, "s.oas", "<= 3.0 MB (2.0), <= 1 s"),
+        ("symmetric", "OASIS", symmetric, "y.oas", "<= 0.36 MB, <= 0.15 s"),
     ]
     made = []
     for case, method, mask, name, goal in cases:

@@ -20,7 +20,6 @@ _HIDES = 0.3
 _ROUGH = 0.35
 _SURE = 3.0  # standard errors from which on noise is taken to grow with light
 # of a camera that nobody describes, where no two dark frames tell
-_ASSUMED_READ_NOISE_E = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,7 +365,7 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
         read, origin = measured.read_noise_e, "from the flats' photon-transfer line"
         read_known = False
     else:
-        read, origin, read_known = _ASSUMED_READ_NOISE_E, "assumed", False
+        read, origin, read_known = 2.0, "assumed", False  # electrons, of a usual sensor
     notes.append(f"read noise {read:.2g} e, {origin}")
     return SensorNoise(gain, sigma, read, known=known, read_known=read_known)
 

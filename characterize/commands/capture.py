@@ -118,7 +118,7 @@ def _shoot(options: Options, path: Path) -> int:
                 design, wanted=[k.name for k in truth.parameter if k.value]
             ),
         )
-        _fill(draft.path, shots, truth, design)
+        write_captures(draft.path, shots, truth, design)
     values = {
         "folder": str(target),
         "frames": len(shots.frames),
@@ -131,19 +131,17 @@ def _shoot(options: Options, path: Path) -> int:
     return 0
 
 
-def write_capture_folder(
+def write_captures(
     folder: Path, shots: SimulatedFrames, truth: HiddenLens, lens: Lens
 ) -> None:
-    """A capture folder as :func:`characterize.load` reads it, whole or not at all; one
-    of ours is replaced.
+    """Write frames and their description as :func:`characterize.load` reads them.
+
+    Args:
+        folder: an empty folder.
+        shots: the frames.
+        truth: what they were simulated of.
+        lens: the design.
     """
-    with transaction.claim_folder(
-        folder, terms=transaction.ClaimTerms(force=True)
-    ) as draft:
-        _fill(draft.path, shots, truth, lens)
-
-
-def _fill(folder: Path, shots: SimulatedFrames, truth: HiddenLens, lens: Lens) -> None:
     import tifffile
 
     depths, angles = truth.stated

@@ -1,24 +1,5 @@
 """The lens that was made, as a record and as a file: values, covariance, what can and
 what cannot be known.
-
-For those who build on it (retraining, mask correction)::
-
-    built = AsBuilt.load("asbuilt.h5")             # built.save(path) writes it
-    built.names, built.value, built.covariance     # (p,), (p,), (p, p) of the fitted parameters; built.sigma
-    built.interval("bias_nm")                      # 95 %, with what the captures cannot tell; built.within_model(...)
-    built.trusted, built.problems                  # whether the fit passed its own checks
-    built.lens()                                   # Lens with the as-built diameters, wavelength and distance
-    built.diameters                                # its DiameterMap
-    built.pillars()                                # (y, x) complex t of every pillar: process and wave front too
-    built.psf()                                    # PsfStack at the depths and angles of the captures
-    built.psf_stack(View(depths_um, angles_rad, window_um, samples))   # PsfStack anywhere else
-    draws = built.samples(16, seed=0)              # (16, p) of the parameters, from the posterior
-    draws = built.lens_samples(16, seed=0)         # the same for what the lens does to light: for training and PSFs
-    built.psf_stack(view, draws[3])                # ... and the lens, pillars and PSFs of each:
-    built.lens(draws[3]), built.pillars(draws[3])
-
-PSFs hold all that belongs to the lens (pillars, process, aberrations, distance,
-wavelength), nothing of the bench.
 """
 
 import math

@@ -170,7 +170,10 @@ def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[ImageChange]:
     sideways = [_each(np.gradient(light, axis=a)) for a in (1, 2)]
     yield ImageChange("shifts from frame to frame", np.concatenate(sideways))
     yield ImageChange("vibration or blur in single frames", _each(_curvature(light)))
-    yield ImageChange("a stage error in single frames", _each(slopes["stage_zero_um"]))
+    if "stage_zero_um" in slopes:
+        yield ImageChange(
+            "a stage error in single frames", _each(slopes["stage_zero_um"])
+        )
     if "wavelength_nm" in slopes:
         ramp = np.linspace(-1, 1, len(light))[:, None, None]
         yield ImageChange(

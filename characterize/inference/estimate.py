@@ -59,9 +59,6 @@ from metalens.lens import Lens
 LIKENESS = 0.45
 # fitted too where the usual parameters do not explain the frames
 EXTRA = tuple(row.name for row in PARAMETERS if row.extra)
-_CAUSES = 4  # that are found in the residuals, one after the other
-# fall of -2 ln L by which a cause must free a parameter that ran to its bound
-_OUT_OF_BOUNDS = 10.0
 _ROUNDS, _STAYS = (
     5,
     0.1,
@@ -263,7 +260,7 @@ def _with_what_is_there(
     if not gain.known:
         return task, ends, None
     looked = missing.run_score_tests(task, ends[0])
-    for _ in range(_CAUSES):
+    for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
             break
         cause = _best_cause(task, ends[0], looked.leans)
@@ -284,16 +281,21 @@ def _with_what_is_there(
 
 
 def _best_cause(
-    task: SearchTask, best: FitSolution, leans: list[ScoreTest]
+    task: SearchTask,
+    best: FitSolution,
+    leans: list[ScoreTest],
+    *,
+    out_of_bounds: float = 10.0,
 ) -> ScoreTest | None:
     """The cause whose parameters lower the misfit most; None where none lowers it by
-    half of what the residuals promise.
+    half of what the residuals promise, or where a parameter ran to its bound by
+    ``out_of_bounds`` of -2 ln L.
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
     for cause in missing.to_fit(leans, stuck=stuck):
         fall = best.merit - search.merit_with(task, best, cause.frees)
-        if fall > (_OUT_OF_BOUNDS if stuck else cause.chi2 / 2):
+        if fall > (out_of_bounds if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
     return max(falls, key=lambda pair: pair[0])[1] if falls else None
 

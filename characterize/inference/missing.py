@@ -38,18 +38,12 @@ CHANCE = 1e-4
 # for a cause of plausible size from which on it is fitted: by chance in one fit of 100
 # or fewer
 ODDS = 10.0
-_TRIED = 5  # causes that are fitted in turn to see which explains most
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
 _PATCHY, _SPOT = (
     3.0,
     0.2,
 )  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
-
-
-# sigma from which on something beside the parameters is no chance: the fit is not
-# trusted
-DECISIVE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +54,11 @@ class ResidualFinding:
     sigma: float
 
 
-def decisive_findings(found: Sequence[ResidualFinding]) -> list[str]:
-    """Findings beyond ``DECISIVE`` sigma, in words: no fit with one passes its checks."""
-    return [one.words for one in found if one.sigma > DECISIVE]
+def decisive_findings(
+    found: Sequence[ResidualFinding], sigma: float = 5.0
+) -> list[str]:
+    """Findings beyond ``sigma``, in words: no fit with one passes its checks."""
+    return [one.words for one in found if one.sigma > sigma]
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +240,9 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
     return run_score_tests(task, mode).reckoned()
 
 
-def to_fit(found: list[ScoreTest], *, stuck: bool = False) -> list[ScoreTest]:
+def to_fit(
+    found: list[ScoreTest], *, stuck: bool = False, most: int = 5
+) -> list[ScoreTest]:
     """Causes that free parameters describe and that may be fitted next, likeliest
     first.
 
@@ -253,11 +251,12 @@ def to_fit(found: list[ScoreTest], *, stuck: bool = False) -> list[ScoreTest]:
 
     Args:
         stuck: a parameter ran to its bound, so that any cause may stand behind it.
+        most: causes that are fitted in turn to see which explains most.
     """
     some = [one for one in found if one.frees]
     told = [one for one in some if one.chance < CHANCE]
     likely = sorted((one for one in some if one.odds > ODDS), key=lambda one: -one.odds)
-    return (some if stuck else told or likely)[:_TRIED]
+    return (some if stuck else told or likely)[:most]
 
 
 def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:

@@ -12,12 +12,5 @@ if TYPE_CHECKING:
     from characterize.measure import sem as sem
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
-    __name__,
-    {
-        "frames": "",
-        "metrics": "",
-        "overlay": "",
-        "picture": "",
-        "sem": "",
-    },
+    __name__, {"frames": "", "metrics": "", "overlay": "", "picture": "", "sem": ""}
 )

@@ -59,7 +59,7 @@ _WINDOW = {
     "wavelength_nm": ("wave", 1e-3),
 }  # what moves the window, um in its unit
 _WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
-_PITCH, _PITCH_STEP = PLACE["pixel_percent"], 0.3
+_PITCH = PLACE["pixel_percent"]
 # off the chief ray, within which windows need no more directions than those of the
 # middle
 _NEAR_UM = 5.0
@@ -325,15 +325,15 @@ class ForwardModel:
             slopes[list(wanted).index("pixel_percent")] /= ratio
         return frames, slopes
 
-    def _pitch_slope(self, x: Array) -> Array:
+    def _pitch_slope(self, x: Array, step_percent: float = 0.3) -> Array:
         """(n, rows, columns) derivative by the pixel pitch per percent: central
         difference.
         """
         up, down = (
-            self.with_pixel_pitch(1 + sign * _PITCH_STEP / 100).images(x)[0]
+            self.with_pixel_pitch(1 + sign * step_percent / 100).images(x)[0]
             for sign in (1, -1)
         )
-        return np.asarray((up - down) / (2 * _PITCH_STEP))
+        return np.asarray((up - down) / (2 * step_percent))
 
     def _light(
         self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None

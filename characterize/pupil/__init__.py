@@ -12,10 +12,5 @@ if TYPE_CHECKING:
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
-    {
-        "PupilFit": "fit",
-        "PupilSpec": "record",
-        "fit_pupil": "fit",
-        "save": "fit",
-    },
+    {"PupilFit": "fit", "PupilSpec": "record", "fit_pupil": "fit", "save": "fit"},
 )

@@ -28,12 +28,7 @@ from codesign.optics import psf_difference
 from codesign.train import assess
 from metalens.cell import Incidence
 from metalens.core.arrays import Array
-from metalens.core.errors import (
-    CellError,
-    LensError,
-    PropagationError,
-    SceneError,
-)
+from metalens.core.errors import CellError, LensError, PropagationError, SceneError
 from metalens.design import neighbours as supercell
 from metalens.fabrication import State, biased, draws, sensitivity, transmission
 from metalens.lens import NeighbourRows

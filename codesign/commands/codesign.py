@@ -277,10 +277,7 @@ def _keep(
         "rows": rows,
     }
     found |= {"bound": pictures.window_depth_bound(going)}
-    found |= {
-        "frozen": list(settings.run.frozen),
-        "image": said,
-    }
+    found |= {"frozen": list(settings.run.frozen), "image": said}
     found |= {"pitch_held_um": going.trainer.pitch_held_um}
     found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")

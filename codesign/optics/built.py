@@ -31,14 +31,7 @@ from metalens.fabrication import (
     transmission,
 )
 from metalens.field import Optics, cell_um
-from metalens.image import (
-    Field,
-    Pupil,
-    amplitude,
-    aperture_light,
-    coordinates,
-    view,
-)
+from metalens.image import Field, Pupil, amplitude, aperture_light, coordinates, view
 from metalens.lens import Lens
 
 OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")

@@ -112,10 +112,7 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
 
 
 def network_macs(
-    net: Supernet,
-    architecture: Architecture,
-    window_um: float,
-    pitch_um: Tensor,
+    net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor
 ) -> Tensor:
     """Multiply-accumulates of one member at this pitch, differentiable."""
     size = window_um / pitch_um * architecture.resolution

@@ -33,14 +33,7 @@ from codesign.batches import (
     parallel,
     sensor_irradiance,
 )
-from codesign.network import (
-    Architecture,
-    Prediction,
-    blur,
-    cost,
-    losses,
-    running,
-)
+from codesign.network import Architecture, Prediction, blur, cost, losses, running
 from codesign.optics import LensError, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.train import moving
@@ -56,13 +49,7 @@ from codesign.train.separability import (
 )
 from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.image import (
-    Frames,
-    Imager,
-    Sensor,
-    UniformImager,
-    encircled_energy,
-)
+from metalens.image import Frames, Imager, Sensor, UniformImager, encircled_energy
 
 
 @dataclass(frozen=True, slots=True)

@@ -224,10 +224,7 @@ def start_run(settings: RunConfig) -> CodesignRun:
         replace(inner, pitch=LearningRateSchedule(0.0)) if "pitch" in frozen else inner
     )
     made = make_model(
-        settings.optics,
-        pitch_um=settings.run.pitch_um,
-        seed=seed,
-        space=settings.space,
+        settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space
     )
     fresh = EyeScenes(
         settings.scenes,

@@ -305,12 +305,7 @@ class _LatticeCheck:
             f"feet of etched pillars in {lattice.name}",
         )
         self.report.add(
-            "foot",
-            count,
-            layer=layer,
-            cell=lattice.name,
-            worst=least,
-            examples=[shown],
+            "foot", count, layer=layer, cell=lattice.name, worst=least, examples=[shown]
         )
 
     def _sites_of(self, class_number: int) -> Iterator[tuple[int, int]]:

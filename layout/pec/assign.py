@@ -223,13 +223,7 @@ def dose_class_map(
     field = fields.at(fields.far, number, first, len(block), fields.near)
     shift = np.log(np.where(t.used, t.own, 1.0) * steps.factors[0])
     _classes(
-        block,
-        field,
-        shift,
-        THRESHOLD * t.goal,
-        steps.per_log,
-        len(steps.factors),
-        out,
+        block, field, shift, THRESHOLD * t.goal, steps.per_log, len(steps.factors), out
     )
     return out
 

@@ -13,11 +13,5 @@ if TYPE_CHECKING:
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
-    {
-        "convex": "",
-        "moments": "",
-        "rectilinear": "",
-        "region": "",
-        "polygon": "",
-    },
+    {"convex": "", "moments": "", "rectilinear": "", "region": "", "polygon": ""},
 )

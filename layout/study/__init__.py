@@ -9,9 +9,5 @@ if TYPE_CHECKING:
     from layout.study.focus import check_study_lens as check_study_lens
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
-    __name__,
-    {
-        "check_study_lens": "focus",
-        "page": "",
-    },
+    __name__, {"check_study_lens": "focus", "page": ""}
 )

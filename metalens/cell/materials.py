@@ -42,10 +42,7 @@ class Material:
     page: tuple[Part, ...] = ()
 
 
-_TABLES = {
-    "a-Si": "a-Si.csv",
-    "Si": "Si.csv",
-}
+_TABLES = {"a-Si": "a-Si.csv", "Si": "Si.csv"}
 _NO_TABLE = np.empty((3, 0))
 _FORMULAS = {
     "air": Material("air", "vacuum: n = 1 by definition", (0.0, math.inf), _NO_TABLE),

@@ -12,10 +12,5 @@ if TYPE_CHECKING:
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
-    {
-        "ChainFiles": "stages",
-        "ChainStage": "stages",
-        "module_view": "",
-        "stages": "",
-    },
+    {"ChainFiles": "stages", "ChainStage": "stages", "module_view": "", "stages": ""},
 )

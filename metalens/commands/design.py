@@ -345,16 +345,7 @@ def _make(wanted: DesignSettings, options: Options, path: Path) -> "DesignOutcom
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
     lost = made_of.mean_loss(made.diameters.diameter_um, wanted.focus.wavelength_um)
     return DesignOutcome(
-        wanted,
-        quality,
-        check,
-        figures,
-        judged,
-        conversion,
-        found,
-        made,
-        beside,
-        lost,
+        wanted, quality, check, figures, judged, conversion, found, made, beside, lost
     )
 
 

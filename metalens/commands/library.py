@@ -282,9 +282,7 @@ def _text(
 def _orders(made: PillarLibrary) -> tuple[DiffractionOrder, ...]:
     """Orders of the substrate, at the shortest wavelength and the widest angle."""
     return substrate_orders(
-        made.cell,
-        float(made.wavelength_um[0]),
-        angle_rad=float(made.angle_rad[-1]),
+        made.cell, float(made.wavelength_um[0]), angle_rad=float(made.angle_rad[-1])
     )
 
 

@@ -10,3 +10,16 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+def to_tensor(values: Any) -> Any:
+    """A torch tensor of a map: tensors as they are, arrays of any strides.
+
+    Args:
+        values: (…, y, x) tensor or array.
+    """
+    import torch
+
+    if isinstance(values, torch.Tensor):
+        return values
+    return torch.as_tensor(np.ascontiguousarray(values))

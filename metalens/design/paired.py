@@ -12,11 +12,7 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.core.store import Provenance
-from metalens.design.candidates import (
-    make_candidates,
-    sample_phases,
-    wanted_blocks,
-)
+from metalens.design.candidates import make_candidates, sample_phases, wanted_blocks
 from metalens.design.of_phase import Limits, MetricSums, Quality
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf, lattice_sites, least_period_um

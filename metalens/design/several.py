@@ -13,11 +13,7 @@ from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.core.store import Provenance
-from metalens.design.candidates import (
-    make_candidates,
-    sample_phases,
-    wanted_blocks,
-)
+from metalens.design.candidates import make_candidates, sample_phases, wanted_blocks
 from metalens.design.of_phase import (
     Limits,
     MetricSums,

@@ -15,12 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
-from metalens.field.splines import (
-    TAPS,
-    spline_coefficients,
-    spline_matrix,
-    spline_taps,
-)
+from metalens.field.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
 from metalens.field.texture import scene_spectrum
 
 SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made

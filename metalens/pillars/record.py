@@ -11,13 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.cell import (
-    Cell,
-    Index,
-    Polarization,
-    check_subwavelength,
-    index,
-)
+from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
 from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError

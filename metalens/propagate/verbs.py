@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from metalens.core.arrays import Array
+from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Media, media
 from metalens.propagate.choice import MethodChoice, choose_method
@@ -325,8 +325,8 @@ def windowed(
         raise PropagationError(
             f"tolerance is {tolerance}, need a relative error above 0 and below 1"
         )
-    phase = torch.as_tensor(phase_rad)
-    level = torch.as_tensor(transmission).to(phase)
+    phase = to_tensor(phase_rad)
+    level = to_tensor(transmission).to(phase)
     made = plan_window(
         make_case(phase.shape, **geometry), tolerance, torch.float64, phase.device
     )

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from metalens import propagate
-from metalens.core.arrays import Array
+from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
 from metalens.lens import Layers, NeighbourRows
 from metalens.propagate import MovingGeometry, PropagationCase
@@ -411,10 +411,10 @@ def _maps(
         raise PropagationError(
             f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each"
         )
-    phase = torch.as_tensor(phase)
+    phase = to_tensor(phase)
     if phase.dtype not in KEPT:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
-    level = torch.as_tensor(level).to(phase)
+    level = to_tensor(level).to(phase)
     if phase.ndim < 2 or 0 in phase.shape[:-2] or not _broadcasts(level, phase):
         shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {tuple(level.shape)}"
         raise PropagationError(f"{shapes}: need (…, y, x) of both, alike")

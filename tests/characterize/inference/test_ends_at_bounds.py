@@ -96,12 +96,7 @@ def valley(seed):
 
     return LocalMode(
         model, data, mode, GaussianPrior(np.zeros(COUNT), wide, low, high)
-    ), (
-        curvature,
-        gradient,
-        low,
-        high,
-    )
+    ), (curvature, gradient, low, high)
 
 
 def profile(i, place, curvature, gradient, low, high):

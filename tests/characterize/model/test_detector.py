@@ -54,10 +54,7 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
     assert (
         detector.disc_transfer(zero, zero, size)[0],
         detector.disc_transfer(zero, zero, size)[1],
-    ) == (
-        1,
-        0,
-    )
+    ) == (1, 0)
     assert detector.ball_transfer(zero, zero, size) == pytest.approx(1, abs=1e-6)
 
 

@@ -176,13 +176,7 @@ def test_low_orders_from_three_starts_then_all_from_the_best(monkeypatch):
             each.near,
             each.secant,
             each.finish,
-        ) == (
-            12,
-            1.0,
-            1.0,
-            True,
-            False,
-        )
+        ) == (12, 1.0, 1.0, True, False)
     last = settings[3]
     assert (
         last.iterations,

@@ -80,10 +80,7 @@ def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyper
     words = "6 synthetic subjects, 3.1 MMACs, seed 11"
     assert set(found) == {
         f"{k}/proposed" for k in ("slip", "gaze_axial", "gaze_lateral")
-    } | {
-        "slip/ratio",
-        "gaze_lateral/ratio",
-    }
+    } | {"slip/ratio", "gaze_lateral/ratio"}
     assert found["slip/proposed"] == MeasuredNumber(0.31, 0.2, 0.45, words)
     assert found["gaze_axial/proposed"] == MeasuredNumber(1.7, 1.1, 2.9, words)
     lateral = found["gaze_lateral/proposed"]
@@ -178,8 +175,4 @@ def test_information_is_summed_over_depths_of_unbinned_pixels_beside_the_hyperbo
         found["scenes/slip/mine"].value,
         found["scenes/slip/mine"].low,
         found["scenes/slip/mine"].high,
-    ) == (
-        1.6,
-        1.5,
-        1.8,
-    )
+    ) == (1.6, 1.5, 1.8)

@@ -67,10 +67,7 @@ def test_cells_hold_the_mean_of_their_pillars_with_the_bias_where_each_stands():
         v,
         bias,
         3,
-    ).shape == (
-        2,
-        2,
-    )
+    ).shape == (2, 2)
 
 
 def test_empty_cells_take_the_nearest_filled_one():

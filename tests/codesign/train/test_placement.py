@@ -83,10 +83,7 @@ def test_frames_and_gradients_pass_through_an_attended_network():
             {"optics": {"image": "uniform"}},
             ("optics", "pitch"),
         ),  # flat frames of a pool, a step ahead
-        (
-            {"scenes": {"pool": 0}},
-            ("optics",),
-        ),  # frames of two sheets, a step ahead
+        ({"scenes": {"pool": 0}}, ("optics",)),  # frames of two sheets, a step ahead
     ],
 )
 def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
@@ -118,11 +115,7 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
 
 def test_what_a_run_ends_with_is_formed_where_it_trained():
     """Fine-tuning, test frames and the test of depth, beside the processor's."""
-    change = {
-        "run": {"finetune_steps": 1},
-        "test_batches": 1,
-        "ambiguity_pairs": 8,
-    }
+    change = {"run": {"finetune_steps": 1}, "test_batches": 1, "ambiguity_pairs": 8}
     plain, moved = _going(change), _going(change)
     (want,) = finish.finish_budgets(plain)
     with elsewhere() as done:

@@ -18,11 +18,7 @@ from metalens.core.errors import MaskFileError
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
 READ = {"gds": gdsii_read.read, "oas": oasis_read.read}
 PARSE = {"gds": gdsii_read.parse_gdsii, "oas": oasis_read.parse_oasis}
-FORMS = [
-    ("gds", {}),
-    ("oas", {}),
-    ("oas", {"fold": False}),
-]
+FORMS = [("gds", {}), ("oas", {}), ("oas", {"fold": False})]
 
 
 @pytest.fixture

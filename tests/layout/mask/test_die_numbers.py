@@ -137,11 +137,7 @@ def test_what_is_not_corrected_has_dose_one_and_every_layer_its_name():
     assert {
         layer: made.doses[layer]
         for layer in (layers.aperture, layers.marks, layers.labels)
-    } == {
-        (2, 0): 1.0,
-        (3, 0): 1.0,
-        (4, 0): 1.0,
-    }
+    } == {(2, 0): 1.0, (3, 0): 1.0, (4, 0): 1.0}
     assert made.doses[1, 0] == 1.1
     names = {
         (2, 0): "aperture",

@@ -50,10 +50,7 @@ def test_a_hole_whose_middle_meets_flats_is_cut_upright():
     pieces = region.without_holes(region.subtract_contours([square], [hole]))
     assert sorted(
         tuple(p[:, 0][[p[:, 0].argmin(), p[:, 0].argmax()]].tolist()) for p in pieces
-    ) == [
-        (-200, 0),
-        (0, 200),
-    ]
+    ) == [(-200, 0), (0, 200)]
 
 
 def test_triangles_fill_an_outline_but_for_its_hole():

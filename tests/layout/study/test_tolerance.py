@@ -285,10 +285,7 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     made = study_page.study_sections(
         lens, process, fields.split_write_fields(lens.diameters, process), {"": SENS}
     )
-    assert [section.title for section in made] == [
-        "Stitching",
-        "Tolerance",
-    ]
+    assert [section.title for section in made] == ["Stitching", "Tolerance"]
     tables = [
         item for section in made for item in section.items if isinstance(item, Table)
     ]

@@ -29,9 +29,7 @@ from metalens.fabrication import (
     pair_rates,
     pair_sensitivities,
 )
-from metalens.fabrication import (
-    two_sizes as by_pairs,
-)
+from metalens.fabrication import two_sizes as by_pairs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum

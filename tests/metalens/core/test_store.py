@@ -44,11 +44,7 @@ def test_round_trip_keeps_arrays_attributes_and_provenance(tmp_path):
         back.provenance.config,
         dict(back.provenance.inputs),
         back.provenance.seed,
-    ) == (
-        made.config,
-        dict(made.inputs),
-        7,
-    )
+    ) == (made.config, dict(made.inputs), 7)
     assert back.provenance.versions["numpy"] == np.__version__
 
 

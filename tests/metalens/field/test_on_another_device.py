@@ -9,14 +9,7 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import (
-    Grid,
-    Layers,
-    SmoothWave,
-    drawn,
-    imager,
-    surrogate,
-)
+from metalens.field import Grid, Layers, SmoothWave, drawn, imager, surrogate
 from metalens.field.points import Optics
 from metalens.image import Frames, basis, image, uniform_imager
 from tests.elsewhere import AWAY, elsewhere

@@ -215,10 +215,7 @@ def test_parts_of_a_window_miss_what_their_own_paths_miss():
     )
     assert spectrum.quadrature_error(
         spectrum.SpectralNodes(lines, share, 0.04), spans
-    ).tolist() == [
-        0.04,
-        0.04,
-    ]
+    ).tolist() == [0.04, 0.04]
 
 
 def test_a_line_has_half_its_light_half_a_width_away():

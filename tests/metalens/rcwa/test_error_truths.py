@@ -226,10 +226,7 @@ def test_a_layer_without_contrast_is_a_film_to_rounding():
     edge = math.sqrt(1e-13 / (math.pi / 4 * 0.69 * 7.4 * 0.5)) * 0.4
     assert solver.is_homogeneous(
         this, np.array([0.99 * edge, 1.01 * edge])
-    ).tolist() == [
-        True,
-        False,
-    ]
+    ).tolist() == [True, False]
 
 
 def test_anchored_bars_add_what_truncations_modes_collocation_and_shifts_leave(
