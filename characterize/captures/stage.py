@@ -4,7 +4,6 @@
 
 import csv
 import difflib
-import io
 import json
 import math
 import re
@@ -260,7 +259,7 @@ def ome_positions(xml: str) -> Array:
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:
     try:
-        lines = io.StringIO(reading.read_text(path), newline="")
+        lines = reading.read_text(path).splitlines(keepends=True)
         table: list[dict[str, Any]] = list(csv.DictReader(lines, skipinitialspace=True))
     except (csv.Error, UnicodeDecodeError) as error:
         raise CaptureError(

@@ -248,33 +248,29 @@ def instrument_pixel_nm(path: Path) -> float | None:
     Raises:
         CaptureError: pixels that are not square, or a size that is no length above 0.
     """
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return None
     import tifffile
 
     try:
         with tifffile.TiffFile(path) as file:
             zeiss, fei = file.sem_metadata or {}, file.fei_metadata or {}
-    except (tifffile.TiffFileError, *DAMAGE):
+    except DAMAGE:
         return None
     sizes: list[float] = []
     if "ap_pixel_size" in zeiss:
         _, value, unit = zeiss["ap_pixel_size"]
-        scale = {"pm": 1e-3, "nm": 1.0, "um": 1e3, "\xb5m": 1e3, "mm": 1e6}.get(unit)
+        scale = {"pm": 1e-3, "nm": 1.0, "um": 1e3, "\xb5m": 1e3}.get(unit)
         sizes = [value * scale] if scale else []
     elif "PixelWidth" in fei.get("Scan", {}):
         scan = fei["Scan"]
         sizes = [scan[k] * 1e9 for k in ("PixelWidth", "PixelHeight") if k in scan]
     if not sizes:
         return None
-    if not (
-        min(sizes) > 0 and max(sizes) < math.inf and max(sizes) < 1.01 * min(sizes)
-    ):
+    if not 0 < max(sizes) < 1.01 * min(sizes):
         raise CaptureError(
-            f"{path}: pixels of {' x '.join(f'{s:.4g}' for s in sizes)} nm by the "
-            "instrument's tag; need square ones: give --pixel-nm"
+            f"{path}: pixels of {sizes} nm by the instrument's tag; need square ones: "
+            "give --pixel-nm"
         )
-    return float(sizes[0])
+    return sizes[0]
 
 
 def scale_from_bar(image: Array, bar_nm: float) -> float:

@@ -32,5 +32,5 @@ def test_no_tag_is_no_pixel_and_an_oblong_one_is_refused(tmp_path):
     (tmp_path / "b.tif").write_bytes(b"no picture")
     assert sem.instrument_pixel_nm(tmp_path / "b.tif") is None
     path = write(tmp_path / "f.tif", 34682, FEI.format("3.7e-09", "4.1e-09"))
-    with pytest.raises(CaptureError, match=r"3\.7 x 4\.1 nm"):
+    with pytest.raises(CaptureError, match="need square ones"):
         sem.instrument_pixel_nm(path)
