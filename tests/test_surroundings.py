@@ -257,8 +257,8 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(
     """Not the lock beside it: its user never heard of that."""
     monkeypatch.chdir(tmp_path)
 
-    def refused(path, target):
-        raise OSError(errno.EROFS, "Read-only file system", str(path))
+    def refused(target):
+        raise OSError(errno.EROFS, "Read-only file system", str(target))
 
     (tmp_path / "library.h5").touch()
     inside = tmp_path / "library.h5" / "out.h5"
@@ -269,6 +269,6 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(
         ),
         (inside, "out.h5: folder .*library.h5 is a file: give another name"),
     ):
-        monkeypatch.setattr(lock, "_taken", refused)
+        monkeypatch.setattr(lock, "hold_lock", refused)
         with pytest.raises(OutputError, match=found), transaction.claim_file(target):
             pass

@@ -336,39 +336,6 @@ def test_metrology_with_an_error_takes_the_place_of_what_is_usual():
     assert (got.low[0], got.high[0]) == (table[0].low, table[0].high)
 
 
-def test_reversed_starts_turn_biases_beyond_their_sigma_and_take_the_rest_along():
-    """A Gaussian with the reversed ones held at minus their value has its mean where
-    the others go.
-    """
-    names = [n for n in search._REVERSED if n in PLACE][:2]
-    names = (names[0], "background_e", names[1], "log_gain")
-    mixed = RNG.standard_normal((4, 4))
-    covariance = mixed @ mixed.T + 0.5 * np.eye(4)
-    sigma = np.sqrt(np.diag(covariance))
-    value = np.array([1.4 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
-    wide = np.full(4, 1e9)
-    about = SimpleNamespace(
-        names=names, prior=GaussianPrior(np.zeros(4), wide, -wide, wide)
-    )
-    got = search.bias_reversals(
-        about, SimpleNamespace(value=value, covariance=covariance)
-    )
-    assert len(got) == 3  # all of the field, and each alone
-    for start, some in zip(got, ([0, 2], [0], [2]), strict=True):
-        rest = [i for i in range(4) if i not in some]
-        gain = covariance[np.ix_(rest, some)] @ np.linalg.inv(
-            covariance[np.ix_(some, some)]
-        )
-        assert start[some] == pytest.approx(-value[some])
-        assert start[rest] == pytest.approx(value[rest] + gain @ (-2 * value[some]))
-    value = np.array([0.9 * sigma[0], 0.3, -1.2 * sigma[2], 7.0])
-    both, one = search.bias_reversals(
-        about, SimpleNamespace(value=value, covariance=covariance)
-    )
-    assert both[[0, 2]] == pytest.approx(-value[[0, 2]])
-    assert one[2] == pytest.approx(-value[2])
-
-
 def test_chance_of_a_misfit_is_that_of_the_pixels_that_count():
     left = np.array([0.3, 0.0, -1.2, 0.0, 0.7, 2.0, -0.1])
     assert verdict.chance_of(SimpleNamespace(residual_sigma=left)) == pytest.approx(

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import bench_lens as b
 
-from characterize.model import kernel, pillar_slopes
+from characterize.model import kernel
 from metalens.core.errors import FitError
-from metalens.lens import DiameterMap
 
 
 @pytest.mark.parametrize(
@@ -40,27 +38,3 @@ def test_tables_hold_five_times_the_rounding_of_their_columns():
     assert np.linalg.norm(left @ right - table) < least * np.linalg.norm(table)
     with pytest.raises(FitError, match="of their norm"):
         kernel.low_rank_factors(table, 0.98 * least)
-
-
-def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):
-    """Within a nanometre to either side, where the answer of a smooth pillar is its
-    value and its slope.
-    """
-    only, asked = 0.1731, []
-
-    def exact(cell, diameter_um, wavelength_um, wanted, table):
-        asked.append(diameter_um)
-        return [2.3 + 1j + 40 * (diameter_um - only), 5j, -1.7]
-
-    monkeypatch.setattr(pillar_slopes, "_upright", lambda cell: False)
-    monkeypatch.setattr(pillar_slopes, "_exact", exact)
-    diameters = np.where(np.eye(5) > 0, 0.0, only)
-    lens = b.row(diameters=DiameterMap(diameters, 0.4))
-    found = pillar_slopes._solve(lens, 1e-4, ())
-    assert only - 1.0001e-3 < min(asked) < only < max(asked) < only + 1.0001e-3
-    assert (found.low_um, found.high_um) == pytest.approx(
-        (only - 1e-3, only + 1e-3), abs=1e-9
-    )
-    assert found.center_um == pytest.approx(only, abs=1e-9)
-    assert found.coefficients[:, 0] == pytest.approx([2.3 + 1j, 5j, -1.7])
-    assert found.coefficients[0, 1] == pytest.approx(40, rel=1e-6)

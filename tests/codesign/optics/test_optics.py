@@ -240,33 +240,3 @@ def test_a_bias_of_the_diameters_sends_light_straight_on():
     window = (SMALL.window_samples * SMALL.sample_um) ** 2 / (math.pi * 100.0**2)
     want = (1 - lost) * plain.sum((1, 2)) + lost * window
     torch.testing.assert_close(hazy.sum((1, 2)), want, rtol=1e-4, atol=0)
-
-
-@pytest.mark.slow
-def test_phase_variances_are_those_of_the_default_cell():
-    """Derivatives of the phase by diameter and height, over diameters whose phases fill
-    a turn evenly.
-    """
-    from metalens import library
-
-    cell = library.DEFAULT_CELL
-    low, high = (
-        library.proxy_of(
-            library.sweep(replace(cell, height_um=h), wavelengths_um=(0.85,))
-        )
-        for h in (cell.height_um, cell.height_um + 0.01)
-    )
-    turn = np.linspace(0, 2 * math.pi, 400, endpoint=False)
-    diameters = np.asarray(
-        low.diameter_um(
-            low.phase_rad(np.array([low.domain_um[0]]), 0.85)[0] + turn, 0.85
-        )
-    )
-    by_diameter = low.dphase_ddiameter(diameters, 0.85) * 1e-3
-    by_height = (high.phase_rad(diameters, 0.85) - low.phase_rad(diameters, 0.85)) / 10
-    rates = np.stack([by_diameter, by_height])
-    mean, covariance = (np.array(part) for part in lens_errors._answers())
-    # the proxy's slope to 1 %, an effective index to 10 % of a slope
-    assert covariance[0, 0] * 1e-6 == pytest.approx(np.cov(rates)[0, 0], rel=0.01)
-    assert covariance[:2, :2] * 1e-6 == pytest.approx(np.cov(rates), rel=0.06)
-    assert mean[:2] * 1e-3 == pytest.approx(rates.mean(1), rel=0.04)

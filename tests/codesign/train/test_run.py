@@ -247,20 +247,6 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
     )
 
 
-def test_the_finest_pitch_is_where_the_count_meets_the_budget():
-    """A count of 700 / pitch^2, in closed form; none where the coarsest is beyond the
-    budget or no coarser one is.
-    """
-
-    def count(pitch_um):
-        return 700 / pitch_um**2
-
-    assert run._finest(count, 20.0, 1.3, 9.0) == pytest.approx(math.sqrt(35), rel=1e-9)
-    assert count(run._finest(count, 20.0, 1.3, 9.0)) <= 20.0
-    assert run._finest(count, 20.0, 1.3, 5.9) is None  # 20.1
-    assert run._finest(count, 20.0, 5.9, 5.9) is None
-
-
 def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     """A pitch that does not divide the image and a resolution that does not divide the
     pixels, by torch's counter.
