@@ -50,7 +50,7 @@ def test_pillars_of_another_colour_or_incidence_are_made_anew(monkeypatch):
         asked.append((x[bench.PLACE["wavelength_nm"]], angle_rad))
         return noise_um
 
-    monkeypatch.setattr(bench.made, "pillars", pillars)
+    monkeypatch.setattr(bench.made, "as_built_transmission", pillars)
     hidden = bench._Made(bench_lens.lens(), TRUTH, bench_lens.RESPONSE)
     blue, red = TRUTH.vector(), TRUTH.vector()
     red[bench.PLACE["wavelength_nm"]] += 5.0

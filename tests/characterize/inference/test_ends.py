@@ -264,7 +264,7 @@ def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch
         assert model == "quick"
         return lambda x, jacobian: (bright + x[0] * picture + x[1] * 100, None)
 
-    monkeypatch.setattr(verdict.residual, "problem", problem)
+    monkeypatch.setattr(verdict.residual, "residual_phase_problem", problem)
     monkeypatch.setattr(verdict, "models_between_depths", lambda model: model)
     monkeypatch.setattr(verdict, "_SHOWN", 4000)
     wide = np.full(2, np.inf)

@@ -43,7 +43,7 @@ def looked(monkeypatch, chi2_per_dof, patched=False):
         image=IMAGE,
         slopes=SLOPES,
     )
-    monkeypatch.setattr(missing.causes, "changes", lambda *_: ())
+    monkeypatch.setattr(missing.causes, "systematic_changes", lambda *_: ())
     monkeypatch.setattr(
         missing, "_ghost", lambda *_: missing.ScoreTest("ghost", 0.0, 0, 1.0)
     )

@@ -142,7 +142,7 @@ def test_low_orders_from_three_starts_then_all_from_the_best(monkeypatch):
         merit = (3.0, 1.0, 2.0, 0.0)[len(asked) - 1]
         return SimpleNamespace(value=start + 0.01 * len(asked), merit=merit)
 
-    monkeypatch.setattr(pupilfit.leastsquares, "fit", fit)
+    monkeypatch.setattr(pupilfit.leastsquares, "fit_levenberg_marquardt", fit)
     model, solution = pupilfit._fit(spec, position, data_of(light))
     models, starts, settings = zip(*asked, strict=True)
     place = models[0].phase_indices.index((4, 0))

@@ -155,7 +155,7 @@ def test_error_bars_grow_with_a_misfit_and_never_shrink(monkeypatch, chi2, widen
     )  # fmt: skip
     for name, answer in (
         ("_complete", SPEC),
-        ("clean", SimpleNamespace(corrections=("dark",))),
+        ("to_electrons", SimpleNamespace(corrections=("dark",))),
         ("_positions", Z),
         ("_crop", (seen, 4.0, ["cut"])),
         ("_fit", (pupil, solution)),

@@ -244,7 +244,7 @@ def test_the_gradient_is_the_mean_over_the_field_and_the_weighted_one_over_the_w
 def test_every_step_of_every_seed_has_noise_of_its_own(monkeypatch):
     """As far as steps go: a million of one seed before those of the next."""
     made, weight = [], torch.ones(1, requires_grad=True)
-    for name in ("irradiance", "depth_um"):
+    for name in ("sensor_irradiance", "depth_um"):
         monkeypatch.setattr(reader_lens, name, lambda *_, **__: torch.ones(1))
     monkeypatch.setattr(reader_lens.blur, "window_vergence", lambda depth: depth)
     monkeypatch.setattr(

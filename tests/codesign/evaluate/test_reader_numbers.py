@@ -213,7 +213,7 @@ def test_depths_are_learned_on_their_windows(monkeypatch):
         return answer.sum()
 
     monkeypatch.setattr(reader, "_steps", steps)
-    monkeypatch.setattr(reader.losses, "depth", loss)
+    monkeypatch.setattr(reader.losses, "depth_loss", loss)
     learn = SimpleNamespace(pixels=torch.zeros(2, 1, 9, 9), vergence=torch.arange(2.0))
     reader._learn_depth(SimpleNamespace(branch=lambda _: (told, None)), learn)
     assert asked == [(2, 4, 64, 3e-3, 0.01)]

@@ -107,7 +107,7 @@ def test_training_and_scores_hold_networks_to_the_frame(tmp_path, monkeypatch):
         told.append(points)
         return pose(answer, axis, points, **weights)
 
-    monkeypatch.setattr(inner.losses, "task", task_of)
+    monkeypatch.setattr(inner.losses, "task_loss", task_of)
     monkeypatch.setattr(inner.losses, "pose", pose_of)
     list(trainer.run())
     assert torch.equal(told[0], losses.mask_in_frame(batch.mask, wide))

@@ -276,7 +276,7 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
     )
     seen = []
     for module, name, most in (
-        (tolerance, "analyse", 10),
+        (tolerance, "analyse_tolerance", 10),
         (stitching, "stitching", 20),
     ):
         whole = getattr(module, name)

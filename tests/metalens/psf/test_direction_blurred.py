@@ -23,7 +23,9 @@ def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
         return direction.IntensityResult(light, 1e-4, "so", torch.ones(1))
 
     monkeypatch.setattr(direction, "compute_intensity", intensity)
-    monkeypatch.setattr(direction.extended, "blurred", lambda light, *_: (light, 0.003))
+    monkeypatch.setattr(
+        direction.extended, "blur_by_source", lambda light, *_: (light, 0.003)
+    )
 
     def unlike(light, case, source, point):
         point(case)
