@@ -83,7 +83,7 @@ NEEDS = {
     "psf": ("lens.h5", "metalens.commands.psf:_compute"),
     "export": ("lens.h5", "metalens.lens.export:export_lens"),
     "scene": ("scene.toml", "codesign.commands.scene:_make"),
-    "layout": ("lens.h5", "layout.commands.make:_prepare"),
+    "layout": ("lens.h5", "layout.commands.make:draw_lens"),
     "capture": (
         "lens.h5 --truth truth.toml",
         "characterize.bench.bench:simulate_frames",
@@ -92,7 +92,7 @@ NEEDS = {
     "fit": ("captures --design lens.h5", "characterize.commands.fit:fit"),
     "codesign": ("run.toml", "codesign.commands.codesign:_work"),
     "evaluate": ("optics lens.h5", "codesign.commands.evaluate_optics:_measure"),
-    "budget": ("lens.h5", "codesign.commands.budget:bench"),
+    "budget": ("lens.h5", "codesign.commands.budget:prepare_device"),
     "check": ("mask.gds", "layout.drc:check_library"),
     "study": ("", "metalens.pillars.study:run_study"),
     "view": ("lens.h5", "metalens.commands.view:_shown"),

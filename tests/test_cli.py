@@ -289,7 +289,7 @@ def test_a_filled_folder_is_not_written_into_without_force(demo):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[cell]\npitch_um = 0.60\n", "diffraction orders"),
+        ("[cell]\npitch_um = 0.90\n", "diffraction orders"),
         (
             "[cell]\npitch_um = 0.3\n[sweep]\ndiameters_um = [0.1, 0.31]\n",
             "pillars touch",

@@ -32,7 +32,6 @@ CASES = {
     "retrain": ("run --optics asbuilt.h5 -o out", "out"),
     "evaluate": ("optics lens.h5 -o out", "out"),
     "budget": ("lens.h5 -o out.h5", "out.h5"),
-    "plan": ("--gaze-error 2deg -o out", "out"),
     "demo": ("out", "out"),
     "check": ("mask.gds -o out.h5", "out.h5"),
     "measure": ("captures -o out", "out"),

@@ -188,9 +188,11 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
         LensError({"bias_nm": 3.0}).state(),
     )
     # the guide's slope is that of the proxy, smoothed
-    assert variance_rad2(wide) == pytest.approx(variance_rad2(all_round), rel=0.05)
-    assert variance_rad2(LensError({"length_nm": 6.0}).state()) == pytest.approx(
-        variance_rad2(wide), rel=1e-12
+    assert variance_rad2(wide, rates) == pytest.approx(
+        variance_rad2(all_round, OpticsConfig().phase_rates), rel=0.05
+    )
+    assert variance_rad2(LensError({"length_nm": 6.0}).state(), rates) == pytest.approx(
+        variance_rad2(wide, rates), rel=1e-12
     )
     for name in ("turn_deg", "pedestal_nm", "cap_nm"):
         with pytest.raises(ConfigError, match=name):

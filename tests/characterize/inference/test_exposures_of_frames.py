@@ -72,7 +72,7 @@ def shot(model):
     )
     electrons = electrons + np.random.default_rng(5).normal(0, np.sqrt(electrons + 9))
     everywhere = np.ones(electrons.shape, bool)
-    data = b.Data(
+    data = b.FitImages(
         electrons,
         everywhere,
         ~everywhere,

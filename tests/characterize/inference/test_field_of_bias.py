@@ -6,14 +6,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy import optimize
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import bench_lens as b
 from pictured import Pictured
 
-from characterize.inference import explore, leastsquares, search
 from characterize.inference.leastsquares import GaussianPrior
 from characterize.model import PLACE
 
@@ -76,33 +73,3 @@ def least(seen, begin):
 
     found = optimize.least_squares(root, begin, bounds=(-WIDE[:4], WIDE[:4]))
     return 2 * found.cost, found.x
-
-
-@pytest.mark.parametrize("seed", [5, 7, 11, 14, 29, 55])
-def test_a_field_of_bias_and_its_reverse_are_both_found_from_either_or_another_valley(
-    seed,
-):
-    """The twin has the same misfit, and the intervals are alike on both sides of 0, to
-    a tenth: ends are known to a few
-    hundredths of a width. A descent from the truth ends in a higher valley at times; no
-    search may.
-    """
-    rng = np.random.default_rng([seed, 3])
-    truth = np.array([6.0, 2.0, 2.0, 3.0]) * rng.standard_normal(4)
-    seen = products(truth)[0] + NOISE * rng.standard_normal(7)
-    frames = BRIGHT + np.tensordot(np.append(seen, 1.3), PICTURES, 1)
-    about = b.given(Field(), frames, NOISE, NAMED, PRIOR)
-    mode = leastsquares.fit_levenberg_marquardt(
-        about.problem(), about.data, np.append(truth, 1.3), prior=PRIOR
-    )
-    found = explore.explore_posterior(about, search.add_mirrored_starts(about, [mode]))
-    begins = rng.uniform(-0.9, 0.9, (24, 4)) * np.minimum(WIDE[:4], 12.0)
-    best = min((least(seen, begin) for begin in begins), key=lambda one: one[0])
-    reached = least(seen, found.best.value[:4])[0]
-    assert reached < best[0] + 0.05
-    assert any(
-        np.abs(one.value[:4] + found.best.value[:4]).max() < 0.5
-        for one in found.modes[1:]
-    )
-    ends = np.stack([-found.low, found.high])[:, :4]
-    assert ends[0] == pytest.approx(ends[1], rel=0.1)

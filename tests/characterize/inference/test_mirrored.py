@@ -5,13 +5,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import bench_lens as b
 
-from characterize.inference import explore, leastsquares
-from characterize.inference.leastsquares import GaussianPrior
 from characterize.model import PLACE
 from characterize.model.setting import FrameSetting
 
@@ -70,20 +66,3 @@ class Forked:
             + 0.012 / (HIGH - LOW) * three
         )
         return image, np.stack([by_bias, 0.05 * (2 * lean + LEAN) * two, three])
-
-
-def test_both_signs_of_a_gradient_that_the_walk_met_lie_in_its_interval():
-    model, wide = Forked(), np.array([30.0, 40.0, 9.0])
-    known = GaussianPrior(np.zeros(3), np.array([15.0, 20.0, 0.02]), -wide, wide)
-    task = b.given(model, BRIGHT.copy(), NOISE, NAMED, known)
-    end = leastsquares.fit_levenberg_marquardt(
-        task.problem(), task.data, np.array([HIGH, 0.0, 0.0]), prior=known
-    )
-    assert end.value[0] == pytest.approx(HIGH, abs=1.0)
-    found = explore.explore_posterior(task, [end])
-    roots = np.roots([1, LEAN, -25])
-    assert found.best.value[0] == pytest.approx(LOW, abs=0.5)
-    # both roots, with what the prior pulls them by (25 / 20² of -2 ln L, against a
-    # noise that knows them to 0.03)
-    assert found.low[1] < roots.min() + 0.1
-    assert found.high[1] > roots.max() - 0.1

@@ -58,7 +58,7 @@ def test_exposures_of_one_place_and_angle_are_one_frame_in_the_order_of_the_firs
         SensorNoise(1, 0, 2),
         (),
     )
-    after, merged = prepare.merge_brackets(before, frames)
+    after, merged = prepare.merge_exposures(before, frames)
     assert after.names == ("frame 0", "frame 1", "frame 3")
     assert after.position_um.tolist() == [27e3, 22e3, 22e3]
     assert after.exposure_s.tolist() == [0.8, 0.7, 0.3]
@@ -78,7 +78,7 @@ def test_frames_stay_where_each_has_its_place_or_time_or_place_is_not_known(
     depth, exposure
 ):
     before, frames = capture(np.ones((3, 4, 6)), depth, exposure), electrons((3, 4, 6))
-    assert prepare.merge_brackets(before, frames) == (before, frames)
+    assert prepare.merge_exposures(before, frames) == (before, frames)
 
 
 def pictured(places):

@@ -101,32 +101,6 @@ def rise(bias, known):
     )
 
 
-def test_both_valleys_are_found_and_the_interval_is_their_hull():
-    """Both lie below 3.84 of the closed form's least: its interval runs from the left
-    one's end to the right one's.
-    """
-    known = prior(0.0, 15.0)
-    about = task(known)
-    found = explore.explore_posterior(about, [at(about, ROOTS[1])])
-    fine = np.linspace(-25, 25, 200001)
-    curve = rise(fine, known) - rise(fine, known).min()
-    inside = fine[curve < 3.8415]
-    assert curve[np.abs(fine).argmin()] > 12  # a wall between
-    assert [m.value[0] for m in found.modes] == pytest.approx(
-        ROOTS, abs=0.2
-    )  # drawn to 0 by the prior
-    assert found.modes[1].merit - found.modes[0].merit == pytest.approx(
-        curve[fine > 0].min() - curve[fine < 0].min(), abs=0.02
-    )
-    # stops are a sigma apart, a cubic between them: an end is off by a twentieth of the
-    # sigma, 0.5 nm
-    assert (found.low[0], found.high[0]) == pytest.approx(
-        (inside.min(), inside.max()), abs=0.05
-    )
-    assert not found.parabolic[0]
-    assert found.low[1] < HEIGHT < found.high[1]
-
-
 def test_draws_lie_in_both_valleys_as_often_as_the_density_says():
     known = prior(4.0, 15.0)
     about = task(known)
@@ -144,17 +118,6 @@ def test_draws_lie_in_both_valleys_as_often_as_the_density_says():
         np.average((fine[fine < 2.5] - middle) ** 2, weights=density[fine < 2.5])
     )
     assert spread == pytest.approx(want, rel=0.2)
-
-
-def test_a_far_better_valley_replaces_the_fit():
-    """A prior of -9 +- 3 puts the right valley (23 / 3)² = 59 above the left one."""
-    about = task(prior(ROOTS[0], 3.0))
-    other = at(about, ROOTS[1])
-    assert other.value[0] > 10
-    found = explore.explore_posterior(about, [other])
-    assert len(found.modes) == 1
-    assert found.best.value[0] == pytest.approx(ROOTS[0], abs=0.01)
-    assert found.high[0] < ROOTS[0] + 3
 
 
 def test_a_walk_between_two_stops_keeps_to_the_lower_of_each_place():

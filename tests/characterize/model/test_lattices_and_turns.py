@@ -134,7 +134,8 @@ def test_frames_are_the_sum_over_every_pillar(hexagonal, hand, sign):
 def test_the_bench_shows_the_sum_over_every_pillar(hexagonal, hand, sign):
     lens, sites = made(hexagonal, hand)
     known = tuple(
-        b.Known(name, value) for name, value in (VALUES | {"crosstalk_px": 0.0}).items()
+        b.KnownValue(name, value)
+        for name, value in (VALUES | {"crosstalk_px": 0.0}).items()
     )
     truth = bench.HiddenLens(
         DEPTHS, parameter=known, camera=bench.BenchCamera(pixel_um=PIXEL, pixels=PIXELS)

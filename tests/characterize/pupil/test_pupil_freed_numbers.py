@@ -4,7 +4,6 @@ number.
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,61 +91,6 @@ def test_slopes_by_the_factors_are_differences_of_images():
         assert (
             np.abs(slopes[-3 + k] - want).max() < 1e-4 * np.abs(want).max()
         )  # third derivatives times 1e-6
-
-
-@pytest.mark.parametrize(("chi2", "widened"), [(0.3, 1.0), (2.25, 1.5)])
-def test_what_is_freed_is_known_to_its_usual_error_and_its_bar_grows_with_a_misfit(
-    monkeypatch, chi2, widened
-):
-    """10 % of aperture, step and pixel, 0.3 of the logarithm at most; gains to 30 %;
-    blur of 5 % to 4 pixels.
-    """
-    given = []
-    logs = np.log([1.05, 0.9, 1.02])
-
-    def fit(images, data, start, *, prior, settings):
-        given.append((start, prior, settings))
-        covariance = np.diag(np.arange(1.0, len(start) + 1) * 1e-4)
-        value = start.copy()
-        value[-3:] = logs
-        return SimpleNamespace(value=value, covariance=covariance, chi2_per_dof=chi2)
-
-    monkeypatch.setattr(free.leastsquares, "fit", fit)
-    size = free._Images(SPEC, Z).model.layout().size
-    coarse = np.random.default_rng(1).normal(size=size)
-    made, optics, longer = free.fit_free_settings(
-        SPEC, Z, None, lambda model: coarse, step_um=2.6
-    )
-    (start, prior, settings), n = given[0], size + 3
-    assert start == pytest.approx(np.concatenate([coarse, np.zeros(3)]))
-    stage = slice(size - 13, size - 9)  # before blur, gains and backgrounds
-    assert np.array_equal(np.delete(prior.mean, stage), np.delete(start, stage))
-    assert not prior.mean[stage].any()
-    sigma = np.full(n, np.inf)
-    sigma[stage], sigma[size - 8 : size - 4], sigma[-3:] = 0.1 * 13 / 3, 0.3, 0.1
-    assert np.array_equal(prior.sigma, sigma)
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    low[-3:], high[-3:] = -0.3, 0.3
-    low[size - 9], high[size - 9] = 0.05 * 0.4, 4 * 0.4
-    assert np.array_equal(prior.low, low)
-    assert np.array_equal(prior.high, high)
-    assert (
-        settings.iterations,
-        settings.step_tolerance,
-        settings.near,
-        settings.secant,
-    ) == (40, 0.1, 1.0, True)
-    assert made.numerical_aperture == pytest.approx(0.336)
-    assert longer == pytest.approx(0.9)
-    assert [name for name, *_ in optics] == list(SPEC.free)
-    assert [value for _, value, _ in optics] == pytest.approx([0.336, 0.9 * 2.6, 0.408])
-    spread = widened * np.sqrt(np.arange(n - 2, n + 1) * 1e-4)
-    assert [bar for *_, bar in optics] == pytest.approx(
-        np.array([0.336, 2.34, 0.408]) * spread
-    )
-    assert free.fit_free_settings(
-        dataclasses.replace(SPEC, free=()), Z, None, None, step_um=1.0
-    )[1:] == ((), 1.0)
 
 
 def test_what_was_freed_is_said_beside_what_was_stated():

@@ -248,7 +248,7 @@ def test_every_step_of_every_seed_has_noise_of_its_own(monkeypatch):
         monkeypatch.setattr(reader_lens, name, lambda *_, **__: torch.ones(1))
     monkeypatch.setattr(reader_lens.blur, "window_vergence", lambda depth: depth)
     monkeypatch.setattr(
-        reader_lens.losses, "depth", lambda found, true: (found - true).sum()
+        reader_lens.losses, "depth_loss", lambda found, true: (found - true).sum()
     )
 
     def read_out(light, sample_um, pitch_um, sensor, *, generator, exact):

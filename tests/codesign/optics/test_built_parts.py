@@ -8,13 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.signal import correlate
 
 from characterize.model import process_state_of
 from characterize.model.parameters import NAMES, parameter_vector
 from codesign.optics import built
 from metalens.fabrication import Sensitivity, transmission
-from metalens.image import Pupil, amplitude, coordinates
+from metalens.image import Pupil, coordinates
 from metalens.lens import DiameterMap
 from tests.codesign import made_lens as m
 
@@ -246,46 +245,6 @@ def test_every_row_of_a_lens_has_the_phase_of_its_focus_off():
     assert turn == pytest.approx(
         np.full(turn.shape, turn[150, 150]), abs=2e-4
     )  # complex64 of some 100 rad
-
-
-def test_psfs_are_harmonics_of_the_aperture_with_itself():
-    """Sums over pairs of nodes so many apart, of an uneven field, in place of
-    transforms: over the light on it.
-    """
-    lens = built.MadeLens(m.small(), m.OPTICS)
-    pupil = lens._pupil(300.0)
-    rng, shape = np.random.default_rng(11), (pupil.nodes, pupil.nodes)
-    field = rng.uniform(0.5, 1.0, shape) * np.exp(1j * rng.normal(0, 0.4, shape))
-    x, y = (c.numpy() for c in coordinates(pupil))
-    phase = (
-        1e-3 * x**2
-        - 2e-2 * y
-        - 2 * np.pi / 0.85 * (np.hypot(np.hypot(x, y), 300.0) - 300.0)
-    )
-    got = lens._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil).numpy()
-    weight = amplitude(pupil).numpy()
-    r2 = x**2 + y**2
-    given = (
-        np.pi * (pupil.radius_um / 300.0 / (2 * pupil.edge / pupil.nodes)) ** 2
-    )  # nodes of the aperture, as its area
-    given *= 1 - 2 * np.sqrt(2) * 33.0 / (
-        3 * 2 * np.pi / 0.85 * pupil.edge * pupil.period_um**2
-    )
-    harmonics, columns = lens._samples(pupil)
-    apart = np.arange(-harmonics + 1, harmonics)
-    for light, depth in zip(got, lens.settings.depths_um.tolist(), strict=True):
-        inward = phase + 2 * np.pi / 0.85 * (
-            np.hypot(np.sqrt(r2), 300.0) - 300.0 + np.sqrt(r2 + depth**2) - depth
-        )
-        wave = weight * field * np.exp(1j * inward)
-        pairs = correlate(wave, wave, method="direct" if pupil.nodes < 40 else "fft")
-        middle = pupil.nodes - 1
-        of = pairs[np.ix_(middle - apart, middle - apart)]
-        want = (columns.numpy() @ of @ columns.numpy().T).real
-        want *= (lens.settings.sample_um / pupil.period_um) ** 2 / given
-        assert light == pytest.approx(
-            want, abs=1e-4 * want.max()
-        )  # single precision of 400 harmonics
 
 
 def test_without_parameters_a_lens_is_the_design():

@@ -216,7 +216,7 @@ def test_made_lenses_differ_and_lose_light_to_haze():
     made = formed.make_imager(loose, BENT, 20, margin=5, error=error)
     plain = formed.make_imager(loose, BENT, 20, margin=5)
     assert torch.allclose(made.stack.sum((-2, -1)), torch.ones(()), atol=1e-4)
-    kept = math.exp(-variance_rad2(error.state()))
+    kept = math.exp(-variance_rad2(error.state(), loose.phase_rates))
     shadow = (11 * 12.0) ** 2 / (
         math.pi * 150.0**2
     )  # of the window in the shadow of the aperture

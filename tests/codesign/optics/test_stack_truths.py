@@ -206,7 +206,7 @@ def by_hand(x, y, *, wrong=False):
     if wrong:
         total += 2 * np.pi * (0.2 * (x**2 + y**2) * x - 0.13 * (x**2 - y**2))
         total += lens_errors.wave_front_rad(
-            WRONG.state(), *map(torch.from_numpy, (x, y))
+            WRONG.state(), *map(torch.from_numpy, (x, y)), BENT.phase_rates
         ).numpy()
     return total
 
@@ -238,7 +238,7 @@ def test_a_lens_made_wrong_has_the_light_of_its_bent_phase_and_the_haze_of_its_p
         for c in torch.broadcast_tensors(*coordinates(BENT.pupil))
     )
     phase = np.where(np.hypot(x, y) <= 1, by_hand(x, y, wrong=True), 0.0)
-    kept = math.exp(-lens_errors.variance_rad2(WRONG.state()))
+    kept = math.exp(-lens_errors.variance_rad2(WRONG.state(), BENT.phase_rates))
     assert kept < 0.99
     want = kept * summed(BENT, phase) + (1 - kept) * 49 / (math.pi * 350**2)
     made = optics.lens_psf_stack(BENT, RAD, error=WRONG).intensity[4].double().numpy()

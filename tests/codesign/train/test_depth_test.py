@@ -2,8 +2,6 @@
 its PSF is found out.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -66,20 +64,6 @@ class Ruler(Supernet):
             torch.zeros(len(place), 2),
             torch.stack([0 * place, 0 * place, place / 10], 1),
         )
-
-
-def test_pairs_share_the_pupil_and_depth_has_nothing_to_do_with_the_picture(pairs):
-    labels = pairs.labels(0, 16)
-    first, second = labels.centroid_px[::2], labels.centroid_px[1::2]
-    assert float((first - second).norm(dim=1).max()) <= 0.1
-    slips = labels.slip_um
-    assert float((slips[::2] - slips[1::2]).norm(dim=1).min()) > 100
-    many = ambiguity.ambiguous_pairs(
-        replace(SCENES, settings=replace(SCENES.settings, scale=0.3)), 24, seed=5
-    ).states
-    depth = 21e3 + many.slip_um[:, 2]
-    assert abs(np.corrcoef(depth, depth * many.scale)[0, 1]) < 0.45  # 3 / sqrt(48)
-    assert float((many.scale - 1).abs().max()) < 0.3 + 1e-9
 
 
 def test_batches_of_pairs_end_with_the_pairs(pairs):

@@ -108,7 +108,7 @@ def test_training_and_scores_hold_networks_to_the_frame(tmp_path, monkeypatch):
         return pose(answer, axis, points, **weights)
 
     monkeypatch.setattr(inner.losses, "task_loss", task_of)
-    monkeypatch.setattr(inner.losses, "pose", pose_of)
+    monkeypatch.setattr(inner.losses, "pose_loss", pose_of)
     list(trainer.run())
     assert torch.equal(told[0], losses.mask_in_frame(batch.mask, wide))
     torch.testing.assert_close(told[1], batch.pose.points / wide)

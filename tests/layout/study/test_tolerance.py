@@ -275,7 +275,7 @@ def _drawn(study, most, *given, **more):
 def test_the_report_sections_say_what_was_found(monkeypatch):
     for module, name, most in (
         (tolerance, "analyse_tolerance", 10),
-        (stitching, "stitching", 20),
+        (stitching, "simulate_stitching", 20),
     ):
         monkeypatch.setattr(
             module, name, functools.partial(_drawn, getattr(module, name), most)
@@ -306,7 +306,7 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
 def test_a_turned_lens_has_its_study(monkeypatch):
     for module, name, most in (
         (tolerance, "analyse_tolerance", 10),
-        (stitching, "stitching", 20),
+        (stitching, "simulate_stitching", 20),
     ):
         monkeypatch.setattr(
             module, name, functools.partial(_drawn, getattr(module, name), most)

@@ -15,7 +15,7 @@ from layout.process.process import Process, WriteField
 from layout.study import focus, page, pillars, stitching, tolerance
 from layout.study.spread_model import reduce_spread, reduction_error
 from metalens.cell import Cell, Index
-from metalens.cell.shapes import Ellipse, Rectangle
+from metalens.cell.shapes import Rectangle
 from metalens.core.report import Table
 from metalens.fabrication import (
     PairSensitivities,
@@ -26,12 +26,10 @@ from metalens.fabrication import (
     draws,
     named,
     own,
-    pair_rates,
     pair_sensitivities,
 )
 from metalens.fabrication import two_sizes as by_pairs
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
-from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum
 
 X_UM, Y_UM = np.linspace(0.1, 0.3, 51), np.linspace(0.12, 0.28, 41)  # one step of 4 nm
@@ -185,39 +183,6 @@ def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
     assert found == pytest.approx(np.array([1e-3, 0.216, 1.0]) * np.exp(0.7j), rel=1e-9)
 
 
-@pytest.mark.parametrize("light", [0, 1])
-def test_derivatives_of_a_pair_are_differences_of_its_own_light(light, monkeypatch):
-    """Three orders and one field of normals on both sides (the usual one moves with the
-    rim, and any has the same
-    limit); steps of 0.1 nm and 1e-4 leave 1e-6 of the second order."""
-    own_tables, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
-    monkeypatch.setattr(
-        pattern,
-        "normal_tables",
-        lambda outlines, cell, reach: own_tables(fixed, cell, reach),
-    )
-    monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
-    lens, (width, length) = two_sizes(5), (0.14, 0.22)
-    found = pair_rates(lens, np.array([width]), np.array([length]))["xy"[light]].rates[
-        :, 0
-    ]
-
-    def log_t(x, *, height=0.0, index=0.0, wide=0.0, long=0.0):
-        shape = Rectangle((length + long * x) / (width + wide * x))
-        cell = Cell(0.4, 0.6 + height * x, Index(2.7 + index * x), shape=shape)
-        return np.log(jones(cell, width + wide * x, 0.85, harmonics=3).t[light, light])
-
-    steps = {
-        "height_nm": {"height": 1},
-        "index": {"index": 1},
-        "width_nm": {"wide": 1},
-        "length_nm": {"long": 1},
-    }
-    for name, by in steps.items():
-        want = (log_t(1e-4, **by) - log_t(-1e-4, **by)) / 2e-4
-        assert found[CAUSES.index(name)] == pytest.approx(want, rel=2e-4), name
-
-
 def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
     monkeypatch,
 ):
@@ -277,7 +242,7 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
     seen = []
     for module, name, most in (
         (tolerance, "analyse_tolerance", 10),
-        (stitching, "stitching", 20),
+        (stitching, "simulate_stitching", 20),
     ):
         whole = getattr(module, name)
 

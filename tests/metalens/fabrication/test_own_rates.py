@@ -294,19 +294,3 @@ def test_a_pillar_cut_into_two_sections_answers_as_the_whole(few_orders):
         row = ROWS.index(name)
         assert parts.rates[row] == pytest.approx(whole.rates[row], rel=1e-9), name
     assert parts.edges == pytest.approx(whole.edges, rel=1e-9)
-
-
-@pytest.mark.parametrize(("wall_rad", "harmonics"), [(0.0, [6, 8]), (0.02, [5, 6])])
-def test_the_truncations_are_coarser_where_a_tilted_wall_is_many_layers(
-    monkeypatch, wall_rad, harmonics
-):
-    seen = []
-
-    def gather(work, about, tasks):
-        seen.extend(tasks)
-        return [[[0j] * (len(ROWS) + 1)] for _ in tasks]
-
-    monkeypatch.setattr(own.executor, "gather", gather)
-    own_rates(lens(dataclasses.replace(CELL, sidewall_rad=wall_rad)), np.array([SIZE]))
-    assert [task[2] for task in seen] == harmonics
-    assert [task[1] for task in seen] == [SIZE, SIZE]

@@ -84,9 +84,9 @@ def test_pitch_without_room_is_refused():
 
 
 def test_pitches_above_cutoff_are_refused_and_named():
-    with pytest.raises(CellError, match=r"pitch 0.7 um at 0.85 um: diffraction orders"):
+    with pytest.raises(CellError, match=r"pitch 0.9 um at 0.85 um: diffraction orders"):
         cell_study.run_study(
-            CellStudy(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,))
+            CellStudy(pitches_um=(0.3, 0.9), heights_um=(0.5,), wavelengths_um=(0.85,))
         )
 
 

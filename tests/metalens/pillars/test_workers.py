@@ -101,8 +101,8 @@ def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(
         textwrap.dedent("""
             import os, sys
             from metalens.core import executor
-            print(dict(executor.run(os.path.basename, ["a/b", "c/d"], processes=2)))
-            print(dict(executor.run(print, ["stray"], processes=1)))
+            print(dict(executor.run_parallel(os.path.basename, ["a/b", "c/d"], processes=2)))
+            print(dict(executor.run_parallel(print, ["stray"], processes=1)))
         """)
     )
     done = subprocess.run(

@@ -335,32 +335,6 @@ def test_the_cheaper_method_is_taken(plans):
     assert (forced.method, forced.tiles) == ("windowed", ((wide,),))
 
 
-@pytest.mark.parametrize("wide", [True, False])
-def test_transforms_are_taken_where_a_window_is_wide_and_they_cost_less_than_the_sum(
-    plans, monkeypatch, wide
-):
-    """Their own seconds, a plan's 20 ms, and 3 ns a pillar for each of two passes."""
-    case = replace(CASE, shape=(700, 900), samples=(30, 40))
-    exact = choice.exact_seconds(case)
-    monkeypatch.setattr(choice.grids, "is_wide", lambda *_: wide)
-    plans[(30, 40)] = SimpleNamespace(
-        seconds=2 * exact, parts=1, nodes=(11, 12)
-    )  # not what is cheapest
-    for own in (
-        exact - 0.02 - 2 * 630_000 * 3e-9 - 1e-3,
-        exact - 0.02 - 2 * 630_000 * 3e-9 + 1e-3,
-    ):
-        monkeypatch.setattr(choice.grids, "seconds", lambda *_, own=own: own)
-        choice.choose_method.cache_clear()
-        made = choice.choose_method(case, 1e-4)
-        cheaper = own + 0.02 + 2 * 630_000 * 3e-9 < exact
-        assert made.method == ("wide" if wide and cheaper else "exact")
-        assert made.seconds == pytest.approx(
-            own + 0.02 + 2 * 630_000 * 3e-9 if wide and cheaper else exact
-        )
-        assert choice.choose_method(case, 1e-4, moving=True).method == "exact"
-
-
 def test_a_window_that_has_no_plan_is_cut_until_its_corners_have_one(plans):
     """Quarters have none, sixteenths do: 16 tiles of 0.05 s, a plan each."""
     wide = replace(CASE, shape=(9000, 9000), samples=(40, 48))

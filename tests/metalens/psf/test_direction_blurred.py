@@ -31,7 +31,7 @@ def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
         point(case)
         return 0.004
 
-    monkeypatch.setattr(direction.extended, "unlike", unlike)
+    monkeypatch.setattr(direction.extended, "shift_invariance_error", unlike)
     given = SimpleNamespace(
         shaded=lambda cases: (None, None),
         at=lambda case: case,
