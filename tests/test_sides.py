@@ -187,9 +187,10 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
         LensError({"width_nm": 6.0}).state(),
         LensError({"bias_nm": 3.0}).state(),
     )
-    # the guide's slope is that of the proxy, smoothed
+    rates = OpticsConfig().phase_rates
+    # the slope of the guide is that of the proxy, smoothed
     assert variance_rad2(wide, rates) == pytest.approx(
-        variance_rad2(all_round, OpticsConfig().phase_rates), rel=0.05
+        variance_rad2(all_round, rates), rel=0.05
     )
     assert variance_rad2(LensError({"length_nm": 6.0}).state(), rates) == pytest.approx(
         variance_rad2(wide, rates), rel=1e-12
