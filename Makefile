@@ -73,7 +73,7 @@ wheel-check: setup
 	$(BIN)/python -m tests.small build/wheel/chain
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt torch numpy
-	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt build/wheel/*.whl
+	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt "$$(echo build/wheel/*.whl)[codesign]"
 	cd build/wheel && venv/bin/metalens demo demo --config chain/chain.toml
 
 clean:

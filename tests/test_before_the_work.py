@@ -413,7 +413,7 @@ def test_room_is_asked_for_as_soon_as_the_size_is_known(
     (inputs / "design.toml").write_text("aperture_mm = 0.023\n")
     for name in (
         "metalens.lens.export:export_lens",
-        "layout.mask.build:prepare_mask",
+        "layout.mask.build:draw_mask",
         "metalens.commands.design:_phase",
     ):
         module, _, word = name.partition(":")

@@ -74,7 +74,9 @@ def test_light_falls_with_the_square_of_its_true_distance_and_adds_over_the_line
         )
 
     monkeypatch.setattr(bench, "_frames", frames)
-    monkeypatch.setattr(bench.made, "pillars", lambda *given, **more: None)
+    monkeypatch.setattr(
+        bench.made, "as_built_transmission", lambda *given, **more: None
+    )
     monkeypatch.setattr(
         bench,
         "_alike",

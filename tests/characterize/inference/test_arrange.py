@@ -142,5 +142,5 @@ def test_a_turn_is_taken_where_it_is_better_once_both_fits_have_gone_on(
     def gone_on(images, data, begin, **_):
         return types.SimpleNamespace(merit=ends[int(begin[0])])
 
-    monkeypatch.setattr(search.leastsquares, "fit", gone_on)
+    monkeypatch.setattr(search.leastsquares, "fit_levenberg_marquardt", gone_on)
     assert search.choose_orientation(tasks).found.orientation == int(turned)

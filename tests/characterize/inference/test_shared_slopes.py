@@ -132,9 +132,7 @@ def test_stops_between_two_of_a_walk_are_as_low_as_with_slopes_of_their_own(abou
         assert one.merit == pytest.approx(least, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    "name", ["stage_scale", "stage_zero_um", "distance_um", "wavelength_nm"]
-)
+@pytest.mark.parametrize("name", ["stage_scale", "stage_zero_um", "distance_um"])
 def test_derivatives_that_are_put_together_are_central_differences(about, name):
     """Stage scale by the zero, the window's own moves with a tolerance by their size:
     the 8e-3 of all derivatives.

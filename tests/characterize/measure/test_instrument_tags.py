@@ -8,7 +8,10 @@ from characterize.measure import sem
 from metalens.core.errors import CaptureError
 
 IMAGE = np.arange(30 * 40, dtype=np.uint8).reshape(30, 40)
-ZEISS = "\r\n0\r\n0\r\n0\r\nAP_MAG\r\nMag = 50.00 K X\r\nAP_PIXEL_SIZE\r\nPixel Size = 2.233 nm\r\n"
+ZEISS = (
+    "\r\n0\r\n0\r\n0\r\nAP_MAG\r\nMag = 50.00 K X\r\n"
+    "AP_PIXEL_SIZE\r\nPixel Size = 2.233 nm\r\n"
+)
 FEI = "[User]\r\nDate=1\r\n[Scan]\r\nPixelWidth={}\r\nPixelHeight={}\r\n"
 
 

@@ -235,7 +235,7 @@ def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
         "amplitude_order = 1\ndrift_order = 1\n"
     )
     words = [
-        "fit_levenberg_marquardt",
+        "fit",
         str(tmp_path / "stack.tif"),
         "--pupil",
         str(tmp_path / "pupil.toml"),
@@ -259,7 +259,7 @@ def test_command_ends_with_1_where_a_fit_is_refused(tmp_path, capsys):
         "amplitude_order = 1\ndrift_order = 1\n"
     )
     words = [
-        "fit_levenberg_marquardt",
+        "fit",
         str(tmp_path / "stack.tif"),
         "--pupil",
         str(tmp_path / "pupil.toml"),

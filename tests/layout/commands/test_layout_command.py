@@ -115,7 +115,7 @@ def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(
 ):
     behind = replace(lens.load(lens_file), layers=Layers(stop=Stop(9.0, 4.0)))
     lens.save(tmp_path / "behind.h5", behind)
-    monkeypatch.setattr(make.build, "prepare", None)
+    monkeypatch.setattr(make.build, "prepare_mask", None)
     assert run(tmp_path / "behind.h5", "-o", tmp_path / "mask", "--study") == 2
     assert "study the same lens designed without layers.stop" in capsys.readouterr().err
     assert not (tmp_path / "mask").exists()

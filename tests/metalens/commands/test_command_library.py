@@ -156,7 +156,7 @@ def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(
         ("pitch_um", "pich_um", "did you mean 'pitch_um'"),
         ("samples", "sampels", "did you mean 'samples'"),
         ("[sweep]", "[swep]", "did you mean 'sweep'"),
-        ("pitch_um = 0.30", "pitch_um = 0.90", "(-1, 0) in the cover"),
+        ("pitch_um = 0.30", "pitch_um = 0.90", "(1, 0) propagate in the cover"),
         ("pitch_um = 0.30", "pitch_um = -1.0", "need a finite length above 0"),
         ("pitch_um = 0.30", "pitch_um = inf", "pitch_um is inf, need a finite number"),
         ("pitch_um = 0.30", "pitch_um = nan", "pitch_um is nan"),
