@@ -13,7 +13,7 @@ import numpy as np
 
 from characterize.model import detector, moments
 from characterize.model.glass import BenchGeometry, FilmStack, source_paths
-from characterize.model.kernel import phasors, real_of
+from characterize.model.kernel import real_of, wrapped_phasors
 from characterize.model.moments import LIT, WHOLE, Cut, LightBases, LightFactor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import (
@@ -379,7 +379,7 @@ class ForwardModel:
         x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, lens = threads.run_concurrently(
             lambda: self._operators(x, group),
-            lambda: phasors(self._phase(x, group), group.reduced.kind),
+            lambda: wrapped_phasors(self._phase(x, group), group.reduced.kind),
             lambda: self._pupil(x, group, bool(names)),
         )
         lit = lens[0] * phasor

@@ -169,7 +169,7 @@ class CompressedKernel:
         size, r = self.amplitude(ray)
         fade = (1 / r).astype(real_of(kind)) - np.dtype(kind).type(1j * self.k)
         return np.asarray(
-            size.astype(real_of(kind)) * fade * phasors(self.k * path, kind)
+            size.astype(real_of(kind)) * fade * wrapped_phasors(self.k * path, kind)
         )
 
     def counts(
@@ -210,7 +210,7 @@ class CompressedKernel:
         return np.asarray(self.path(a, b, X, Y)[0] - self.by_x(a, X) - self.by_y(b, Y))
 
 
-def phasors(phase: Array, kind: Any = np.complex64) -> Array:
+def wrapped_phasors(phase: Array, kind: Any = np.complex64) -> Array:
     """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex
     one makes light fade.
     """

@@ -29,8 +29,8 @@ from characterize.model.kernel import (
     complex_precision,
     extra_digits,
     low_rank_factors,
-    phasors,
     real_of,
+    wrapped_phasors,
 )
 from characterize.model.pillars import PillarResponse
 from characterize.model.window import (
@@ -293,7 +293,7 @@ class CompressedLens:
         turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[
             :, built
         ]
-        found = phasors(
+        found = wrapped_phasors(
             self.k * self.path(*places, self.bench.distance_um, self.bench) + turn,
             self.kind,
         )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from codesign.batches.scenes import SceneConfig as SceneConfig
     from codesign.batches.scenes import as_batch as as_batch
     from codesign.batches.scenes import augmented_frames as augmented_frames
-    from codesign.batches.scenes import depth_factors as depth_factors
+    from codesign.batches.scenes import draw_depth_scales as draw_depth_scales
     from codesign.batches.scenes import widen_motion as widen_motion
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
@@ -43,7 +43,7 @@ __getattr__, __dir__, __all__ = attach_lazy_exports(
         "TEST": "scenes",
         "VALIDATION": "scenes",
         "as_batch": "scenes",
-        "depth_factors": "scenes",
+        "draw_depth_scales": "scenes",
         "depth_um": "flat",
         "render_pool": "pool",
         "sensor_irradiance": "flat",

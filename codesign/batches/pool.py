@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from codesign.batches.batch import EyePose, FrameBatch
 from codesign.batches.flat import SingleSurfaceFrames, flatten_layers
-from codesign.batches.scenes import EyeScenes, depth_factors, pose_of
+from codesign.batches.scenes import EyeScenes, draw_depth_scales, pose_of
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
@@ -160,7 +160,7 @@ class PoolScenes:
             torch.from_numpy(pool.place_um[rows]),
         )
         low, high = pool.depths_um
-        scale = depth_factors(
+        scale = draw_depth_scales(
             place[:, 2], (float(low), float(high)), self.spread, generator
         )
         slip, shift = (

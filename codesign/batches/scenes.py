@@ -48,7 +48,8 @@ class SceneConfig:
     samples rendered beyond it.
     scale: spread of the scale ambiguity: depths and labels are multiplied by a factor
     of 1 +- scale at an unchanged
-        pinhole image, so that size does not tell depth; see :func:`depth_factors`.
+        pinhole image, so that size does not tell depth; see
+        :func:`draw_depth_scales`.
     slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up
     or down.
     depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image
@@ -169,7 +170,9 @@ class EyeScenes:
         generator = np.random.default_rng((self.seed, self.stream, step, 1))
         return replace(
             plain,
-            scale=depth_factors(depth, self.depths_um, self.settings.scale, generator),
+            scale=draw_depth_scales(
+                depth, self.depths_um, self.settings.scale, generator
+            ),
         )
 
     def rendered(self, step: int, size: int) -> RenderedFrames:
@@ -226,7 +229,7 @@ def widen_traits(variety: float) -> dict[str, SubjectTrait]:
     return found
 
 
-def depth_factors(
+def draw_depth_scales(
     depth_um: Tensor,
     range_um: tuple[float, float],
     spread: float,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from codesign.batches import EyeScenes, FrameBatch, as_batch, depth_factors
+from codesign.batches import EyeScenes, FrameBatch, as_batch, draw_depth_scales
 from codesign.eye import (
     DrawnAugmentations,
     EyeStates,
@@ -91,7 +91,7 @@ def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> AmbiguityScenes
         )
     )
     depth = scenes.rig.distance_um + joined.slip_um[:, 2]
-    scale = depth_factors(
+    scale = draw_depth_scales(
         depth, scenes.depths_um, scenes.settings.scale, np.random.default_rng((seed, 8))
     )
     generator = np.random.default_rng((seed, scenes.stream, 10))

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from metalens.aberrations.chief import ChiefRay, chief_ray, middle_um, source_at
 from metalens.aberrations.waves import (
-    PlaneWaves,
+    FieldPlaneWaves,
     line_mtf,
     plane_waves_of_source,
     sharpness_per_um,
@@ -266,7 +266,7 @@ def vignetted_share(
 
 
 def _sharpest(
-    lens: Lens, light: PlaneWaves, angle_rad: float, close_um: Array
+    lens: Lens, light: FieldPlaneWaves, angle_rad: float, close_um: Array
 ) -> Array:
     """(2,) distance behind the pillars where the line images along x and along y are
     sharpest; NaN at an end.
@@ -298,7 +298,7 @@ def _sharpest(
 
 
 def _settled(
-    light: PlaneWaves, places: Array, sharp: Array, axis: int, deep: float
+    light: FieldPlaneWaves, places: Array, sharp: Array, axis: int, deep: float
 ) -> float:
     """The best of a scan, settled between its neighbours."""
     best = int(np.argmax(sharp))

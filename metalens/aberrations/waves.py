@@ -47,7 +47,7 @@ STEEPEST = 0.999
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class PlaneWaves:
+class FieldPlaneWaves:
     """Plane waves of one field angle at the design wavelength.
 
     amplitude: (y, x) complex128, √T A. p_x, p_y: (x,), (y,) n sin θ along each axis.
@@ -94,7 +94,7 @@ class PlaneWaves:
 
 def plane_waves_of_source(
     lens: Lens, angle_rad: tuple[float, float], depth_um: float
-) -> PlaneWaves:
+) -> FieldPlaneWaves:
     """Plane waves of a source's light at the design wavelength.
 
     Args:
@@ -143,7 +143,7 @@ def plane_waves_of_source(
     )
     light = nx * ny * power * faces, d.site_um2 * power * faces
     aperture = float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2
-    return PlaneWaves(amplitude, p_x, p_y, (dx, dy), *light, aperture, wave, after)
+    return FieldPlaneWaves(amplitude, p_x, p_y, (dx, dy), *light, aperture, wave, after)
 
 
 def _lighting(
@@ -221,7 +221,7 @@ def _rows(
     return out, power
 
 
-def line_image(waves: PlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
+def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
     """Line image along x (0) or y (1) of waves on a plane (:meth:`Waves.at`), of sum 1
     where all light is in it, and
     the step of its samples in um; it repeats beyond its ends."""
@@ -233,7 +233,7 @@ def line_image(waves: PlaneWaves, field: Array, axis: int) -> tuple[Array, float
     return np.asarray(line), waves.wavelength_um / (count * waves.spacing[axis])
 
 
-def sharpness_per_um(waves: PlaneWaves, field: Array, axis: int) -> float:
+def sharpness_per_um(waves: FieldPlaneWaves, field: Array, axis: int) -> float:
     """∫ L² over (∫ L)² of the line image along an axis: one over how wide it is; a bar
     of width b gives 1 / b.
     """
@@ -242,7 +242,7 @@ def sharpness_per_um(waves: PlaneWaves, field: Array, axis: int) -> float:
 
 
 def line_mtf(
-    waves: PlaneWaves, field: Array, axis: int, frequencies_per_um: Array
+    waves: FieldPlaneWaves, field: Array, axis: int, frequencies_per_um: Array
 ) -> Array:
     """(frequencies,) modulation transfer along an axis, of all light through the lens:
     its value just above frequency 0

@@ -50,7 +50,7 @@ UNLIKE: dict[str, Polarization] = {
 }  # planes of incidence along x: s is the light along y
 
 
-def plane_waves(
+def sweep_plane_waves(
     sweep: Sweep,
     wavelengths_um: tuple[float, ...],
     angles_deg: tuple[float, ...],

@@ -90,7 +90,7 @@ def _run(
         ]
         return dict(zip(itertools.chain(*groups), made, strict=True))
 
-    first = few_nodes.plane_waves(
+    first = few_nodes.sweep_plane_waves(
         sweep,
         few_nodes.pick_nodes(sweep.wavelengths_um),
         few_nodes.pick_nodes(sweep.angles_deg),

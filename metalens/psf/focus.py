@@ -136,11 +136,11 @@ def incident_um2(lens: Lens, angle_rad: Point, depth_um: float) -> float:
     """
     d = lens.diameters
     there = np.asarray(d.diameter_um) > 0
-    shadow = np.abs(stop_shadow(lens, angle_rad, depth_um))
+    shadow = np.abs(lens_stop_shadow(lens, angle_rad, depth_um))
     return float(d.site_um2 * ((there * shadow) ** 2).sum())
 
 
-def stop_shadow(lens: Lens, angle_rad: Point, depth_um: float) -> Array:
+def lens_stop_shadow(lens: Lens, angle_rad: Point, depth_um: float) -> Array:
     """(y, x) complex factor of the aperture stop at every pillar; 1 without one."""
     if lens.layers.stop is None:
         return np.ones((1, 1))
@@ -166,7 +166,7 @@ def in_phase_irradiance(
     )
     level = all_maps(lens, nodes, angle_rad, torch.float32, scalar=True)[0][1].numpy()
     d = lens.diameters
-    level = level * np.abs(stop_shadow(lens, angle_rad, depth_um))
+    level = level * np.abs(lens_stop_shadow(lens, angle_rad, depth_um))
     total = 0.0
     for one, wave, weight in zip(
         level, nodes.wavelengths_um.tolist(), nodes.weights.tolist(), strict=True

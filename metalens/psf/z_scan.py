@@ -11,7 +11,7 @@ from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.lens import Lens
 from metalens.psf.budget import sine_aperture
-from metalens.psf.focus import stop_shadow
+from metalens.psf.focus import lens_stop_shadow
 from metalens.psf.metrics import Point, fwhm
 from metalens.psf.of_lens import all_maps
 from metalens.psf.spectrum import SpectralNodes
@@ -78,7 +78,7 @@ def focus_scan(
     """
     waves = nodes or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     maps, _ = all_maps(lens, waves, (0.0, 0.0), torch.float64, scalar=True)
-    shade = stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
+    shade = lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
     turn, part = torch.from_numpy(np.angle(shade)), torch.from_numpy(np.abs(shade))
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = sine_aperture(lens, (0.0, 0.0))

@@ -9,7 +9,7 @@ import torch
 from codesign.batches import flat, pool
 from codesign.batches.flat import SingleSurfaceFrames, flatten_layers, sensor_irradiance
 from codesign.batches.pool import PoolScenes
-from codesign.batches.scenes import EyeScenes, SceneConfig, depth_factors
+from codesign.batches.scenes import EyeScenes, SceneConfig, draw_depth_scales
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import SceneError, TrainingError
@@ -147,12 +147,12 @@ def test_slippage_of_a_pool_is_that_of_the_renderer_at_its_scale():
 
 def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
     depth = torch.linspace(18_000, 24_000, 4000, dtype=torch.float64)
-    factor = depth_factors(depth, (18_000.0, 24_000.0), 0.4, np.random.default_rng(0))
+    factor = draw_depth_scales(depth, (18e3, 24e3), 0.4, np.random.default_rng(0))
     assert (
         abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05
     )  # 3 / sqrt(4000)
     assert torch.equal(
-        depth_factors(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
+        draw_depth_scales(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
         torch.ones(4000).double(),
     )
 

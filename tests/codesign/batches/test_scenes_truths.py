@@ -73,7 +73,7 @@ def test_scales_bring_every_depth_to_one_that_knows_nothing_of_it():
     ends there.
     """
     depth = torch.tensor([15e3, 20e3, 26e3, 31e3], dtype=torch.float64)
-    got = scenes.depth_factors(depth, (18e3, 27e3), 0.15, np.random.default_rng(9))
+    got = scenes.draw_depth_scales(depth, (18e3, 27e3), 0.15, np.random.default_rng(9))
     wanted = np.random.default_rng(9).uniform(18e3, 27e3, 4)
     assert got.numpy() == pytest.approx(np.clip(wanted / depth.numpy(), 0.85, 1.15))
 
