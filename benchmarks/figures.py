@@ -27,7 +27,7 @@ SENTENCES = (  # of the README's text, beside its table
     "as wide as a sensor, a hundred times | {psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2} times |",
     "| a round pillar by the modal method to 1e-4 in 50 ms | {modal; tolerance 0.0001; seconds; ms} ms,",
     "of 22 000 entries in 60 s | {library; 200 x 11; seconds; 2} s (",
-    "150 frames/s | {codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} at 9.7 MMACs, "
+    "150 frames/s (earlier image model) | {codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} at 9.7 MMACs, "
     "{codesign; 9.7 MMACs, true image & lens and pitch moving; seconds; rate} where the lens moves (",
 )
 REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
