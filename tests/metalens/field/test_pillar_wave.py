@@ -157,7 +157,7 @@ def _differentiates(lens):
     with torch.no_grad():
         wide = 0.5 * (score(diameter + step) - score(diameter - step))
     # the value reads one cell in two of a line, the slope their mean: 5 % at a patch of
-    # 20 um (test_cells_of_pillars)
+    # 20 um
     assert float((slope * step).sum()) == pytest.approx(float(wide), rel=8e-2)
 
 
