@@ -22,7 +22,7 @@ from characterize.model.parameters import KnownValue
 from characterize.model.pillar_slopes import log_response_slopes
 from metalens import design, profiles
 from metalens.cell.record import Cell
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 # %% [markdown]
 # A small lens. Yours comes from `metalens design`, its proxy from `metalens library`.

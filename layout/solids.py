@@ -18,7 +18,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ProcessError
 from metalens.core.units import nm
 from metalens.lens import Lens
-from metalens.pillars.axes import cell_of_sizes
+from metalens.library.axes import cell_of_sizes
 
 # pillars that viewers and CAD kernels still open
 MAX_PILLARS = {"STEP": 10_000, "STL": 500_000}

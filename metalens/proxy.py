@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 from metalens.core.lazy import attach_lazy_exports
 
 if TYPE_CHECKING:
-    from metalens.pillars.fit import ProxyTolerances as ProxyTolerances
-    from metalens.pillars.fit import fit_proxy as fit
-    from metalens.pillars.proxy import Proxy as Proxy
+    from metalens.library.fit import ProxyTolerances as ProxyTolerances
+    from metalens.library.fit import fit_proxy as fit
+    from metalens.library.proxy import Proxy as Proxy
 
 __getattr__, __dir__, __all__ = attach_lazy_exports(
     __name__,
     {
-        "Proxy": "metalens.pillars.proxy",
-        "ProxyTolerances": "metalens.pillars.fit",
-        "fit": "metalens.pillars.fit:fit_proxy",
+        "Proxy": "metalens.library.proxy",
+        "ProxyTolerances": "metalens.library.fit",
+        "fit": "metalens.library.fit:fit_proxy",
     },
 )

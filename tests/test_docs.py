@@ -53,7 +53,7 @@ def _records():
     from codesign.commands.evaluate_optics import OpticsSettings as Optics
     from layout.arrange import Floorplan
     from layout.process.process import Process
-    from metalens.pillars.study import CellStudy
+    from metalens.library.study import CellStudy
 
     return {
         "CELL.toml": CellFile,

@@ -36,7 +36,7 @@ from metalens.fabrication import (
     sensitivity,
 )
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.rcwa import jones
 from tests.codesign.process_entry import process_entry
 

@@ -17,7 +17,7 @@ from metalens.field.left_out import Judged, neglected, unpolarised
 from metalens.field.plan import spectral
 from metalens.image import Frames
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import Source, SpectralNodes, spectrum
 
 FRAMES = 8

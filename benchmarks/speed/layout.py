@@ -322,7 +322,7 @@ def _lens(diameter_mm: float, pitch_um: float, *, cubic_rad: float = 3.0) -> "Le
     """
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens
-    from metalens.pillars import Proxy
+    from metalens.library import Proxy
 
     count, reach = round(diameter_mm * 1e3 / pitch_um), 500 * diameter_mm
     x = ((np.arange(count) - (count - 1) / 2) * pitch_um).astype(np.float32)

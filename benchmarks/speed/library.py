@@ -14,10 +14,10 @@ from metalens import library, rcwa
 from metalens.cell.record import Cell, Index
 from metalens.cell.response import Response
 from metalens.core import executor
-from metalens.pillars import curve as reduced
-from metalens.pillars import fit as proxy_fit
-from metalens.pillars.proxy import Proxy
-from metalens.pillars.record import DEFAULT_CELL, PillarLibrary, Sweep
+from metalens.library import curve as reduced
+from metalens.library import fit as proxy_fit
+from metalens.library.proxy import Proxy
+from metalens.library.record import DEFAULT_CELL, PillarLibrary, Sweep
 
 HARD = Cell(0.40, 0.7, Index(3.6))
 SPAN = (0.08, 0.32)

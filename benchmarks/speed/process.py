@@ -20,7 +20,7 @@ from layout.study import focus, stitching, tolerance
 from layout.study.sensitivity import LogSensitivities
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 from metalens.propagate import chief_path, field_at
 
 PROXY = Proxy(

@@ -33,7 +33,7 @@ _SOURCES = (
         "metalens.modal",
         "metalens.rcwa",
         "metalens.fabrication",
-        "metalens.pillars",
+        "metalens.library",
     ),
     *("characterize.model.solving", "characterize.model.pillar_slopes"),
 )

@@ -36,7 +36,7 @@ from metalens.fabrication import (
     transmission,
 )
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
 # wavelengths that t is interpolated between: it turns by less than one radian over the

@@ -23,7 +23,7 @@ from metalens.fabrication import (
     of_kind,
 )
 from metalens.lens import Lens
-from metalens.pillars import curve, engines
+from metalens.library import curve, engines
 
 # of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter
 # waves

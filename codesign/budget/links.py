@@ -32,7 +32,7 @@ from metalens.core.errors import CellError, LensError, PropagationError, SceneEr
 from metalens.design import neighbours as supercell
 from metalens.fabrication import State, biased, draws, sensitivity, transmission
 from metalens.lens import NeighbourRows
-from metalens.pillars import PillarLibrary, engines
+from metalens.library import PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again
 FINER = 30.0  # how much more precisely

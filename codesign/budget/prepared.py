@@ -30,7 +30,7 @@ from metalens.core.errors import LensError
 from metalens.fabrication import Printed
 from metalens.image import Grid, Imager, PsfBasis
 from metalens.lens import Lens
-from metalens.pillars import PillarLibrary
+from metalens.library import PillarLibrary
 from metalens.psf import Source
 
 

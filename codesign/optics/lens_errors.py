@@ -22,7 +22,7 @@ from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.fabrication import DRAWN, Draw, ResponseError, State, guide, of_kind
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
 _FIRST = (

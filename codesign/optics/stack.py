@@ -47,7 +47,7 @@ from metalens.image import (
     uniform_imager,
     view,
 )
-from metalens.pillars import DEFAULT_CELL, Proxy
+from metalens.library import DEFAULT_CELL, Proxy
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from metalens.core import config
 # settings file: (module, record, command that reads it)
 SETTINGS = {
     "CELL.toml": ("metalens.commands.library", "CellFile", "library"),
-    "STUDY.toml": ("metalens.pillars.study", "CellStudy", "study"),
+    "STUDY.toml": ("metalens.library.study", "CellStudy", "study"),
     "DESIGN.toml": ("metalens.commands.design", "DesignSettings", "design"),
     "PSF.toml": ("metalens.commands.psf", "PsfSettings", "psf"),
     "ARRANGEMENT.toml": ("layout.arrange", "Floorplan", "layout"),

@@ -27,7 +27,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import LensError, ProcessError
 from metalens.core.units import nm
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars.axes import cell_of_sizes
+from metalens.library.axes import cell_of_sizes
 
 _BLOCK_SITES = 1 << 20
 _FLAT = 1e-9

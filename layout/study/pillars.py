@@ -17,7 +17,7 @@ from metalens.fabrication import (
     transmission,
 )
 from metalens.lens import Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 
 class PillarKindsOfLens(Protocol):

@@ -12,8 +12,8 @@ import numpy as np
 from metalens.cell import Cell
 from metalens.commands.common import DistributedOptions
 from metalens.core import store
-from metalens.pillars import Sweep, axes
-from metalens.pillars.axes import AxesLibrary
+from metalens.library import Sweep, axes
+from metalens.library.axes import AxesLibrary
 
 LEAST_USABLE = 0.5  # of the pairs of sizes, below which a library is no library
 NM = 1e3

@@ -37,7 +37,7 @@ from metalens.design import (
 from metalens.design.free_form import FisherSettings, ResolvedFisherSettings
 from metalens.lens import Layers, Lens, check_gaps
 from metalens.lens import picture as lens_plot
-from metalens.pillars import PillarLibrary, axes
+from metalens.library import PillarLibrary, axes
 from metalens.psf import FocusMetrics
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from metalens.design import (
     Quality,
 )
 from metalens.lens import Layers, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import FocusMetrics
 
 

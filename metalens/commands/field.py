@@ -17,7 +17,7 @@ from metalens.core import config, reading, store
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import figure_png, make_figure
-from metalens.pillars import workers
+from metalens.library import workers
 from metalens.rcwa import FieldGrid, NearField, near_fields
 
 CUTS = {"xz": "y = 0", "yz": "x = 0"}

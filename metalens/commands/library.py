@@ -24,7 +24,7 @@ from metalens.commands import axes_library
 from metalens.commands.common import DistributedOptions, Output
 from metalens.core import config, reading, store
 from metalens.core.errors import DomainError
-from metalens.pillars import (
+from metalens.library import (
     DEFAULT_CELL,
     MOST_ERROR,
     PillarLibrary,
@@ -36,8 +36,8 @@ from metalens.pillars import (
     height_hint,
     workers,
 )
-from metalens.pillars import fit as proxy_fit
-from metalens.pillars.circular import GeometricPhase
+from metalens.library import fit as proxy_fit
+from metalens.library.circular import GeometricPhase
 
 MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
@@ -139,7 +139,7 @@ def _fit(made: PillarLibrary, wanted: ProxyTolerances) -> tuple[ProxyFit | None,
 
 
 def _draw(target: Path, made: PillarLibrary, fitted: ProxyFit | None) -> None:
-    from metalens.pillars import library_figure
+    from metalens.library import library_figure
 
     library_figure(target.with_suffix(".png"), made, fitted)
 

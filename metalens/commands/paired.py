@@ -20,7 +20,7 @@ from metalens.design import (
     PolarizationMetrics,
 )
 from metalens.lens import Layers, Lens, check_gaps
-from metalens.pillars import axes
+from metalens.library import axes
 from metalens.psf import FocusMetrics
 
 BOTH: tuple[Literal["x", "y"], ...] = ("x", "y")

@@ -11,7 +11,7 @@ from metalens.commands import design_words as words
 from metalens.core.errors import ConfigError
 from metalens.design import FocusCheck, Quality, WavelengthTarget
 from metalens.lens import Layers, Lens
-from metalens.pillars import PillarLibrary
+from metalens.library import PillarLibrary
 from metalens.psf import FocusMetrics
 
 

@@ -15,8 +15,8 @@ import tyro
 from metalens.commands.common import DistributedOptions, Output
 from metalens.core import config
 from metalens.core.units import nm
-from metalens.pillars import CellStudy, SweepJournal, study_plots
-from metalens.pillars import study as cell_study
+from metalens.library import CellStudy, SweepJournal, study_plots
+from metalens.library import study as cell_study
 
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 

@@ -16,7 +16,7 @@ from metalens.design import phase_map, profiles
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import DiameterMap, Hand, Lens
-from metalens.pillars import Proxy, height_hint
+from metalens.library import Proxy, height_hint
 
 PLACES, SEARCHED = (
     61,

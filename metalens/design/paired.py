@@ -17,7 +17,7 @@ from metalens.design.of_phase import Limits, MetricSums, Quality
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import Lens, TwoSizeTable
-from metalens.pillars.axes import AxesLibrary, cell_of_sizes
+from metalens.library.axes import AxesLibrary, cell_of_sizes
 
 _COVERED_RAD = (
     0.2  # a wanted pair of phases is covered where a pillar gives both within this, and

@@ -24,7 +24,7 @@ from metalens.design.of_phase import (
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 # of phase between diameters of the table, at any wavelength; a parabola finds what lies
 # between

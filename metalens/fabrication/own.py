@@ -12,7 +12,7 @@ from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.fabrication.perturbations import Perturbation, ResponseError, of_kind
-from metalens.pillars.axes import cell_of_sizes
+from metalens.library.axes import cell_of_sizes
 
 if TYPE_CHECKING:
     from metalens.lens import Lens

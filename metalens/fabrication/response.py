@@ -23,7 +23,7 @@ from metalens.fabrication.perturbations import (
 from metalens.fabrication.solved import Solved
 from metalens.fabrication.two_sizes import PairSensitivities
 from metalens.lens import Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 # steps in the wavelengths of a proxy, of which the last one gives the tangent at its
 # end

@@ -14,7 +14,7 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
 from metalens.lens.record import Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 Polynomials = tuple[
     float, float, int, float, Array, Array

@@ -11,7 +11,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError, LensError
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 NAMES = ("wavelength_um", "x_um", "y_um", "t")
 

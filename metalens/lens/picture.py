@@ -10,7 +10,7 @@ from metalens.cell.shapes import rotate_corners
 from metalens.core import report
 from metalens.core.arrays import Array
 from metalens.lens.record import Lens
-from metalens.pillars.axes import cell_of_sizes
+from metalens.library.axes import cell_of_sizes
 
 _PIXELS = 420  # along the longer side of the phase picture
 _ZOOM = 28  # pillars along the side of the zoom

@@ -21,7 +21,7 @@ from metalens.lens.layers import Layers, check_gaps
 from metalens.lens.neighbours import NeighbourRows
 from metalens.lens.pairs import TwoSizeTable
 from metalens.lens.rows import RowsOnDisk
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 _NAME = "diameter_um"
 Hand = Literal["", "left", "right"]

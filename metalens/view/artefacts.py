@@ -15,7 +15,7 @@ from metalens import psf
 from metalens.core import report, store
 from metalens.core.arrays import Array
 from metalens.core.errors import StoreError
-from metalens.pillars import axes
+from metalens.library import axes
 from metalens.view import standing
 from metalens.view.panels import (
     ClassMapPanel,

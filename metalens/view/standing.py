@@ -9,7 +9,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import axes
+from metalens.library import axes
 from metalens.view.panels import DrawingPanel, ImagePanel, OutlinePanel, SliderAxis
 
 MOST_DRAWN = 3_000_000  # pillars of a page; of a larger lens its middle is drawn

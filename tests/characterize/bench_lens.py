@@ -23,7 +23,7 @@ from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import Sensitivity
 from metalens.lens import Layers
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)
 VALUES = {

@@ -20,7 +20,7 @@ from metalens.cell.record import Cell, Index
 from metalens.core.store import Provenance
 from metalens.design.profiles import Focus
 from metalens.fabrication import sensitivity
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt;
 # |T| of 0.9 that varies a little

@@ -25,8 +25,8 @@ from metalens.core import store
 from metalens.core.errors import MetalensError
 from metalens.fabrication import Sensitivity
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
-from metalens.pillars.record import PillarLibrary, Sweep
+from metalens.library.proxy import Proxy
+from metalens.library.record import PillarLibrary, Sweep
 from metalens.psf import PsfStack
 
 CELL = Cell(pitch_um=0.30, pillar=Index(3.6))

@@ -15,7 +15,7 @@ from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Rin
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 PROXY = Proxy(
     np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01

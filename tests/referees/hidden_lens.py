@@ -9,7 +9,7 @@ import numpy as np
 
 from metalens import design
 from metalens.design import profiles
-from metalens.pillars.record import DEFAULT_CELL
+from metalens.library.record import DEFAULT_CELL
 from tests.referees import pillar_table
 from tests.referees.pillar_bench import Session
 

@@ -17,9 +17,9 @@ from scipy.interpolate import CubicSpline
 
 from metalens import library
 from metalens.core import store
-from metalens.pillars import fit as proxies
-from metalens.pillars.proxy import Proxy
-from metalens.pillars.record import DEFAULT_CELL, Sweep
+from metalens.library import fit as proxies
+from metalens.library.proxy import Proxy
+from metalens.library.record import DEFAULT_CELL, Sweep
 
 PATH = Path(__file__).with_name("pillar_table.json")
 HEIGHTS_UM = (0.664, 0.682, 0.7, 0.718, 0.736)

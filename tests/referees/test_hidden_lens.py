@@ -12,7 +12,7 @@ from characterize.inference.estimate import FitOptions
 from characterize.model import NAMES, UNFITTED, log_response_slopes
 from metalens import modal
 from metalens.core.errors import CaptureError, FitError
-from metalens.pillars.record import DEFAULT_CELL
+from metalens.library.record import DEFAULT_CELL
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_bench as bench
 from tests.referees import pillar_table

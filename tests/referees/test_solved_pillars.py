@@ -12,7 +12,7 @@ from characterize.model.pillars import PillarChange, PillarResponse
 from metalens import modal
 from metalens.cell import Index
 from metalens.fabrication import ResponseError, answer, named, transmission
-from metalens.pillars.record import DEFAULT_CELL
+from metalens.library.record import DEFAULT_CELL
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_table
 

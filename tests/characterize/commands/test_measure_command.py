@@ -21,7 +21,7 @@ from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Square
 from metalens.cli import main
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 
 def spots(folder, sigma_um, pixel_um=0.9):

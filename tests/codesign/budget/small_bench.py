@@ -16,7 +16,7 @@ from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
 from metalens.fabrication import Printed, Spread
 from metalens.lens import Layers, Lens, NeighbourRows
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 SLOPE = 55.0  # rad a um: phase of a pillar over its diameter, a straight line
 CELL = Cell(

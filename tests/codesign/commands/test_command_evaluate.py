@@ -11,7 +11,7 @@ import pytest
 from metalens import cli, design, lens
 from metalens.cell.record import Cell, Index
 from metalens.design.profiles import Focus
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 IDEAL = Proxy(
     np.array([[0.0, 3 * math.pi]]),

@@ -22,7 +22,7 @@ from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
 from metalens.image.pupil import Pupil
 from metalens.lens import Layers, Stop
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 RADIUS_UM = 150.0
 # pillars that give the phase of their diameter exactly: 3 turns over the domain, no

@@ -13,7 +13,7 @@ from codesign.optics import lens_errors
 from codesign.optics import stack as optics
 from codesign.optics.lens_errors import LensError, LensErrors
 from metalens.cell import Incidence, Index
-from metalens.pillars import DEFAULT_CELL, engines
+from metalens.library import DEFAULT_CELL, engines
 
 SETTINGS = optics.OpticsConfig()
 

@@ -20,7 +20,7 @@ from layout.formats import (
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 SIDES = {"a": 15, "b": 10}
 

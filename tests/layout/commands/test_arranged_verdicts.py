@@ -13,7 +13,7 @@ from layout.formats import CellContent, MaskAssembly, gdsii_write
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 PROXY = Proxy(
     np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01

@@ -23,7 +23,7 @@ from metalens.cell.record import Cell
 from metalens.core.errors import MaskFileError, ProcessError
 from metalens.lens import Layers, Stop
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from metalens.cell.record import Cell
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 PROXY = Proxy(
     np.array([[3.3, 3.3, 0.2]]),

@@ -13,7 +13,7 @@ from layout.study.focus import FocusWindow
 from metalens.cell import Cell, Film, Index
 from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Layers, Lens, Stop
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 from tests.referees import films, plain_sum
 
 RNG = np.random.default_rng(4)

@@ -21,7 +21,7 @@ from metalens.core.errors import ProcessError
 from metalens.core.report import Figure, Table
 from metalens.fabrication import ResponseError, Spread, draws, named, transmission
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 from tests.referees import plain_sum
 
 PROXY = Proxy(

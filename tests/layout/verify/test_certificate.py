@@ -21,7 +21,7 @@ from metalens.cell import Cell
 from metalens.core.errors import ProcessError
 from metalens.fabrication import Bias
 from metalens.lens.record import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from tests.referees import rims
 from tests.referees.verified import verify
 

@@ -16,7 +16,7 @@ from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
 from metalens.fabrication import Bias
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from tests.referees import plain_exposure
 from tests.referees.verified import verify
 

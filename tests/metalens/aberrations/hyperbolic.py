@@ -8,7 +8,7 @@ import numpy as np
 
 from metalens.cell import Cell, Film, Index
 from metalens.lens import DiameterMap, Layers, Lens, Stop
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from tests.referees import ray_trace
 
 WAVE, PITCH, RADIUS = 0.85, 0.42, 62.0

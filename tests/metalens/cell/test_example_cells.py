@@ -15,7 +15,7 @@ from metalens.cell.orders import check_subwavelength
 from metalens.cli import main
 from metalens.commands.library import CellFile
 from metalens.core import config
-from metalens.pillars import axes
+from metalens.library import axes
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"
 FILES = sorted(FOLDER.glob("*.toml"))

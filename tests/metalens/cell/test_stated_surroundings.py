@@ -14,7 +14,7 @@ from metalens.cli import main
 from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.core.errors import CellError
-from metalens.pillars.record import Sweep
+from metalens.library.record import Sweep
 
 COVER = Index(1.66)
 # n = 2.67 on itself at 527 nm: pitch 224 nm > 527 / 2.67 = 197 nm, < 527 nm in air

@@ -12,7 +12,7 @@ from metalens import rcwa
 from metalens.cell import Cell
 from metalens.cli import main
 from metalens.commands import axes_library
-from metalens.pillars import Sweep, axes
+from metalens.library import Sweep, axes
 from metalens.view import artefacts
 
 CELL = """

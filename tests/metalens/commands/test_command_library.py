@@ -12,7 +12,7 @@ from metalens.cli import main
 from metalens.commands import library as command
 from metalens.commands.library import CellFile
 from metalens.core import config
-from metalens.pillars.record import DEFAULT_CELL
+from metalens.library.record import DEFAULT_CELL
 
 QUICK = """
 [cell]

@@ -15,7 +15,7 @@ from metalens.cli import main
 from metalens.commands.psf import Options, PsfSettings
 from metalens.core.errors import ConfigError
 from metalens.lens import NeighbourRows
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 from metalens.psf import of_lens
 
 SETTINGS = """

@@ -18,7 +18,7 @@ from metalens.design import of_phase as design
 from metalens.design import phase_map
 from metalens.design.of_phase import Limits
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45))
 FOCUS = Focus(0.85, 2000.0, 20_000.0)

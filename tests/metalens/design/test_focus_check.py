@@ -11,7 +11,7 @@ from metalens import design
 from metalens.cell.record import Cell, Index
 from metalens.design.focus_check import check_focus
 from metalens.design.profiles import Focus, hyperbolic_phase
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45))
 FOCUS = Focus(0.85, 200.0, 2000.0)

@@ -13,8 +13,8 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import ConfigError, DomainError, LensError, PropagationError
 from metalens.design import Focus, Limits
-from metalens.pillars import Sweep
-from metalens.pillars.axes import AxesLibrary
+from metalens.library import Sweep
+from metalens.library.axes import AxesLibrary
 from metalens.view import standing
 
 X, Y, WAVELENGTH = np.linspace(0.1, 0.3, 81), np.linspace(0.12, 0.28, 65), 0.94

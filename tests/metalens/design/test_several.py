@@ -12,7 +12,7 @@ from metalens import cli, design
 from metalens.cell import Cell, Index
 from metalens.core.errors import DomainError, LensError
 from metalens.design import Focus, Limits, WavelengthTarget
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 CELL = Cell(0.35, 0.9, Index(2.4), Index(1.45))
 LIMITS = Limits(90, 60)

@@ -14,7 +14,7 @@ from metalens.cell.shapes import Square
 from metalens.core.errors import CellError
 from metalens.design import neighbours as supercell
 from metalens.design.profiles import Focus
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 from metalens.psf import among
 
 CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6), substrate="SiO2")

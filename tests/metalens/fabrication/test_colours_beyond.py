@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens.fabrication import designed
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 D = np.array([0.12, 0.17, 0.23])
 

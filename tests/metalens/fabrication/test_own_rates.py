@@ -20,7 +20,7 @@ from metalens.fabrication import (
     response,
 )
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.rcwa import jones, pattern
 
 WAVE, SIZE, RATIO, ANGLE = 0.85, 0.23, 0.62, 0.2

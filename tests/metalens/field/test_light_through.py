@@ -18,7 +18,7 @@ from metalens.field.plan import Plan
 from metalens.field.points import psfs
 from metalens.field.through import through
 from metalens.lens import Layers, Stop
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens
 
 GLASS = Layers(behind=(Film(Index(1.7), 110.0),))

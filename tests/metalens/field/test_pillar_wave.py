@@ -27,7 +27,7 @@ from metalens.field import (
 from metalens.field.texture import texture_error
 from metalens.image import integrate
 from metalens.lens import DiameterMap, Lens, NeighbourRows
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import View, from_lens
 
 PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15

@@ -15,7 +15,7 @@ from metalens.core.errors import DomainError
 from metalens.field import compiled
 from metalens.lens import DiameterMap, Lens, answers
 from metalens.lens.pairs import TwoSizeTable
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 DRAW = np.random.default_rng(17)
 SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array(

@@ -12,7 +12,7 @@ from metalens import lens as lenses
 from metalens.cell import Cell, Index
 from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, NeighbourRows
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 SINE, ASIDE = np.array([0.5, 0.25, 0.6, 0.35]), np.array([False, False, True, True])
 COVER = 1.3

@@ -10,7 +10,7 @@ import pytest
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.lens import DiameterMap, Lens, TwoSizeTable
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 DRAW = np.random.default_rng(23)
 X, Y, WAVES = (

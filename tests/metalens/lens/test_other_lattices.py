@@ -12,7 +12,7 @@ from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, export
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 PROXY = Proxy(
     np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.08, 0.32), (0.94, 0.94), 0.01, 0.01

@@ -9,7 +9,7 @@ import pytest
 
 from metalens.cell import Cell, Film, Index
 from metalens.lens import DiameterMap, Layers, Lens, Stop, reach
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 
 PROXY = Proxy(
     np.array([[3.0, 2.8, 0.3]]),

@@ -13,7 +13,7 @@ from metalens import lens as lenses
 from metalens.cell import Cell, Film, Index, Lattice
 from metalens.core.errors import PropagationError
 from metalens.lens import DiameterMap, Layers, Lens, Stop
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import directions, far_field
 from tests.referees import plain_sum
 

@@ -12,7 +12,7 @@ from scipy import special
 from metalens import design, lens, psf
 from metalens.cell.record import Cell
 from metalens.cli import main
-from metalens.pillars.proxy import Proxy
+from metalens.library.proxy import Proxy
 
 WAVE, PITCH, FOCAL, LEVEL = 0.78, 0.37, 210.0, 0.86
 PROXY = Proxy(

@@ -9,7 +9,7 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import Source, of_lens
 
 PHASE = np.array([[0.0, 1.15 * math.pi], [-0.4, -1.9]])

@@ -273,7 +273,7 @@ def test_polychromatic_psf_converges_with_the_nodes():
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens, answers
-    from metalens.pillars import Proxy
+    from metalens.library import Proxy
     from metalens.psf.of_lens import library_incidence
 
     angled = (

@@ -15,7 +15,7 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens, answers
-from metalens.pillars import Proxy
+from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
 from metalens.psf.of_lens import PILOT, light_shares, paths_um
 

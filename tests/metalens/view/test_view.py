@@ -18,7 +18,7 @@ from metalens.commands import view
 from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
 from metalens.design import make
-from metalens.pillars.record import PillarLibrary, Sweep
+from metalens.library.record import PillarLibrary, Sweep
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
 from metalens.view import (

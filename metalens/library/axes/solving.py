@@ -1,0 +1,317 @@
+"""Run a sweep over two sizes: solves where two interpolations disagree, until they
+agree; judged on pairs held out.
+"""
+
+import itertools
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from metalens.cell import Cell
+from metalens.core import config
+from metalens.core.arrays import Array
+from metalens.core.console import Console
+from metalens.core.store import Provenance
+from metalens.library import workers
+from metalens.library.axes.between import interpolate_table
+from metalens.library.axes.record import (
+    AxesLibrary,
+    cell_of_sizes,
+    check_axes_sweep,
+    is_exchange_symmetric,
+    size_ranges,
+)
+from metalens.library.record import Sweep
+from metalens.library.workers import SweepJournal
+
+FIRST, MOST, ADDED = (
+    7,
+    19,
+    2,
+)  # nodes along an axis: to begin with, at most, and more a round
+COARSEST = 5  # orders of the truncation
+MOST_ERROR = 2.0  # of an amplitude within 1
+LOOK = 61  # places along an axis where the interpolations are compared in between
+# of the pairs that may stay above the tolerance (resonances) when the search ends
+LEFT_OUT = 0.03
+SOLVER_SHARE = 0.6  # of the tolerance, for the solver
+HELD_OUT = (
+    24  # pairs; the bars are scaled by what half of them show, the other half judges
+)
+SPREAD, LEAST_WIDE = (
+    2.0,
+    0.5,
+)  # of the scale: over the largest error to bar of twelve pairs; the least that it may be
+_GOLDEN = (
+    0.7548776662466927,
+    0.5698402909980532,
+)  # of the plane: 1/g, 1/g², g³ = g + 1
+
+
+class SolvedPillar(NamedTuple):
+    """One pillar: (2, 2) Jones matrix and its error bar."""
+
+    t: Array
+    error: float
+
+
+class _Nodes:
+    """Exact solves of one wavelength, by pair of sizes; where the sizes may be
+    exchanged half of them follow.
+    """
+
+    def __init__(
+        self,
+        cell: Cell,
+        sweep: Sweep,
+        wavelength_um: float,
+        reach: int,
+        journal: SweepJournal,
+    ) -> None:
+        self._cell, self._wavelength, self._reach, self._journal = (
+            cell,
+            wavelength_um,
+            reach,
+            journal,
+        )
+        self.swaps, self._tolerance = is_exchange_symmetric(cell, sweep), sweep.bar
+        self._known: dict[tuple[float, float], SolvedPillar] = {}
+        self.solves = 0
+
+    def solve(
+        self, pairs: list[tuple[float, float]], console: Console, label: str
+    ) -> list[SolvedPillar]:
+        """Of every pair."""
+        left = list(
+            dict.fromkeys(
+                self._first(pair)
+                for pair in pairs
+                if self._first(pair) not in self._known
+            )
+        )
+        tasks = [
+            workers.jones_task(
+                cell_of_sizes(self._cell, x, y),
+                x,
+                self._wavelength,
+                tolerance=self._tolerance,
+                reach=self._reach,
+            )
+            for x, y in left
+        ]
+        for pair, result in zip(
+            left, self._journal.run(tasks, console, label), strict=True
+        ):
+            t = (np.array(result["t"]) @ (1, 1j)).reshape(2, 2)
+            self._known[pair] = SolvedPillar(t, max(result["error"]))
+        self.solves += len(left)
+        return [self._of(pair) for pair in pairs]
+
+    def _first(self, pair: tuple[float, float]) -> tuple[float, float]:
+        return (max(pair), min(pair)) if self.swaps else pair
+
+    def _of(self, pair: tuple[float, float]) -> SolvedPillar:
+        found = self._known[self._first(pair)]
+        return (
+            found
+            if self._first(pair) == pair
+            else SolvedPillar(found.t[::-1, ::-1], found.error)
+        )
+
+    def grid(
+        self, x: Array, y: Array, console: Console, label: str
+    ) -> tuple[Array, Array]:
+        """(m, n, 4) Jones matrices and (m, n) error bars on all pairs of nodes."""
+        made = self.solve([(float(a), float(b)) for a in x for b in y], console, label)
+        shape = len(x), len(y)
+        return np.array([one.t for one in made]).reshape(*shape, 4), np.array(
+            [one.error for one in made]
+        ).reshape(shape)
+
+
+def sweep_two_sizes(
+    cell: Cell,
+    settings: Sweep,
+    *,
+    console: Console | None = None,
+    checkpoint: Path | None = None,
+) -> AxesLibrary:
+    """Compute a library over two sizes.
+
+    Args:
+        settings: ``diameters_um`` and ``lengths_um`` are the ranges along x and y,
+            ``samples`` the entries along the
+            longer of them. console, checkpoint: as for :func:`metalens.library.sweep`.
+
+    Accuracy: the bar of an entry adds the truncation error of the solver, carried as a
+    small shift of the sizes, and
+        the disagreement of interpolations, scaled by what twelve pairs held out show;
+        ``held_out`` tells how far off
+        they and twelve more are.
+
+    Raises:
+        ConfigError, CellError, MaterialError: see
+            :func:`metalens.library.axes.check_axes_sweep`.
+    """
+    check_axes_sweep(cell, settings)
+    settings = settings.settled(cell)
+    console = console or Console(quiet=True)
+    journal = SweepJournal(checkpoint, cell, settings)
+    places = size_entries(settings)
+    reach = _reach(cell, settings)
+    t, error, held, solves = [], [], [], 0
+    for index, wavelength in enumerate(settings.wavelengths_um):
+        nodes = _Nodes(cell, settings, wavelength, reach, journal)
+        x, y = _lines(nodes, settings, console)
+        values, bars = nodes.grid(x, y, console, "pillars")
+        made = interpolate_table((x, y), values, places, tolerance=settings.bar)
+        judged = _held_out(nodes, places, made.value, made.doubt, console)
+        wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
+        bar = np.minimum(
+            wide * made.doubt + _carried((x, y), bars, places, made.value), MOST_ERROR
+        )
+        row, column = _spread(places)
+        judged[:, 3] = bar[row, column]
+        t.append(made.value.reshape(*made.doubt.shape, 2, 2))
+        error.append(bar)
+        held.append(np.insert(judged, 0, index, axis=1))
+        solves += nodes.solves
+    axes = np.array(settings.wavelengths_um), *places
+    about = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
+    found = np.concatenate(held)
+    library = AxesLibrary(
+        cell, settings, *axes, np.array(t), np.array(error), found, solves, reach, about
+    )
+    journal.finish()
+    return library
+
+
+def size_entries(sweep: Sweep) -> tuple[Array, Array]:
+    """Evenly spaced sizes along x and y, with one step; the shorter range may end
+    before its largest size.
+    """
+    spans = size_ranges(sweep)
+    step = max(high - low for low, high in spans) / (sweep.samples - 1)
+    x, y = (
+        low + step * np.arange(int((high - low) / step + 1e-9) + 1)
+        for low, high in spans
+    )
+    return np.minimum(x, spans[0][1]), np.minimum(
+        y, spans[1][1]
+    )  # the last one, to rounding
+
+
+def _reach(cell: Cell, sweep: Sweep) -> int:
+    """The least truncation whose bars meet the solver's share at four probes, or the
+    largest there is.
+    """
+    from metalens.rcwa import jones, most_harmonics
+
+    (x0, x1), (y0, y1) = size_ranges(sweep)
+    shares = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
+    sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
+    most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
+    for reach in range(min(COARSEST, most), most):
+        wanted = SOLVER_SHARE * sweep.bar
+        about = {"tolerance": wanted, "harmonics": reach}
+        if all(
+            jones(cell_of_sizes(cell, x, y), x, wavelength, **about).converged  # type: ignore[arg-type]
+            for x, y in sizes
+            for wavelength in sweep.wavelengths_um
+        ):
+            return reach
+    return most
+
+
+def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
+    """Nodes along x and y: Chebyshev's, and lines between them where the interpolations
+    disagree most.
+    """
+    spans = size_ranges(sweep)
+    angle = np.pi * np.arange(FIRST) / (FIRST - 1)
+    lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
+    look = np.linspace(*spans[0], LOOK), np.linspace(*spans[1], LOOK)
+    for made, span in zip(lines, spans, strict=True):
+        made[[0, -1]] = span
+    while True:
+        x, y = lines
+        values, _ = nodes.grid(x, y, console, "pillars")
+        doubt = interpolate_table((x, y), values, look, tolerance=sweep.bar).doubt
+        above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
+        if above <= LEFT_OUT or len(x) >= MOST:
+            return x, y
+        some = np.minimum(doubt, 10 * sweep.bar)  # a resonance is not chased for ever
+        profiles = [some.mean(axis=1), some.mean(axis=0)]
+        if nodes.swaps:
+            profiles = [profiles[0] + profiles[1]] * 2
+        lines = [_more(*pair) for pair in zip(lines, look, profiles, strict=True)]
+
+
+def _more(lines: Array, look: Array, profile: Array) -> Array:
+    """Nodes with some more, in the gaps over which the doubt adds up to most."""
+    for _ in range(ADDED):
+        gaps = [
+            float(profile[(look > a) & (look < b)].sum())
+            for a, b in itertools.pairwise(lines)
+        ]
+        worst = int(np.argmax(gaps))
+        lines = np.insert(lines, worst + 1, (lines[worst] + lines[worst + 1]) / 2)
+    return lines
+
+
+def _held_out(
+    nodes: _Nodes,
+    places: tuple[Array, Array],
+    value: Array,
+    doubt: Array,
+    console: Console,
+) -> Array:
+    """(k, 4) x, y, error and doubt of the interpolation at the entries that are held
+    out.
+    """
+    row, column = _spread(places)
+    pairs = [
+        (float(places[0][i]), float(places[1][j]))
+        for i, j in zip(row, column, strict=True)
+    ]
+    exact = np.array([one.t.ravel() for one in nodes.solve(pairs, console, "held out")])
+    missed = np.abs(value[row, column] - exact).max(axis=1)
+    return np.column_stack([np.array(pairs), missed, doubt[row, column]])
+
+
+def _spread(places: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Entries that spread over the plane (Roberts's sequence)."""
+    shares = np.mod(np.outer(np.arange(1, HELD_OUT + 1), _GOLDEN) + 0.5, 1)
+    row, column = (
+        np.minimum((shares[:, k] * len(places[k])).astype(int), len(places[k]) - 1)
+        for k in (0, 1)
+    )
+    return row, column
+
+
+def _carried(
+    nodes: tuple[Array, Array], bars: Array, places: tuple[Array, Array], value: Array
+) -> Array:
+    """(p, q) error of the solver between the nodes: a small shift of the sizes, so it
+    grows with the slope of t.
+    """
+    steep = np.zeros(value.shape[:2])
+    for axis in (0, 1):
+        rise = np.abs(np.gradient(value, places[axis], axis=axis)).max(axis=-1)
+        steep = np.hypot(steep, rise)
+    steep += 2 / (places[0][-1] - places[0][0])
+    place = [
+        np.interp(n, p, np.arange(len(p))) for n, p in zip(nodes, places, strict=True)
+    ]
+    at = np.stack(np.meshgrid(*place, indexing="ij"))
+    shift = bars / map_coordinates(steep, at, order=1)
+    corner = np.maximum.reduce(
+        [shift[:-1, :-1], shift[1:, :-1], shift[:-1, 1:], shift[1:, 1:]]
+    )
+    cell = [
+        np.clip(np.searchsorted(n, p, side="right") - 1, 0, len(n) - 2)
+        for n, p in zip(nodes, places, strict=True)
+    ]
+    return np.asarray(corner[cell[0][:, None], cell[1]] * steep)

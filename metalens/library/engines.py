@@ -1,0 +1,270 @@
+"""Which solver takes a pillar cell, and one whose error changes smoothly with the
+diameter.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import numpy as np
+
+from metalens.cell import Cell, Incidence, Response
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
+from metalens.library.curve import FIRST, starting_diameters
+
+PROBES = [
+    4,
+    7,
+    FIRST - 1,
+]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
+# that a curve takes: the one that serves most diameters, and what follows it beside a
+# resonance
+MESHES = 3
+# of the tolerance, half of an entry's: with the share of the fit the entry is still
+# within its own
+ENOUGH = 1.2
+Engine = Literal["auto", "rcwa", "modal"]
+
+
+def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
+    """``modal`` for round pillars on a square lattice (more precise, and faster where
+    upright), ``rcwa`` for others.
+
+    Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
+    """
+    if engine == "modal" and not cell.round:
+        raise CellError(
+            f"the modal engine takes round pillars on a square lattice, not {cell.described}: use 'rcwa'"
+        )
+    if engine == "auto":
+        return "modal" if cell.round else "rcwa"
+    return engine
+
+
+def solve_to_tolerance(
+    cell: Cell, light: Incidence, *, tolerance: float, engine: str
+) -> Callable[[float], Response]:
+    """Response at a diameter, refined until its own error estimate meets the tolerance."""
+    if engine == "modal":
+        return functools.partial(_modal, cell, light, tolerance)
+    return functools.partial(_rcwa, cell, light, tolerance, None)
+
+
+def solver_at_fixed_discretization(
+    cell: Cell,
+    light: Incidence,
+    span_um: tuple[float, float],
+    *,
+    tolerance: float,
+    engine: str,
+) -> Callable[[float], Response]:
+    """As :func:`solve_to_tolerance`, on one discretisation for all diameters of
+    ``span_um``, so
+    far as it goes.
+    """
+    return solvers_at_common_discretization(
+        cell, [light], span_um, tolerance=tolerance, engine=engine
+    )[0]
+
+
+def solvers_at_common_discretization(
+    cell: Cell,
+    lights: Sequence[Incidence],
+    span_um: tuple[float, float],
+    *,
+    tolerance: float,
+    engine: str,
+) -> list[Callable[[float], Response]]:
+    """:func:`solver_at_fixed_discretization` for several lights, on the discretisation
+    that all of them need.
+
+    It is the least that meets the tolerance at three probes, which a curve over the
+    span solves anyhow: answers are
+    remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is
+    reported), but it has no jumps that
+    a rational fit would take for resonances. Meshes of the modal method need meet it at
+    two of the probes: beside a
+    resonance, where the error is many times that elsewhere, the next mesh takes over.
+    The jump there is the true error
+    of the coarser mesh, some tenth of its bar.
+    """
+    if cell.height_um == 0 or (
+        engine == "modal" and not has_upright_walls(cell, engine)
+    ):
+        return [
+            functools.cache(
+                solve_to_tolerance(cell, light, tolerance=tolerance, engine=engine)
+            )
+            for light in lights
+        ]
+    make = _modal_levels if engine == "modal" else _rcwa_levels
+    of_lights = [
+        [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
+        for light in lights
+    ]
+    levels = list(zip(*of_lights, strict=True))
+    probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
+    allowed = 1 if engine == "modal" else 0
+    for place, level in enumerate(levels[:-1]):
+        if all(_failing(at, probes, allowed) <= allowed for at in level):
+            taken = levels[place : place + MESHES] if engine == "modal" else [level]
+            return [
+                _stepped(meshes, ENOUGH * tolerance)
+                for meshes in zip(*taken, strict=True)
+            ]
+    return list(levels[-1])
+
+
+def has_upright_walls(cell: Cell, engine: str) -> bool:
+    """Whether the modal engine solves the pillar by itself: its lights of one direction
+    then share modes and a mesh.
+    """
+    return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
+
+
+def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
+    """Whether :func:`solver_at_fixed_discretization` took the finest discretisation
+    there is, by the errors of
+    the nodes that came of it (the
+    first ones as a curve begins with): a pillar solved by itself has no less error
+    then."""
+    return not cell.round and bool(errors[PROBES].max() > tolerance)
+
+
+def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:
+    """How many probes miss the tolerance, counted no further than one more than are
+    allowed.
+    """
+    failing = 0
+    for diameter_um in probes:
+        failing += not at(diameter_um).converged
+        if failing > allowed:
+            break
+    return failing
+
+
+def _stepped(
+    meshes: Sequence[Callable[[float], Response]], enough: float
+) -> Callable[[float], Response]:
+    """:func:`_met`, remembered; between two diameters that needed a finer mesh, beside
+    a resonance, that one begins.
+    """
+    needed: dict[float, int] = {}
+
+    @functools.cache
+    def at(diameter_um: float) -> Response:
+        below = max((known for known in needed if known < diameter_um), default=None)
+        above = min((known for known in needed if known > diameter_um), default=None)
+        begin = (
+            0 if below is None or above is None else min(needed[below], needed[above])
+        )
+        needed[diameter_um], found = _met(meshes, diameter_um, enough, begin)
+        return found
+
+    return at
+
+
+def _met(
+    meshes: Sequence[Callable[[float], Response]],
+    diameter_um: float,
+    enough: float,
+    begin: int = 0,
+) -> tuple[int, Response]:
+    """Of the first mesh from ``begin`` on that meets the tolerance at this diameter,
+    else of the best; its place first.
+
+    The third costs several times as much as both before, and is asked where neither has
+    an error of ``enough`` or less.
+    """
+    tried: list[tuple[int, Response]] = []
+    for place in range(begin, len(meshes)):
+        if place > 1 and any(made.t_error <= enough for _, made in tried):
+            break
+        tried.append((place, meshes[place](diameter_um)))
+        if tried[-1][1].converged:
+            return tried[-1]
+    return min(tried, key=lambda made: made[1].t_error)
+
+
+def _modal_levels(
+    cell: Cell, light: Incidence, largest_um: float, tolerance: float
+) -> list[Callable[[float], Response]]:
+    """One mesh a level: the one that the ladder takes for the largest diameter."""
+    from metalens.modal import RUNGS, MeshLevel, case_of, first_rung, solve_on_mesh
+
+    def level(rung: MeshLevel) -> Callable[[float], Response]:
+        mesh = rung.choice(largest_um / cell.pitch_um)
+
+        def at(diameter_um: float) -> Response:
+            case = case_of(cell, diameter_um, light)
+            made = solve_on_mesh(case, mesh.plan, weak=rung.weak)
+            error = rung.error(made, case.rho, mesh=mesh)
+            t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
+            return Response(
+                t,
+                r,
+                error,
+                made.unknowns,
+                made.energy,
+                "modal",
+                error <= tolerance,
+                f"mesh {rung.name}",
+            )
+
+        return at
+
+    return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
+
+
+def _rcwa_levels(
+    cell: Cell, light: Incidence, largest_um: float, tolerance: float
+) -> list[Callable[[float], Response]]:
+    reaches: tuple[int, ...] = (6, 8, 10, 12, 14)
+    if not cell.round:
+        from metalens.rcwa import most_harmonics
+
+        most = most_harmonics(
+            cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
+        )
+        reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
+    return [
+        functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches
+    ]
+
+
+def _modal(
+    cell: Cell, light: Incidence, tolerance: float, diameter_um: float
+) -> Response:
+    from metalens import modal
+
+    return modal.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        azimuth_rad=light.azimuth_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+    )
+
+
+def _rcwa(
+    cell: Cell,
+    light: Incidence,
+    tolerance: float,
+    harmonics: int | None,
+    diameter_um: float,
+) -> Response:
+    from metalens import rcwa
+
+    return rcwa.solve(
+        cell,
+        diameter_um,
+        light.wavelength_um,
+        angle_rad=light.angle_rad,
+        azimuth_rad=light.azimuth_rad,
+        polarization=light.polarization,
+        tolerance=tolerance,
+        harmonics=harmonics,
+    )

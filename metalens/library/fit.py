@@ -1,0 +1,468 @@
+"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least
+coefficients in tolerance.
+"""
+
+import contextlib
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
+from metalens.library import polynomial
+from metalens.library.proxy import Proxy
+from metalens.library.record import PillarLibrary
+from metalens.library.stretch import (
+    LEAST_ENTRIES,
+    MonotonicBranch,
+    longest_monotonic_branch,
+)
+
+TURN = 2 * math.pi
+FOLLOWED, KNOWN_SHARE = (
+    1e-3,
+    0.5,
+)  # deviation from entries where none is stated, and that of the entries' own bars
+EXCLUDED = (
+    0.1  # of the phase that a domain may lose beside a resonance for its tolerances
+)
+POWERS = (3, 2, 1)
+HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
+MOST_TERMS = 24  # coefficients in the diameter of one curve
+TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
+MOST_NODES = 5  # coefficients in the wavelength, and in the angle
+
+
+@dataclass(frozen=True, slots=True)
+class ProxyTolerances:
+    """What a proxy must meet.
+
+    phase_tolerance_rad, transmission_tolerance: largest deviation from the library
+    entries; left out, 1e-3, or half
+        of what the entries' own error bars say on the domain where that is more.
+    coefficients: real ones, of phase and |T| together at one wavelength and angle; more
+    are taken only where
+        fewer would leave less than a full turn.
+    least_transmission: a domain ends where |t| falls below.
+    least_half_width_um: a domain ends at resonances narrower than this: a pillar so
+    little off would jump.
+    within_um: (least, largest) diameter to consider; all entries without it.
+    """
+
+    phase_tolerance_rad: float | None = field(default=None, metadata={"above": 0})
+    transmission_tolerance: float | None = field(default=None, metadata={"above": 0})
+    coefficients: int = field(default=24, metadata={"above": 0})
+    least_transmission: float = 0.7
+    least_half_width_um: float = 0.005
+    within_um: tuple[float, float] | None = None
+
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """Of phase (rad) and |T|."""
+        return (
+            self.phase_tolerance_rad or FOLLOWED,
+            self.transmission_tolerance or FOLLOWED,
+        )
+
+    def settled(self, entry_error: float) -> "ProxyTolerances":
+        """What is left out, by the errors of the entries themselves: no curve need
+        follow what is not known.
+        """
+        usual = max(FOLLOWED, KNOWN_SHARE * entry_error)
+        phase, level = (
+            self.phase_tolerance_rad or usual,
+            self.transmission_tolerance or usual,
+        )
+        return dataclasses.replace(
+            self, phase_tolerance_rad=phase, transmission_tolerance=level
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FitTrial:
+    """One line of the table of error against coefficients."""
+
+    coefficients: int
+    power: int
+    phase_error_rad: float
+    transmission_error: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ProxyFit:
+    """A proxy and why it is as it is.
+
+    notes: where its domain was cut, and why. table: error against the number of
+    coefficients on that domain.
+    turns: covered by the domain, the least over wavelengths and angles.
+    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their
+    mean.
+    shortfall: by how much the proxy misses the tolerances that were wanted, for a
+    person; empty where it meets them.
+    smooth_turns: covered by the diameters without resonance, as far as the proxy or
+    not.
+    """
+
+    proxy: Proxy
+    notes: tuple[str, ...]
+    table: tuple[FitTrial, ...]
+    turns: float
+    polarization_spread: float
+    shortfall: str
+    smooth_turns: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FitData:
+    """What is fitted: phase and |T| (angle, wavelength, diameter), and the coordinates."""
+
+    phase: Array
+    level: Array
+    diameter: Array
+    wavelength: Array
+    angle: Array
+
+
+def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
+    """The proxy of a library.
+
+    Every other diameter is fitted (least largest deviation, by Lawson's weights), all
+    are judged: half of them
+    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have
+    their own polynomials in
+    diameter^power; |T| is scaled until its certified bound lies below 1. Where so few
+    entries allow only a
+    domain that misses the tolerances, ``shortfall`` says so.
+
+    Raises:
+        DomainError: no stretch of diameters without resonance holds enough entries.
+    """
+    wanted = wanted or ProxyTolerances()
+    found = _fitted(library, wanted, across_resonances=False)
+    if any(width < wanted.least_half_width_um for *_, width in library.resonances):
+        with contextlib.suppress(DomainError):
+            across = _fitted(library, wanted, across_resonances=True)
+            crosses = bool(across.proxy.gaps_um) and not across.shortfall
+            if crosses and across.turns > found.turns:
+                return across
+    return found
+
+
+def _fitted(
+    library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool
+) -> ProxyFit:
+    """The proxy on one side of all narrow resonances, or across them."""
+    smooth = longest_monotonic_branch(
+        library,
+        least_transmission=wanted.least_transmission,
+        least_half_width_um=wanted.least_half_width_um,
+        within_um=wanted.within_um,
+        across_resonances=across_resonances,
+    )
+    wanted = wanted.settled(entry_error(library, smooth.diameter_um))
+    data = FitData(
+        smooth.phase,
+        smooth.level,
+        smooth.diameter_um,
+        library.wavelength_um,
+        library.angle_rad,
+    )
+    kept, proxy, terms = _followed(data, wanted)
+    low, high = proxy.domain_um
+    proxy = dataclasses.replace(
+        proxy,
+        entry_error=entry_error(library, kept.diameter),
+        gaps_um=tuple((a, b) for a, b in smooth.gaps_um if low < a and b < high),
+    )
+    counts = range(4, max(18, 2 * terms + 5), 2)
+    trials = (
+        _trial(kept, proxy.power, count)
+        for count in counts
+        if count // 2 < len(kept.diameter) // 3
+    )
+    table = tuple(trial for trial in trials if trial is not None)
+    notes = _notes(smooth, data, kept, terms)
+    short = (
+        TURNS_BACK
+        if math.isinf(_cost(proxy, wanted))
+        else tolerance_shortfall(proxy, wanted)
+    )
+    return ProxyFit(
+        proxy,
+        notes,
+        table,
+        _turns(kept),
+        smooth.polarization_spread,
+        short,
+        _turns(data),
+    )
+
+
+def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
+    """Root mean square of the error bars of t, relative to |t|, of the entries at some
+    of a library's diameters.
+    """
+    some = np.isin(library.diameter_um, diameter_um)
+    return float(
+        np.sqrt(np.mean((library.t_error / np.abs(library.t))[..., some] ** 2))
+    )
+
+
+def _followed(data: FitData, wanted: ProxyTolerances) -> tuple[FitData, Proxy, int]:
+    """The domain that a proxy follows, and its number of coefficients: those wanted;
+    more where a full turn takes them;
+    fewer where so few entries let those wanted swing between them."""
+    terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
+    kept, proxy = _longest(data, wanted, terms)
+    while more < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
+        more += 2
+        with contextlib.suppress(
+            DomainError
+        ):  # more coefficients than so few entries bear: those before stand
+            longer, better = _longest(data, wanted, more)
+            if _cost(better, wanted) <= 1 and len(longer.diameter) > len(kept.diameter):
+                kept, proxy, terms = longer, better, more
+    for fewer in range(terms - 1, 1, -1) if _cost(proxy, wanted) > 1 else ():
+        other = _best(kept, wanted, fewer)
+        if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
+            proxy, terms = other, fewer
+    shorter = _shorter(kept, wanted, terms) if _cost(proxy, wanted) > 1 else None
+    return shorter or (kept, proxy, terms)
+
+
+def _shorter(
+    data: FitData, wanted: ProxyTolerances, terms: int
+) -> tuple[FitData, Proxy, int] | None:
+    """Without the last diameters, beside what bounds the domain, where the tolerances
+    are met so; they are excluded as
+    the resonance is, up to a tenth of the phase. None where that is not enough."""
+    for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
+        some = _head(data, count)
+        if _turns(some) < (1 - EXCLUDED) * _turns(data):
+            return None
+        fewer = min(terms, count // 3)
+        other = _best(some, wanted, fewer)
+        if other is not None and _cost(other, wanted) <= 1:
+            return some, other, fewer
+    return None
+
+
+def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> Proxy:
+    """The proxy of a library alone; :func:`fit` gives its table of error against
+    coefficients too.
+    """
+    return fit(library, wanted).proxy
+
+
+def proxy_of(library: PillarLibrary) -> Proxy:
+    """The proxy that a library holds, fitted now where it holds none.
+
+    Raises:
+        DomainError: no proxy fits; a library for circular light holds none (it is
+            fitted where that is swept).
+    """
+    if library.proxy is None and library.sweep.light == "circular":
+        raise DomainError(
+            "a library for circular light without a proxy: make it with 'metalens library'"
+        )
+    return library.proxy if library.proxy is not None else fit_proxy(library)
+
+
+def _longest(
+    data: FitData, wanted: ProxyTolerances, terms: int
+) -> tuple[FitData, Proxy]:
+    """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
+    tolerances.
+    """
+    good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
+    best = _best(_head(data, good), wanted, terms)
+    if best is None:
+        raise DomainError(
+            f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
+            f"{data.diameter[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+        )
+    while bad - good > 1:
+        middle = (
+            (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
+        )
+        trial = _best(_head(data, middle), wanted, terms)
+        if trial is not None and _cost(trial, wanted) <= 1:
+            good, best = middle, trial
+        else:
+            bad = middle
+    return _head(data, good), best
+
+
+def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
+    """By how much a proxy misses its tolerances, for a person; empty where it meets
+    them.
+    """
+    if tolerance_ratio(proxy, wanted) <= 1:
+        return ""
+    phase, level = wanted.tolerances
+    return (
+        f"the proxy follows the phase within {proxy.max_phase_error_rad:.3g} rad and |T| within "
+        f"{proxy.max_transmission_error:.3g}, where {phase:.3g} and {level:.3g} are wanted: sweep with more samples, "
+        "or loosen phase_tolerance_rad and transmission_tolerance"
+    )
+
+
+def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
+    """The larger error in units of its tolerance."""
+    phase, level = wanted.tolerances
+    return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
+
+
+def _best(data: FitData, wanted: ProxyTolerances, terms: int) -> Proxy | None:
+    """Of the powers of the diameter, the one with the least error in units of the
+    tolerances; None where each takes
+    |T| below 0 between the entries."""
+    found = []
+    for power in POWERS:
+        with contextlib.suppress(DomainError):
+            found.append(fit_terms(data, power, terms))
+    return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
+
+
+def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
+    """As :func:`tolerance_ratio`; infinite where the phase turns back (the library's
+    does not).
+    """
+    middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
+    monotone = all(
+        proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}
+    )
+    return tolerance_ratio(proxy, wanted) if monotone else math.inf
+
+
+def fit_terms(data: FitData, power: int, terms: int) -> Proxy:
+    """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
+    many for |T|.
+    """
+    axes = _axes(data, power)
+    phase = _minimax(axes, data.phase, terms)
+    level = _minimax(axes, data.level, terms)
+    high = polynomial.certified_bounds(level, points=64 if level.size > terms else 512)[
+        1
+    ]
+    if high > 1 - HEADROOM:
+        level = level * ((1 - HEADROOM) / high)
+    errors = [
+        float(np.abs(_evaluate(axes, c) - values).max())
+        for c, values in ((phase, data.phase), (level, data.level))
+    ]
+    flat = len(data.angle) == 1
+    return Proxy(
+        phase[0] if flat else phase,
+        level[0] if flat else level,
+        (float(data.diameter[0]), float(data.diameter[-1])),
+        (float(data.wavelength[0]), float(data.wavelength[-1])),
+        errors[0],
+        errors[1],
+        power,
+        0.0 if flat else float(data.angle[-1]),
+    )
+
+
+def _axes(data: FitData, power: int) -> tuple[Array, Array, Array]:
+    """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
+    sine = np.sin(data.angle) ** 2
+    return (
+        2 * sine / sine[-1] - 1 if len(sine) > 1 else np.zeros(1),
+        _unit(data.wavelength) if len(data.wavelength) > 1 else np.zeros(1),
+        _unit(data.diameter**power),
+    )
+
+
+def _unit(values: Array) -> Array:
+    return np.asarray((2 * values - values[0] - values[-1]) / (values[-1] - values[0]))
+
+
+def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
+    a, w, d = (
+        chebyshev.chebvander(x, n - 1)
+        for x, n in zip(axes, coefficients.shape, strict=True)
+    )
+    return np.asarray(
+        np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True)
+    )
+
+
+def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
+    """Tensor coefficients: every curve by itself in the diameter, then its coefficients
+    in wavelength and angle.
+
+    Up to five wavelengths or angles are met exactly by polynomials of them, more by
+    least squares.
+    """
+    curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
+    for axis in (0, 1):
+        basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), MOST_NODES) - 1)
+        curves = np.moveaxis(
+            np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis
+        )
+    return curves
+
+
+def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
+    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson
+    1961: weights times
+    deviation)."""
+    weight = np.ones(values.shape)
+    best, least = (
+        np.zeros((*values.shape[:-1], basis.shape[1])),
+        np.full(values.shape[:-1], np.inf),
+    )
+    for _ in range(rounds):
+        root = np.sqrt(weight)[..., None]
+        q, r = np.linalg.qr(basis * root)
+        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[
+            ..., 0
+        ]
+        off = np.abs(np.einsum("nk,...k->...n", basis, c) - values)
+        worst = off.max(axis=-1)
+        better = worst < least
+        best[better], least[better] = c[better], worst[better]
+        weight *= off / np.maximum(worst, 1e-300)[..., None] + 1e-9
+        weight /= weight.sum(axis=-1, keepdims=True)
+    return best
+
+
+def _trial(data: FitData, power: int, coefficients: int) -> FitTrial | None:
+    """One line of the table; None where |T| falls below 0 between the entries."""
+    try:
+        proxy = fit_terms(data, power, coefficients // 2)
+    except DomainError:
+        return None
+    return FitTrial(
+        coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error
+    )
+
+
+def _head(data: FitData, count: int) -> FitData:
+    return FitData(
+        data.phase[..., :count],
+        data.level[..., :count],
+        data.diameter[:count],
+        data.wavelength,
+        data.angle,
+    )
+
+
+def _turns(data: FitData) -> float:
+    return float(abs(data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
+
+
+def _notes(
+    smooth: MonotonicBranch, data: FitData, kept: FitData, terms: int
+) -> tuple[str, ...]:
+    if len(kept.diameter) == len(data.diameter):
+        return smooth.notes
+    return (
+        *smooth.notes,
+        f"cut at {kept.diameter[-1]:.4f} um: up to {data.diameter[-1]:.4f} um the phase is smooth, but {2 * terms} "
+        "coefficients do not describe it within the tolerances",
+    )

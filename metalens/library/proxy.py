@@ -1,0 +1,310 @@
+"""Polynomial proxy of the pillar library: diameter, wavelength and angle to phase and
+transmission (paper Eq. 2).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from metalens.core.arrays import Array
+from metalens.core.errors import DomainError
+from metalens.library import inverse, polynomial
+from metalens.library.inverse import Values
+
+AVERAGED = 65  # diameters over which |t| is averaged
+# of t: the largest tolerance of a library; pillars known less well (root mean square)
+# make no lens
+MOST_ERROR = 0.1
+
+
+def height_hint(height_um: float, turns: float) -> str:
+    """What would cover a turn of phase where pillars of this height cover less
+    (``turns``), for a person.
+    """
+    return (
+        f"take pillars of about {height_um / max(turns, 0.05):.3g} um ({height_um:g} um now; phase grows with the "
+        "height as long as no resonance comes in), or a material of higher index"
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Proxy:
+    """Phase and |T| as polynomials of diameter, wavelength and angle, with the error
+    seen on held-out entries.
+
+    phase_coefficients: ([angle degree + 1,] wavelength degree + 1, diameter degree + 1)
+    Chebyshev coefficients
+        of the phase in rad.
+    transmission_coefficients: as above, of |T|; certified to stay within [0, 1] on the
+    domain.
+    domain_um: (least, largest) diameter.
+    wavelengths_um: (least, largest) wavelength; equal where the proxy holds at one
+    wavelength.
+    max_phase_error_rad, max_transmission_error: largest deviation from held-out library
+    entries.
+    power: the polynomials run in diameter^power.
+    max_angle_rad: largest angle of incidence in air; the polynomials run in the square
+    of its sine.
+    entry_error: what the entries may be wrong by themselves, relative to |t|: their
+    error bars' root mean square.
+    gaps_um: (least, largest) diameters around narrow resonances inside the domain,
+    which :meth:`diameter_um` never returns.
+
+    Raises:
+        DomainError: |T| leaves [0, 1] inside the domain, or an empty domain.
+    """
+
+    phase_coefficients: Array
+    transmission_coefficients: Array
+    domain_um: tuple[float, float]
+    wavelengths_um: tuple[float, float]
+    max_phase_error_rad: float
+    max_transmission_error: float
+    power: int = 1
+    max_angle_rad: float = 0.0
+    entry_error: float = 0.0
+    gaps_um: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        low, high = self.domain_um
+        if not 0 <= low < high < math.inf:
+            raise DomainError(
+                f"proxy domain is {self.domain_um} um, need 0 <= least < largest"
+            )
+        least, most = polynomial.certified_bounds(self.transmission_coefficients)
+        slack = (
+            3e-3 * (most - least) + 1e-12
+        )  # the width of the certificate, not of the polynomial
+        if not (least >= -slack and most <= 1 + slack):
+            raise DomainError(
+                f"|T| of the proxy runs from {least:.6f} to {most:.6f}, need 0 to 1: fit it again"
+            )
+
+    def phase_rad(
+        self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
+    ) -> Values:
+        """Phase of pillars in rad, unwrapped along the diameter; shape, dtype and
+        device of ``diameter_um``.
+
+        Torch tensors carry exact derivatives in the diameter, of any order.
+
+        Raises:
+            DomainError: a diameter, the wavelength or the angle lies outside the
+                proxy's domain.
+        """
+        return self._verb(
+            "evaluate_curve", self.at(wavelength_um, angle_rad), diameter_um
+        )
+
+    def transmission(
+        self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
+    ) -> Values:
+        """Magnitude |T| in [0, 1]; otherwise as :meth:`phase_rad`."""
+        return self._verb(
+            "evaluate_curve", self.level_at(wavelength_um, angle_rad), diameter_um
+        )
+
+    def dphase_ddiameter(
+        self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
+    ) -> Values:
+        """Slope of the phase, rad/um; otherwise as :meth:`phase_rad`."""
+        return self._verb(
+            "evaluate_slope", self.at(wavelength_um, angle_rad), diameter_um
+        )
+
+    def dtransmission_ddiameter(
+        self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
+    ) -> Values:
+        """Slope of |T|, 1/um; otherwise as :meth:`phase_rad`."""
+        curve = self._curve(self.transmission_coefficients, wavelength_um, angle_rad)
+        return self._verb("evaluate_slope", curve, diameter_um)
+
+    def diameter_um(
+        self,
+        phase_rad: Values,
+        wavelength_um: float,
+        *,
+        angle_rad: float = 0.0,
+        within_um: tuple[float, float] | None = None,
+        gap: Literal["refuse", "nearest"] = "refuse",
+    ) -> Values:
+        """Diameter of the pillar with a phase, any phase taken modulo 2 pi into the
+        domain.
+
+        Args:
+            within_um: (least, largest) diameter to use; the whole domain without it.
+                Where it covers more
+                than a turn the end with the lesser phase is used: move ``within_um`` to
+                choose the branch.
+            gap: what to do with a phase that no pillar has (less than a turn covered).
+
+        Accuracy:
+            phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
+            gradients are exact. A diameter in one of ``gaps_um`` moves to its nearer
+            end.
+
+        Raises:
+            DomainError: the phase is not monotone within ``within_um``, or no pillar
+                has a phase.
+        """
+        return inverse.invert_phase(
+            self.at(wavelength_um, angle_rad),
+            phase_rad,
+            within_um=within_um,
+            gap=gap,
+            excluded_um=self.gaps_um,
+        )
+
+    def coverage_rad(
+        self,
+        wavelength_um: float,
+        angle_rad: float = 0.0,
+        within_um: tuple[float, float] | None = None,
+    ) -> float:
+        """Phase range between the ends of ``within_um`` (the whole domain without it)."""
+        ends = self.phase_rad(
+            np.array(within_um or self.domain_um), wavelength_um, angle_rad
+        )
+        return float(abs(ends[1] - ends[0]))
+
+    def error(self, wavelength_um: float) -> float:
+        """What t by the curves may be wrong by, relative to its mean: deviation from
+        entries, and the entries' own.
+        """
+        level = np.asarray(
+            self.transmission(np.linspace(*self.domain_um, AVERAGED), wavelength_um)
+        ).mean()
+        return math.hypot(
+            self.max_phase_error_rad,
+            self.max_transmission_error / float(level),
+            self.entry_error,
+        )
+
+    @property
+    def doubt(self) -> str:
+        """Why no lens is to be made of these pillars, for a person: how little a solver
+        knows of them; else empty.
+
+        Not for the curve's own deviation: that is the tolerances' of a fit.
+        """
+        if self.entry_error <= MOST_ERROR:
+            return ""
+        return (
+            f"the pillars' own error bars are {self.entry_error:.2g} of |t| (root mean square), {MOST_ERROR:g} at the "
+            "most for a lens: take lower pillars, a smaller pitch, or a shape with fewer corners and with mirrors "
+            "along x and y, which its solver knows better"
+        )
+
+    def monotone(
+        self,
+        wavelength_um: float,
+        angle_rad: float = 0.0,
+        within_um: tuple[float, float] | None = None,
+    ) -> bool:
+        """Whether the phase rises or falls throughout: no root of its slope lies inside
+        (certified, not sampled).
+        """
+        return polynomial.is_monotonic(
+            self.at(wavelength_um, angle_rad), within_um or self.domain_um
+        )
+
+    def at(
+        self, wavelength_um: float, angle_rad: float = 0.0
+    ) -> polynomial.ChebyshevCurve:
+        """The phase as a curve of the diameter alone."""
+        return self._curve(self.phase_coefficients, wavelength_um, angle_rad)
+
+    def level_at(
+        self, wavelength_um: float, angle_rad: float = 0.0
+    ) -> polynomial.ChebyshevCurve:
+        """|T| as a curve of the diameter alone."""
+        return self._curve(
+            self.transmission_coefficients, wavelength_um, angle_rad, ceiling=1.0
+        )
+
+    def _curve(
+        self,
+        coefficients: Array,
+        wavelength_um: float,
+        angle_rad: float,
+        ceiling: float = math.inf,
+    ) -> polynomial.ChebyshevCurve:
+        if coefficients.ndim == 3:
+            coefficients = np.asarray(
+                chebyshev.chebval(self._angle_unit(angle_rad), coefficients)
+            )
+        elif angle_rad:
+            raise DomainError(
+                f"angle {angle_rad} rad, but the proxy holds at normal incidence only"
+            )
+        low, high = self.wavelengths_um
+        if not low - 1e-9 <= wavelength_um <= high + 1e-9:
+            raise DomainError(
+                f"wavelength {wavelength_um:.7g} um, but the proxy holds from {low:.7g} to {high:.7g} um: sweep a "
+                "library over the wavelengths ([sweep] wavelengths_um)"
+            )
+        unit = 0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
+        row = np.asarray(chebyshev.chebval(unit, coefficients))
+        return polynomial.chebyshev_curve(row, self.domain_um, self.power, ceiling)
+
+    def _angle_unit(self, angle_rad: float) -> float:
+        if not abs(angle_rad) <= self.max_angle_rad + 1e-9:
+            raise DomainError(
+                f"angle {angle_rad} rad, but the proxy holds up to {self.max_angle_rad} rad"
+            )
+        return min(
+            1.0, 2 * (math.sin(angle_rad) / math.sin(self.max_angle_rad)) ** 2 - 1
+        )
+
+    def _verb(
+        self, verb: str, p: polynomial.ChebyshevCurve, diameter_um: Values
+    ) -> Values:
+        if _is_torch(diameter_um):
+            from metalens.library import polynomial_torch
+
+            return cast(Values, getattr(polynomial_torch, verb)(p, diameter_um))
+        array = np.asarray(diameter_um)
+        array = array if array.dtype.kind == "f" else array.astype(float)
+        return cast(Values, getattr(polynomial, verb)(p, array)[()])
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Everything as arrays, for a store file."""
+        return {
+            "phase_coefficients": self.phase_coefficients,
+            "transmission_coefficients": self.transmission_coefficients,
+            "domain_um": np.array(self.domain_um),
+            "wavelengths_um": np.array(self.wavelengths_um),
+            "max_error": np.array(
+                [self.max_phase_error_rad, self.max_transmission_error]
+            ),
+            "power": np.array(self.power),
+            "max_angle_rad": np.array(self.max_angle_rad),
+            "entry_error": np.array(self.entry_error),
+            "gaps_um": np.array(self.gaps_um, float).reshape(-1, 2),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Array]) -> "Proxy":
+        """Inverse of :meth:`to_arrays`."""
+        domain, waves, error = (
+            arrays[k].tolist() for k in ("domain_um", "wavelengths_um", "max_error")
+        )
+        return cls(
+            arrays["phase_coefficients"],
+            arrays["transmission_coefficients"],
+            (domain[0], domain[1]),
+            (waves[0], waves[1]),
+            error[0],
+            error[1],
+            int(arrays["power"]),
+            float(arrays["max_angle_rad"]),
+            float(arrays["entry_error"]),
+            tuple((low, high) for low, high in arrays["gaps_um"].tolist()),
+        )
+
+
+def _is_torch(values: object) -> bool:
+    return type(values).__module__.partition(".")[0] == "torch"

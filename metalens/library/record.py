@@ -1,0 +1,372 @@
+"""The pillar library: response over diameter, wavelength, angle and polarisation, an
+error bar on every entry.
+"""
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
+from metalens.core import config, store
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.core.reading import typed_reader
+from metalens.core.store import Provenance
+from metalens.library.circular import GeometricPhase
+from metalens.library.circular import check_geometric_phase as check_turned
+from metalens.library.proxy import MOST_ERROR, Proxy
+
+# Hydrogenated amorphous silicon deposited for near-infrared optics: n of 3.5-3.7 and
+# hardly any loss. The evaporated
+# film of Pierce and Spicer ("a-Si") absorbs so much that its pillars stay below |t| =
+# 0.8 before half a turn.
+PLAIN = Index(3.6)
+DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
+MOST_ALONG = 1000  # samples along a size, where there are two
+USUAL = {
+    "modal": 1e-3,
+    "rcwa": 0.02,
+    "axes": 0.05,
+}  # round pillars, others (corners converge slowly), two sizes
+# a sweep ends this far below the pitch: 10 nm of bias beyond a printable gap of 60 nm
+EDGE_GAP_UM = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """What a library holds.
+
+    wavelengths_um: vacuum wavelengths.
+    angles_deg: of incidence in air, in the plane of a lattice axis; both polarisations
+    where one is not 0.
+    diameters_um: (least, largest); without it from 0.06 (or a fifth of a smaller pitch)
+    to the pitch less 0.05.
+    samples: evenly spaced diameters; more are added around resonances.
+    tolerance: error bar that is asked of every entry's t; left out, what the solver of
+    such cells reaches but beside
+        resonances (:data:`USUAL`).
+    engine: auto, rcwa or modal.
+    lengths_um: (least, largest) size along y of a rectangle or an ellipse; diameters_um
+    is then that along x, and the
+        library one over both sizes (``samples`` entries along the longer range) with
+        Jones matrices.
+    light: linear, or circular: x and y at normal incidence, for pillars that are turned
+    one by one; the proxy is then
+        that of the light converted to the other hand.
+    """
+
+    wavelengths_um: tuple[float, ...] = (0.85,)
+    angles_deg: tuple[float, ...] = (0.0,)
+    diameters_um: tuple[float, float] | None = None
+    samples: int = 200
+    tolerance: float | None = None
+    engine: str = "auto"
+    light: Literal["linear", "circular"] = "linear"
+    lengths_um: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name, values in (
+            ("wavelengths_um", self.wavelengths_um),
+            ("angles_deg", self.angles_deg),
+        ):
+            if not values or any(b <= a for a, b in itertools.pairwise(values)):
+                raise ConfigError(
+                    f"{name} = {list(values)}: need at least one value, rising"
+                )
+        if not all(math.isfinite(w) and w > 0 for w in self.wavelengths_um):
+            raise ConfigError(
+                f"wavelengths_um = {list(self.wavelengths_um)}: need finite lengths above 0"
+            )
+        if not all(0 <= a < 90 for a in self.angles_deg):
+            raise ConfigError(
+                f"angles_deg = {list(self.angles_deg)}: need 0 <= angle < 90"
+            )
+        if not 20 <= self.samples <= 100_000:
+            raise ConfigError(f"samples = {self.samples}: need 20 to 100000")
+        if self.tolerance is not None and not 1e-8 <= self.tolerance <= MOST_ERROR:
+            raise ConfigError(
+                f"tolerance = {self.tolerance}: need 1e-8 to {MOST_ERROR:g}"
+            )
+        if self.engine not in ("auto", "rcwa", "modal"):
+            raise ConfigError(f"engine = {self.engine!r}: need auto, rcwa or modal")
+        if self.light == "circular" and self.angles_deg != (0.0,):
+            raise ConfigError(
+                f"angles_deg = {list(self.angles_deg)} of circular light: need normal incidence, [0.0]"
+            )
+        if self.lengths_um is not None:
+            self._check_lengths(self.lengths_um)
+
+    def _check_lengths(self, lengths: tuple[float, float]) -> None:
+        for name, span in (
+            ("diameters_um", self.diameters_um or (0, 0)),
+            ("lengths_um", lengths),
+        ):
+            if not (0 < span[0] < span[1] and math.isfinite(span[1])):
+                raise ConfigError(
+                    f"{name} = {list(span)}: with lengths_um both need 0 < least < largest"
+                )
+        plain = (
+            self.angles_deg == (0.0,)
+            and self.light == "linear"
+            and self.engine != "modal"
+        )
+        if not plain or self.samples > MOST_ALONG:
+            raise ConfigError(
+                f"lengths_um = {list(lengths)}: a library over two sizes is for normal incidence (angles_deg = [0.0]), "
+                f'light = "linear", engine auto or rcwa, and at most {MOST_ALONG} samples'
+            )
+
+    @property
+    def polarizations(self) -> tuple[Polarization, ...]:
+        """x at normal incidence alone (a square lattice treats x and y alike), else s
+        and p; x and y for circular.
+        """
+        if self.light == "circular":
+            return ("x", "y")
+        return ("x",) if self.angles_deg == (0.0,) else ("s", "p")
+
+    @property
+    def bar(self) -> float:
+        """The tolerance, that of round pillars where none is stated."""
+        return USUAL["modal"] if self.tolerance is None else self.tolerance
+
+    def settled(self, cell: Cell) -> "Sweep":
+        """The same with the tolerance that pillars of such a cell have where none is
+        stated.
+        """
+        if self.tolerance is not None:
+            return self
+        usual = (
+            "axes" if self.lengths_um is not None else "modal" if cell.round else "rcwa"
+        )
+        return dataclasses.replace(self, tolerance=USUAL[usual])
+
+    def span_um(self, cell: Cell) -> tuple[float, float]:
+        """(least, largest) diameter.
+
+        Raises:
+            CellError: the diameters do not fit into the cell.
+        """
+        thinnest = max(min(0.06, cell.pitch_um / 5), cell.size_um(0.0))
+        low, high = self.diameters_um or (thinnest, cell.widest_um(EDGE_GAP_UM))
+        if not 0 < low < high:
+            raise CellError(
+                f"diameters_um = ({low:g}, {high:g}): need 0 < least < largest"
+            )
+        if high >= cell.pitch_um if cell.round else cell.gap_um(high) <= 0:
+            raise CellError(
+                f"diameters_um reaches {high:g} um on a pitch of {cell.pitch_um:g} um: pillars touch; "
+                "keep the largest diameter below the pitch"
+            )
+        return low, high
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PillarLibrary:
+    """Response of one pillar cell; see :class:`metalens.cell.response.Response` for the
+    normalisation.
+
+    cell, sweep: what was computed.
+    polarization: names along the first axis; angle_rad, wavelength_um, diameter_um: the
+    other axes.
+    t, r: (polarization, angle, wavelength, diameter) complex amplitudes of the zero
+    order.
+    t_error: as t; estimate of |t - exact|, not below the true error.
+    energy: as t; |t|² + |r|² of the zero orders, 1 where nothing absorbs and no other
+        order propagates.
+    resonances: (k, 5) polarization index, angle_rad, wavelength_um, diameter_um,
+    half-width in um of the poles of
+        t(D) near the real axis.
+    engine: modal or rcwa. solves: exact solves behind the entries.
+    proxy: polynomial of Eq. 2 fitted to the entries; notes: what was cut from its
+    domain, and why.
+    turned: for circular light, the pillar of most conversion solved at several turns.
+    """
+
+    cell: Cell
+    sweep: Sweep
+    polarization: tuple[str, ...]
+    angle_rad: Array
+    wavelength_um: Array
+    diameter_um: Array
+    t: Array
+    r: Array
+    t_error: Array
+    energy: Array
+    resonances: Array
+    engine: str
+    solves: int
+    proxy: Proxy | None = None
+    notes: tuple[str, ...] = ()
+    provenance: Provenance = field(default_factory=Provenance)
+    turned: GeometricPhase | None = None
+
+    def __post_init__(self) -> None:
+        shape = (
+            len(self.polarization),
+            len(self.angle_rad),
+            len(self.wavelength_um),
+            len(self.diameter_um),
+        )
+        for name in ("t", "r", "t_error", "energy"):
+            if getattr(self, name).shape != shape:
+                raise DomainError(
+                    f"library {name} has shape {getattr(self, name).shape}, need {shape}"
+                )
+            if not np.isfinite(getattr(self, name)).all():
+                raise DomainError(f"library {name} holds values that are not finite")
+
+    @property
+    def converged(self) -> bool:
+        """Whether every error bar meets the tolerance."""
+        return bool(self.t_error.max() <= self.sweep.bar)
+
+    @property
+    def lost(self) -> Array:
+        """As t: share of the power that is absorbed or leaves in orders other than zero
+        (of a shape without a mirror along x or y, or in the other polarisation).
+        """
+        return np.asarray(np.maximum(1 - self.energy, 0.0))
+
+    def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
+        """Mean of :attr:`lost` over pillars, at the least angle of the library.
+
+        diameter_um: of the pillars, 0 where there is none. wavelength_um: the nearest
+        of the library is taken; polarisations are averaged.
+        """
+        wave = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
+        pillars = np.ravel(diameter_um)[np.ravel(diameter_um) > 0]
+        of_size = self.lost[:, 0, wave].mean(axis=0)
+        return float(np.interp(pillars, self.diameter_um, of_size).mean())
+
+
+def check_sweep(cell: Cell, sweep: Sweep) -> None:
+    """Refuse a sweep that cannot be computed, before anything is computed.
+
+    Raises:
+        CellError: pillars touch, or diffraction orders propagate in the cover (named).
+        MaterialError: a wavelength outside the range of a material.
+    """
+    span = sweep.span_um(cell)
+    if sweep.lengths_um is not None:
+        raise ConfigError(
+            "lengths_um: a library over two sizes is made by metalens.library.axes.sweep_two_sizes"
+        )
+    if sweep.light == "circular":
+        check_turned(cell, span[1])
+    check_light(cell, sweep)
+
+
+def check_light(cell: Cell, sweep: Sweep) -> None:
+    """Refuse wavelengths that a material does not hold, half-spaces that absorb, and
+    orders that propagate in the cover.
+
+    Raises:
+        CellError, MaterialError: as :func:`check_sweep`.
+    """
+    films = [film.material for film in (*cell.under, *cell.over)]
+    layered = [
+        m
+        for layer in cell.layers
+        for m in (layer.material, layer.between, layer.coat)
+        if m is not None
+    ]
+    for wavelength in sweep.wavelengths_um:
+        for material in (cell.pillar, cell.fill, *films, *layered):
+            index(material, wavelength)
+        for side in ("substrate", "cover"):
+            n = index(getattr(cell, side), wavelength)
+            if n.imag:
+                raise CellError(
+                    f"{side} absorbs at {wavelength:g} um (n = {n:.4g}): the power that enters or leaves it depends on "
+                    "where it is measured; give its real index, or make the absorbing part a film under or over"
+                )
+        check_subwavelength(
+            cell, wavelength, angle_rad=math.radians(sweep.angles_deg[-1])
+        )
+
+
+def save(path: str | Path, library: PillarLibrary) -> None:
+    """Write a library file (kind ``library``)."""
+    names = (
+        "angle_rad",
+        "wavelength_um",
+        "diameter_um",
+        "t",
+        "r",
+        "t_error",
+        "energy",
+        "resonances",
+    )
+    arrays: dict[str, Array] = {name: getattr(library, name) for name in names}
+    arrays["polarization"] = np.array(library.polarization)
+    arrays["notes"] = np.array(library.notes, dtype=str)
+    if library.proxy is not None:
+        arrays |= {
+            f"proxy/{name}": array for name, array in library.proxy.to_arrays().items()
+        }
+    if library.turned is not None:
+        arrays |= {
+            f"turned/{name}": array
+            for name, array in library.turned.to_arrays().items()
+        }
+    attributes: dict[str, Any] = {
+        "cell": config.dumps(library.cell),
+        "sweep": config.dumps(library.sweep),
+        "engine": library.engine,
+        "solves": library.solves,
+        "axes": "polarization, angle_rad, wavelength_um, diameter_um",
+    }
+    store.save(
+        path, "library", arrays, attributes=attributes, provenance=library.provenance
+    )
+
+
+@typed_reader
+def load(path: str | Path) -> PillarLibrary:
+    """Read a library file.
+
+    Raises:
+        StoreError: not a library file; DomainError: its arrays do not fit together.
+    """
+    stored = store.load(path, "library")
+    arrays, about = stored.arrays, stored.attributes
+    proxy, turned = (
+        {
+            name.removeprefix(group): array
+            for name, array in arrays.items()
+            if name.startswith(group)
+        }
+        for group in ("proxy/", "turned/")
+    )
+    names = (
+        "angle_rad",
+        "wavelength_um",
+        "diameter_um",
+        "t",
+        "r",
+        "t_error",
+        "energy",
+        "resonances",
+    )
+    return PillarLibrary(
+        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
+        sweep=config.loads(about["sweep"], Sweep, where=f"{path}: sweep"),
+        polarization=tuple(_text(v) for v in arrays["polarization"]),
+        **{name: arrays[name] for name in names},
+        engine=about["engine"],
+        solves=about["solves"],
+        proxy=Proxy.from_arrays(proxy) if proxy else None,
+        notes=tuple(_text(v) for v in arrays["notes"]),
+        provenance=stored.provenance,
+        turned=GeometricPhase.from_arrays(turned) if turned else None,
+    )
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,482 @@
+"""Which pillar cell to take: over pitch, height and wavelength, how much phase do
+printable pillars cover smoothly?
+"""
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from metalens.cell import Blend, Cell, Incidence, Material, index, materials
+from metalens.core.arrays import Array
+from metalens.core.console import Console
+from metalens.core.errors import CellError, ConfigError
+from metalens.library import engines, workers
+from metalens.library.curve import ResponseCurve
+from metalens.library.proxy import MOST_ERROR
+from metalens.library.record import PLAIN, Sweep, check_light
+from metalens.library.stretch import REACH, UNKNOWN
+from metalens.library.workers import SweepJournal
+
+TURN = 2 * math.pi
+SAMPLES = 600
+
+
+@dataclass(frozen=True, slots=True)
+class CellStudy:
+    """What is compared.
+
+    pitches_um, heights_um, wavelengths_um: every combination.
+    pillar: material of the pillars, on the substrate and under the cover of
+    :class:`metalens.cell.Cell`.
+    cell: any cell in its place: substrate, cover, shape, lattice, films, wall and
+    material of every pillar; its pitch
+        and height are those compared, and "diameter" is the size of its shape. Light is
+        along x, at normal incidence.
+    min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and
+    between two.
+    least_transmission: |t| below this ends a smooth stretch.
+    least_half_width_um: so does a resonance narrower than this.
+    tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end
+    a stretch.
+    others: materials that the chosen cell is tried with as well, where their sources
+    hold all the wavelengths; [] for
+        none.
+    """
+
+    pitches_um: tuple[float, ...] = (
+        0.28,
+        0.29,
+        0.30,
+        0.31,
+        0.32,
+        0.34,
+        0.36,
+        0.38,
+        0.40,
+        0.42,
+        0.45,
+    )
+    heights_um: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    wavelengths_um: tuple[float, ...] = (0.85, 0.94)
+    pillar: Material = PLAIN
+    min_diameter_um: float = field(default=0.08, metadata={"above": 0})
+    min_gap_um: float = 0.06
+    least_transmission: float = 0.8
+    least_half_width_um: float = 0.005
+    tolerance: float = field(default=3e-3, metadata={"above": 0})
+    others: tuple[str, ...] = field(default=("a-Si",), metadata={"may_be_empty": True})
+    cell: Cell | None = None
+
+    def __post_init__(self) -> None:
+        if self.cell is not None and self.pillar != PLAIN:
+            raise ConfigError(
+                "pillar and cell are both given: a cell has its own material; give pillar inside cell"
+            )
+        if self.tolerance > MOST_ERROR:
+            raise ConfigError(
+                f"tolerance = {self.tolerance}: need an error of t above 0 and up to {MOST_ERROR:g}"
+            )
+        if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
+            raise ConfigError(
+                f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
+                f"{self.min_gap_um} um"
+            )
+
+    @property
+    def material(self) -> Material:
+        """Of the pillars."""
+        return self.pillar if self.cell is None else self.cell.pillar
+
+    def made(
+        self, pitch_um: float, height_um: float, pillar: Material | None = None
+    ) -> Cell:
+        """One cell of the study, or the same of another material; of layers those of
+        the pillar's own take the height.
+
+        Raises:
+            CellError: a height that the films of other materials fill.
+        """
+        base = (self.cell or Cell(pitch_um)).at_height(height_um)
+        return replace(base, pitch_um=pitch_um, pillar=pillar or self.material)
+
+
+@dataclass(frozen=True, slots=True)
+class CellVerdict:
+    """One cell at one wavelength.
+
+    turns: of phase that the longest smooth stretch covers; from_um, to_um: its
+    diameters.
+    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
+    ends: what bounds it above.
+    max_angle_deg: of incidence in air up to which no diffraction order propagates, in
+        substrate or cover.
+    error: largest error estimate of t on the stretch.
+    pillar: name of the material, or n + ik.
+    """
+
+    pitch_um: float
+    height_um: float
+    wavelength_um: float
+    turns: float
+    from_um: float
+    to_um: float
+    least_transmission: float
+    mean_power: float
+    ends: str
+    max_angle_deg: float
+    error: float
+    pillar: str
+
+
+def run_study(
+    study: CellStudy,
+    console: Console | None = None,
+    *,
+    journal: SweepJournal | None = None,
+) -> list[CellVerdict]:
+    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell
+    with other materials.
+
+    Args:
+        journal: of the curves that an interrupted run has solved; the verdicts are the
+            same.
+
+    Raises:
+        CellError: a pitch at which diffraction orders propagate in the cover; it is
+            named, with the largest that has none. Sizes that do not fit.
+        MaterialError: unknown, or a wavelength outside the range of a material of the
+            cell.
+    """
+    for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
+        check_light(
+            study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
+        )
+    tried, _ = other_materials(study)
+    shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
+    cases = [
+        (study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes
+    ]
+    journal = journal or SweepJournal(None)
+    verdicts = _judged(study, cases, journal, console or Console(quiet=True))
+    best = best_cell(study, verdicts)
+    if best is None:
+        return verdicts
+    cells = [study.made(*best, other) for other in tried]
+    again = [
+        (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
+    ]
+    return verdicts + _judged(study, again, journal, Console(quiet=True))
+
+
+def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Other materials that are tried, without the study's own; and those whose sources
+    lack a wavelength.
+
+    Raises:
+        MaterialError: an unknown name or a file that cannot be read.
+    """
+    named_else = [
+        name for name in dict.fromkeys(study.others) if name != study.material
+    ]
+    ranges = {name: materials.find_material(name).range_um for name in named_else}
+    held = [
+        all(low <= w <= high for w in study.wavelengths_um)
+        for low, high in ranges.values()
+    ]
+    tried = tuple(name for name, holds in zip(named_else, held, strict=True) if holds)
+    return tried, tuple(name for name in named_else if name not in tried)
+
+
+def _judged(
+    study: CellStudy,
+    cases: list[tuple[Cell, float]],
+    journal: SweepJournal,
+    console: Console,
+) -> list[CellVerdict]:
+    """One rational curve t(D) a case, on all cores."""
+    tasks = []
+    for cell, wavelength in cases:
+        span = _span(study, cell)
+        engine = engines.choose_engine(cell)
+        tasks.append(
+            workers.curves_task(
+                cell,
+                [Incidence(wavelength)],
+                span,
+                tolerance=study.tolerance,
+                engine=engine,
+            )
+        )
+    found = journal.run(tasks, console, "cells")
+    made = [workers.solve_curves(one, tolerance=study.tolerance)[0] for one in found]
+    return [
+        judge_cell(study, *case, curve) for case, curve in zip(cases, made, strict=True)
+    ]
+
+
+def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
+    """(least, largest) printable size.
+
+    Raises:
+        CellError: there is none.
+    """
+    low, high = (
+        cell.size_um(study.min_diameter_um, study.min_gap_um),
+        cell.widest_um(study.min_gap_um),
+    )
+    if low >= high:
+        raise CellError(
+            f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "
+            f"{high:g} um, min_diameter_um = {study.min_diameter_um:g} takes {low:.4g} um"
+        )
+    return low, high
+
+
+def judge_cell(
+    study: CellStudy, cell: Cell, wavelength_um: float, curve: ResponseCurve
+) -> CellVerdict:
+    """The smooth stretch that covers most phase on one curve."""
+    d = np.linspace(
+        curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES
+    )
+    value, error = curve(d)
+    hole = (
+        cell.shape.hole
+    )  # the wider an opening, the less phase: taken with the other sign
+    level, phase = (
+        np.abs(value[:, 0]),
+        np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1),
+    )
+    back = "the phase rises" if hole else "the phase falls"
+    faults = {
+        "|t| falls": level < study.least_transmission,
+        back: np.diff(phase, append=np.inf) < 0,
+    }
+    faults["an error bar above half of |t|"] = error > UNKNOWN * level
+    sharp = np.zeros(SAMPLES, bool)
+    for centre, width in curve.resonances(study.least_half_width_um):
+        sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
+    faults["a narrow resonance"] = sharp
+    start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
+    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or [
+        "the printable range"
+    ]
+    run = slice(start, stop)
+    return CellVerdict(
+        cell.pitch_um,
+        cell.height_um,
+        wavelength_um,
+        float(phase[stop - 1] - phase[start]) / TURN if stop > start else 0.0,
+        float(d[start]),
+        float(d[max(start, stop - 1)]),
+        float(level[run].min(initial=1.0)),
+        _mean_over_phase(phase[run], level[run] ** 2),
+        " and ".join(why),
+        max_angle_deg(cell, wavelength_um),
+        float(error[run].max(initial=0.0)),
+        material_name(cell.pillar),
+    )
+
+
+def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
+    """Angle of incidence in air up to which no other order propagates on either side:
+    sin = wavelength / spacing of rows - largest n.
+    """
+    n = max(
+        index(material, wavelength_um).real for material in (cell.substrate, cell.cover)
+    )
+    sine = cell.lattice.least_order * wavelength_um / cell.pitch_um - n
+    return math.degrees(math.asin(min(1.0, max(0.0, sine))))
+
+
+def _most_phase(phase: Array, good: Array) -> tuple[int, int]:
+    """(start, stop) of the run of good samples that covers most phase; (0, 0) where
+    there is none.
+    """
+    edges = (
+        np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+        .reshape(-1, 2)
+        .tolist()
+    )
+    return max(
+        ((a, b) for a, b in edges),
+        key=lambda run: phase[run[1] - 1] - phase[run[0]],
+        default=(0, 0),
+    )
+
+
+def _mean_over_phase(phase: Array, power: Array) -> float:
+    if len(phase) < 2:
+        return 0.0
+    return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
+
+
+def study_markdown(
+    study: CellStudy, verdicts: list[CellVerdict], *, command: str
+) -> str:
+    """The study as a page with one table a wavelength: turns covered (least |t|), pitch
+    across, height down.
+    """
+    lines = [
+        "# Cell study",
+        "",
+        f"{_subject(study)}. Printable: {_limits(study)}. Each entry is the phase, in turns, "
+        "that the longest stretch of diameters covers on which the phase rises, |t| >= "
+        f"{study.least_transmission:g} and no resonance has a half-width below {1e3 * study.least_half_width_um:g} nm; "
+        "in brackets the mean |t|² over it. **Bold**: a full turn.",
+        "",
+        f"Made by `{command}`; numbers with diameters and reasons in `cell_study.json`.",
+        "",
+        "![coverage](cell_study.png)",
+    ]
+    for wavelength in study.wavelengths_um:
+        lines += [
+            "",
+            f"## {1e3 * wavelength:g} nm",
+            "",
+            *_table(
+                study,
+                [v for v in _own(study, verdicts) if v.wavelength_um == wavelength],
+            ),
+        ]
+    missed = uncertain_entries(study, verdicts)
+    lines += ["", missed[0].upper() + missed[1:] + "."] if missed else []
+    return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
+
+
+def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
+    """On how many stretches an error bar of t lies above the tolerance, in words; empty
+    where on none.
+    """
+    every = [v for v in verdicts if v.turns > 0]
+    missed = [v for v in every if v.error > study.tolerance]
+    if not missed:
+        return ""
+    worst = max(missed, key=lambda v: v.error)
+    place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
+    return (
+        f"on {len(missed)} of {len(every)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
+        f"largest of {worst.error:.2g} ({worst.pillar}, {place})"
+    )
+
+
+def _subject(study: CellStudy) -> str:
+    """What the pillars are, in words."""
+    if study.cell is None:
+        return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
+    substrate, cover = (
+        material_name(study.cell.substrate),
+        material_name(study.cell.cover),
+    )
+    return f"Pillars of {material_name(study.material)} on {substrate} under {cover}: {study.cell.described}"
+
+
+def _limits(study: CellStudy) -> str:
+    """What is printed, in words."""
+    least, gap = (
+        f"{1e3 * study.min_diameter_um:.4g} nm",
+        f"{1e3 * study.min_gap_um:.4g} nm",
+    )
+    if study.made(study.pitches_um[0], study.heights_um[0]).round:
+        return f"diameter from {least} to the pitch less {gap}"
+    return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
+
+
+def material_name(material: Material) -> str:
+    """A material in words."""
+    if isinstance(material, Blend):
+        mixed = f" with {material.share:.0%} {material.other}" if material.other else ""
+        return f"{material.base}{mixed} {material.n_offset:+g} {material.k_offset:+g}i"
+    return (
+        material
+        if isinstance(material, str)
+        else f"n = {material.n:g} + {material.k:g}i"
+    )
+
+
+def _own(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[CellVerdict]:
+    return [v for v in verdicts if v.pillar == material_name(study.material)]
+
+
+def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
+    found = {(v.height_um, v.pitch_um): v for v in verdicts}
+    head = (
+        "| height \\ pitch (nm) | "
+        + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um)
+        + " |"
+    )
+    lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
+    for height in study.heights_um:
+        cells = [found[height, pitch] for pitch in study.pitches_um]
+        texts = [
+            f"**{v.turns:.2f}** ({v.mean_power:.2f})"
+            if v.turns >= 1
+            else f"{v.turns:.2f} ({v.mean_power:.2f})"
+            for v in cells
+        ]
+        lines.append(f"| {1e3 * height:g} | " + " | ".join(texts) + " |")
+    return lines
+
+
+def best_cell(
+    study: CellStudy, verdicts: list[CellVerdict]
+) -> tuple[float, float] | None:
+    """(pitch, height) in um that covers a full turn at every wavelength with most turns
+    at the worst of them, at the
+    least height; None where no cell does."""
+    by_cell: dict[tuple[float, float], list[float]] = {}
+    for v in _own(study, verdicts):
+        by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
+    good = {cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1}
+    if not good:
+        return None
+    height = min(cell[0] for cell in good)
+    best = max(
+        (cell for cell in good if cell[0] == height), key=lambda cell: good[cell]
+    )
+    return best[1], best[0]
+
+
+def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
+    waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
+    best = best_cell(study, verdicts)
+    if best is None:
+        return [f"No cell covers a full turn at {waves} nm."]
+    found = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
+    lines = [
+        "## Choice",
+        "",
+        f"The lowest pillars that cover a full turn at {waves} nm with one cell are {1e3 * best[1]:g} nm high; among "
+        f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
+        "",
+    ]
+    for v in found:
+        lines.append(
+            f"- {v.pillar}, {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
+            f"{1e3 * v.to_um:.0f} nm "
+            f"(ended by {v.ends}), |t| >= {v.least_transmission:.2f}, mean |t|² {v.mean_power:.2f}; no diffraction "
+            f"order up to {v.max_angle_deg:.0f} deg"
+        )
+    _, outside = other_materials(study)
+    return lines + [
+        f"- {name} was not tried: its source does not hold {waves} nm"
+        for name in outside
+    ]
+
+
+def round_to_tolerance(value: object) -> object:
+    """Six significant digits: what the tolerance carries, and the same text on any
+    machine.
+    """
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, dict):
+        return {k: round_to_tolerance(v) for k, v in value.items()}
+    return (
+        [round_to_tolerance(v) for v in value]
+        if isinstance(value, list | tuple)
+        else value
+    )

@@ -1,0 +1,150 @@
+"""Figures of a pillar library and of the cell study."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from metalens.core import store
+from metalens.core.store import replace_atomically
+from metalens.library.study import (
+    CellStudy,
+    CellVerdict,
+    round_to_tolerance,
+    study_markdown,
+)
+
+if TYPE_CHECKING:
+    from metalens.library.fit import ProxyFit
+    from metalens.library.record import PillarLibrary
+
+DEG, NM = 180 / np.pi, 1e3
+
+
+def write_study(
+    folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
+) -> None:
+    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist."""
+    values = {"study": asdict(study), "verdicts": [asdict(v) for v in verdicts]}
+    store.write_text(
+        folder / "cell_study.json",
+        json.dumps(round_to_tolerance(values), indent=1) + "\n",
+    )
+    store.write_text(
+        folder / "README.md", study_markdown(study, verdicts, command=command)
+    )
+    study_figure(folder / "cell_study.png", study, verdicts)
+
+
+def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
+    """Turns covered over pitch and height, a panel a wavelength; the line is one full
+    turn.
+    """
+    figure = Figure(figsize=(9, 3.6), layout="constrained", dpi=110)
+    panels = figure.subplots(1, len(study.wavelengths_um), sharey=True, squeeze=False)[
+        0
+    ]
+    pitch, height = NM * np.array(study.pitches_um), NM * np.array(study.heights_um)
+    for panel, wavelength in zip(panels, study.wavelengths_um, strict=True):
+        found = [v.turns for v in verdicts if v.wavelength_um == wavelength]
+        turns = np.array(found[: len(height) * len(pitch)]).reshape(
+            len(height), len(pitch)
+        )
+        image = panel.imshow(
+            turns, origin="lower", aspect="auto", vmin=0, vmax=2, cmap="RdYlBu"
+        )
+        for i, j in np.ndindex(*turns.shape):
+            weight = "bold" if turns[i, j] >= 1 else "normal"
+            panel.text(
+                j,
+                i,
+                f"{turns[i, j]:.2f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                fontweight=weight,
+            )
+        panel.set_xticks(range(len(pitch)), [f"{p:g}" for p in pitch], fontsize=8)
+        panel.set_yticks(range(len(height)), [f"{h:g}" for h in height], fontsize=8)
+        panel.set(title=f"{NM * wavelength:g} nm", xlabel="pitch (nm)")
+    panels[0].set_ylabel("pillar height (nm)")
+    figure.colorbar(image, ax=panels, label="smooth phase (turns)")
+    _write(figure, path)
+
+
+def library_figure(
+    path: Path, library: "PillarLibrary", made: "ProxyFit | None"
+) -> None:
+    """Phase and |t| with error bars, the bars by themselves beside the tolerance, and
+    what the proxy leaves.
+    """
+    figure = Figure(figsize=(7.5, 8.5), layout="constrained", dpi=110)
+    phase, level, bars, rest = figure.subplots(
+        4, 1, sharex=True, height_ratios=(3, 2, 1.2, 1.8)
+    )
+    d = NM * library.diameter_um
+    for i, j, k in np.ndindex(*library.t.shape[:3]):
+        t, error = library.t[i, j, k], library.t_error[i, j, k]
+        label = f"{NM * library.wavelength_um[k]:g} nm"
+        if len(library.angle_rad) > 1:
+            label += f", {DEG * library.angle_rad[j]:.3g}° {library.polarization[i]}"
+        size = np.abs(t)
+        turns = np.unwrap(np.angle(t)) / (2 * np.pi)
+        kind: dict[str, Any] = {"lw": 0.9, "elinewidth": 2.5, "alpha": 0.9}
+        phase.errorbar(
+            d,
+            turns - turns[0],
+            error / np.maximum(size, error) / (2 * np.pi),
+            label=label,
+            **kind,
+        )
+        level.errorbar(d, size, error, **kind)
+        bars.semilogy(d, error, lw=0.9)
+    phase.set_ylabel("phase (turns)")
+    level.set(ylabel="|t|", ylim=(0, 1.05))
+    bars.axhline(library.sweep.bar, color="0.5", lw=0.8, ls="--")
+    bars.set_ylabel("error bar of t")
+    if library.t.shape[0] * library.t.shape[1] * library.t.shape[2] <= 12:
+        phase.legend(fontsize=7)
+    cell = library.cell
+    phase.set_title(
+        f"pitch {NM * cell.pitch_um:g} nm, height {NM * cell.height_um:g} nm, engine {library.engine}"
+    )
+    if made is not None:
+        _residuals(rest, library, made)
+        for panel in (phase, level):
+            panel.axvspan(
+                *(NM * v for v in made.proxy.domain_um), color="0.92", zorder=0
+            )
+    rest.set(xlabel="diameter (nm)", ylabel="proxy - library")
+    _write(figure, path)
+
+
+def _residuals(panel: Any, library: "PillarLibrary", made: "ProxyFit") -> None:
+    """Deviation of the proxy from the entries of its domain, phase (rad) and |T|."""
+    proxy = made.proxy
+    low, high = proxy.domain_um
+    inside = (library.diameter_um >= low - 1e-9) & (library.diameter_um <= high + 1e-9)
+    d, mean = library.diameter_um[inside], library.t[..., inside].mean(axis=0)
+    first = True
+    for j, k in np.ndindex(*mean.shape[:2]):
+        place = (float(library.wavelength_um[k]), float(library.angle_rad[j]))
+        turned = np.angle(np.exp(1j * proxy.phase_rad(d, *place)) / mean[j, k])
+        panel.plot(NM * d, turned, "C0.", ms=2, label="phase (rad)" if first else None)
+        panel.plot(
+            NM * d,
+            proxy.transmission(d, *place) - np.abs(mean[j, k]),
+            "C1.",
+            ms=2,
+            label="|T|" if first else None,
+        )
+        first = False
+    panel.legend(fontsize=7)
+
+
+def _write(figure: Figure, path: Path) -> None:
+    with replace_atomically(path) as part:
+        figure.savefig(part, format="png", metadata={"Software": "metalens"})

@@ -1,0 +1,333 @@
+"""The cell study: known coverages, the choice, and the page."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from metalens import cli
+from metalens.cell import Cell, Film, Index, Layer
+from metalens.cell.shapes import Cross
+from metalens.core.console import Console
+from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
+from metalens.library import study as cell_study
+from metalens.library import study_plots, workers
+from metalens.library.study import CellStudy
+
+SMALL = CellStudy(
+    pitches_um=(0.30, 0.40), heights_um=(0.7,), wavelengths_um=(0.85,), tolerance=1e-2
+)
+
+
+@pytest.fixture(scope="module")
+def verdicts():
+    return cell_study.run_study(SMALL)
+
+
+def test_known_coverages(verdicts):
+    narrow, wide, film = verdicts
+    assert narrow.turns == pytest.approx(1.53, abs=0.03)
+    assert wide.turns == pytest.approx(0.77, abs=0.03)
+    assert narrow.max_angle_deg == 90
+    assert wide.max_angle_deg == pytest.approx(
+        42.3, abs=0.1
+    )  # sin = 0.85/0.40 - 1.4525
+    assert film.pillar == "a-Si"
+    assert film.turns < 0.6  # the absorbing film of Pierce and Spicer
+
+
+def test_choice_takes_the_lowest_then_the_most(verdicts):
+    narrow, wide, _ = verdicts
+    assert cell_study.best_cell(SMALL, verdicts) == (0.30, 0.7)
+    taller = dataclasses.replace(narrow, height_um=0.9, turns=2.0)
+    assert cell_study.best_cell(SMALL, [taller, narrow]) == (0.30, 0.7)
+    better = dataclasses.replace(narrow, pitch_um=0.31, turns=1.6)
+    assert cell_study.best_cell(SMALL, [narrow, better]) == (0.31, 0.7)
+    elsewhere = dataclasses.replace(better, wavelength_um=0.94, turns=0.4)
+    assert cell_study.best_cell(SMALL, [narrow, better, elsewhere]) == (0.30, 0.7)
+    assert cell_study.best_cell(SMALL, [wide]) is None
+
+
+def test_page_json_and_figure(verdicts, tmp_path):
+    study_plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
+    page = (tmp_path / "README.md").read_text()
+    assert f"| 700 | **{verdicts[0].turns:.2f}**" in page
+    assert "pitch of 300 nm" in page
+    assert "Made by `metalens study`" in page
+    values = json.loads((tmp_path / "cell_study.json").read_text())
+    assert values["verdicts"][1]["pitch_um"] == 0.4
+    assert (tmp_path / "cell_study.png").read_bytes().startswith(b"\x89PNG")
+    first = (tmp_path / "cell_study.png").read_bytes()
+    study_plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
+    assert (tmp_path / "cell_study.png").read_bytes() == first
+
+
+def test_no_cell_is_said_plainly(verdicts):
+    only = dataclasses.replace(SMALL, pitches_um=(0.40,))
+    assert "No cell covers a full turn at 850 nm" in cell_study.study_markdown(
+        only, verdicts[1:2], command="x"
+    )
+
+
+def test_most_phase_of_runs():
+    phase = np.arange(10.0)
+    good = np.array([1, 1, 0, 1, 1, 1, 1, 0, 1, 1], bool)
+    assert cell_study._most_phase(phase, good) == (3, 7)
+    assert cell_study._most_phase(phase, ~good & False) == (0, 0)
+
+
+def test_pitch_without_room_is_refused():
+    with pytest.raises(ConfigError, match="no pillar of"):
+        CellStudy(pitches_um=(0.12,))
+
+
+def test_pitches_above_cutoff_are_refused_and_named():
+    with pytest.raises(CellError, match=r"pitch 0.9 um at 0.85 um: diffraction orders"):
+        cell_study.run_study(
+            CellStudy(pitches_um=(0.3, 0.9), heights_um=(0.5,), wavelengths_um=(0.85,))
+        )
+
+
+def test_other_materials_are_tried_where_they_hold_and_never_the_own_one_again():
+    """a-Si is tabulated from 0.31 to 2.066 um, Si-infrared beyond; what does not hold
+    is said, not stumbled over.
+    """
+    base = dataclasses.replace(
+        SMALL,
+        pitches_um=(0.9,),
+        heights_um=(2.2,),
+        wavelengths_um=(2.5,),
+        pillar=Index(3.48),
+    )
+    far = dataclasses.replace(base, others=("a-Si", "Si-infrared", "a-Si"))
+    assert cell_study.other_materials(far) == (("Si-infrared",), ("a-Si",))
+    own = dataclasses.replace(
+        base,
+        pillar="Si-infrared",
+        others=("Si-infrared", "TiO2"),
+        wavelengths_um=(1.5,),
+    )
+    assert cell_study.other_materials(own) == (("TiO2",), ())
+    full = cell_study.CellVerdict(
+        0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i"
+    )
+    assert (
+        "a-Si was not tried: its source does not hold 2500 nm"
+        in cell_study.study_markdown(far, [full], command="x")
+    )
+
+
+@pytest.mark.parametrize(
+    ("cell", "others", "says"),
+    [
+        (Cell(0.3), ("a_Si",), "unknown material 'a_Si'"),
+        (
+            Cell(0.3, under=(Film("Si-infrared", 0.1),)),
+            ("a-Si",),
+            "Si-infrared at 0.85 um",
+        ),
+        (Cell(0.3, substrate=Index(1.5, 0.1)), ("a-Si",), "substrate absorbs"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_before_any_cell_is(
+    cell, others, says, monkeypatch
+):
+    monkeypatch.setattr(
+        workers, "run_tasks", lambda tasks: pytest.fail("cells were solved first")
+    )
+    with pytest.raises(MetalensError, match=says):
+        cell_study.run_study(dataclasses.replace(SMALL, cell=cell, others=others))
+
+
+def test_heights_of_layered_pillars_are_made_of_their_own_material():
+    """Pedestal and residual mask stay 60 and 40 nm; what they fill leaves no pillar."""
+    layers = (
+        Layer(0.06, material=Index(1.5)),
+        Layer(0.5),
+        Layer(0.04, grow_um=-0.01, material=Index(1.9)),
+    )
+    study = dataclasses.replace(SMALL, cell=Cell(0.3, 0.6, Index(3.6), layers=layers))
+    made = study.made(0.33, 0.75, Index(2.4))
+    assert [layer.height_um for layer in made.layers] == pytest.approx(
+        [0.06, 0.65, 0.04]
+    )
+    assert (made.pitch_um, made.height_um, made.pillar) == (0.33, 0.75, Index(2.4))
+    with pytest.raises(
+        CellError, match=r"0\.1 um of it of other films: need a larger height"
+    ):
+        study.made(0.33, 0.09)
+
+
+def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
+    """The foot is 28 nm wider than the diameter: with a printable gap of 20 nm
+    neighbours overlapped, and the study
+    ended with a refusal."""
+    cell = Cell(0.3, pillar=Index(3.6), sidewall_rad=0.04)
+    leaning = CellStudy(
+        pitches_um=(0.3,),
+        heights_um=(0.7,),
+        min_diameter_um=0.2,
+        min_gap_um=0.02,
+        cell=cell,
+    )
+    want = (0.2, 0.98 * 0.3 - 0.7 * math.tan(0.04))
+    assert cell_study._span(leaning, leaning.made(0.3, 0.7)) == pytest.approx(
+        want, rel=1e-12
+    )
+
+
+def test_the_page_says_what_is_printable_of_any_shape():
+    crosses = CellStudy(
+        pitches_um=(0.3,),
+        heights_um=(0.7,),
+        wavelengths_um=(0.85,),
+        cell=Cell(0.3, shape=Cross(0.4)),
+    )
+    verdict = cell_study.CellVerdict(
+        0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si"
+    )
+    page = cell_study.study_markdown(
+        dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x"
+    )
+    assert (
+        "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm"
+        in page
+    )
+    discs = dataclasses.replace(crosses, cell=Cell(0.3))
+    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.study_markdown(
+        discs, [verdict], command="x"
+    )
+
+
+TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"
+
+
+def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
+    """After one of two cells the user presses Ctrl-C, and a kill cuts the line that
+    follows; that cell is not solved
+    again, and the folder is that of a run that nobody stopped."""
+    (tmp_path / "study.toml").write_text(TWO)
+    monkeypatch.chdir(tmp_path)
+    solved, answers = [], {}
+
+    def run(tasks):  # in this process, each once
+        for i, task in enumerate(tasks):
+            key = json.dumps(task)
+            answers[key] = answers.get(key) or workers.run_task(task)
+            yield i, answers[key]
+
+    def stopped(tasks):
+        yield next(run(tasks))
+        raise KeyboardInterrupt
+
+    def counted(tasks):
+        solved.append(len(tasks))
+        return run(tasks)
+
+    monkeypatch.setattr(workers, "run_tasks", stopped)
+    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.INTERRUPTED
+    assert not (tmp_path / "out").exists()
+    journal = tmp_path / "out.resume"
+    assert len(journal.read_text().splitlines()) == 2
+    with open(journal, "ab") as file:
+        file.write(b'["cut sho')
+    monkeypatch.setattr(workers, "run_tasks", counted)
+    assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
+    assert solved == [1, 1]  # the other cell, and the chosen one of another material
+    assert not journal.exists()
+    (tmp_path / "whole").mkdir()
+    assert (
+        cli.main(["study", "study.toml", "-o", "whole/out", "--quiet"]) == cli.SUCCESS
+    )
+    for name in ("README.md", "cell_study.json", "cell_study.png"):
+        assert (tmp_path / "out" / name).read_bytes() == (
+            tmp_path / "whole" / "out" / name
+        ).read_bytes()
+
+
+def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
+    tmp_path, monkeypatch
+):
+    """What was solved for a table of n that has been edited since does not get into the
+    result.
+    """
+    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
+    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
+    study, solved = CellStudy(pillar=str(table)), []
+
+    def told(tasks):
+        solved.append(tasks)
+        for i, _ in enumerate(tasks):
+            yield (
+                i,
+                {
+                    "diameter_um": [0.1],
+                    "t": [[1.0, 0.5]],
+                    "r": [[0.0, 0.1]],
+                    "error": [0.2],
+                    "energy": [1.0],
+                },
+            )
+
+    def done(settings):
+        solved.clear()
+        workers.SweepJournal(path, settings).run(
+            [{"kind": "curve"}], Console(quiet=True), "cells"
+        )
+        return any(solved)
+
+    monkeypatch.setattr(workers, "run_tasks", told)
+    assert [done(study), done(study)] == [True, False]
+    assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [
+        True,
+        True,
+    ]
+    table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.55,0\n")
+    assert [done(study), done(study)] == [True, False]
+
+
+def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_mix(
+    tmp_path, monkeypatch
+):
+    """Workers read it anew for every task; what was solved for the new one is not kept
+    as one of the old.
+    """
+    table, path = tmp_path / "film.csv", tmp_path / "out.resume"
+    table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
+    study = CellStudy(pillar=str(table))
+
+    def told(tasks):
+        for i, _ in enumerate(tasks):
+            yield (
+                i,
+                {
+                    "diameter_um": [0.1],
+                    "t": [[1.0, 0.5]],
+                    "r": [[0.0, 0.1]],
+                    "error": [0.2],
+                    "energy": [1.0],
+                },
+            )
+            table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
+
+    monkeypatch.setattr(workers, "run_tasks", told)
+    with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
+        workers.SweepJournal(path, study).run(
+            [{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells"
+        )
+    assert len(path.read_text().splitlines()) == 2  # its title and the first
+
+
+def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
+    path = tmp_path / "out.resume"
+    title = workers.SweepJournal(path, SMALL) and path.read_text()
+    path.write_text(title + '["task", {"diameter_um": [0.1]}]\n')
+    assert workers.SweepJournal(path, SMALL)._known == {}
+    path.write_text("pages of a thesis\n")
+    with pytest.raises(
+        StoreError, match=r"out\.resume is in the way.*no journal of metalens"
+    ):
+        workers.SweepJournal(path, SMALL)
+    assert path.read_text() == "pages of a thesis\n"
