@@ -1,6 +1,4 @@
-"""Pillar libraries: a cell swept over size, wavelength, angle and polarisation, kept as
-a file, and its proxy.
-"""
+"""Pillar libraries: a cell swept over size, wavelength and angle, and its proxy."""
 
 from typing import TYPE_CHECKING
 
