@@ -1,12 +1,9 @@
-"""``python -m benchmarks.figures``: the table of the README, written anew from the
-result files.
+"""``python -m benchmarks.figures``: tables of the pages, written from result files.
 
-figures.md holds the table with a reference in the place of each figure, ``{file; words;
-key; digits}``: the file of
-benchmarks/results, words that each appear in the row's case, method, goal or "N
-threads" (the row must be the only
-one), the column (or an expression that finds the figure in those words), and how it is
-written: a count of digits,
+figures.md holds a table for each page with a reference in the place of each figure,
+``{file; words; key; digits}``: the file of benchmarks/results, words that each stand in
+the row's case, method, goal or "N threads" (one row must fit), the column (or an
+expression that finds the figure in those words), and its form: a count of digits,
 ``ms``, ``GB`` (of a column in MB), ``%``, ``rate`` (one over it) or ``text``.
 """
 
@@ -15,20 +12,17 @@ import re
 from pathlib import Path
 
 HERE = Path(__file__).parent
-README, TEMPLATE, RESULTS = (
-    HERE.parent / "README.md",
-    HERE / "figures.md",
-    HERE / "results",
-)
-SENTENCES = (  # of the README's text, beside its table
-    "{characterize_study; peak 8000 e & Cramér-Rao; error; 3} times the\nCramér-Rao bound",
-    "| the fit of a 1 mm lens in 8 s | {characterize; fit & rms; seconds; 2} s |",
-    "as fast as the angular spectrum | {psf; 1 mm free-form & windowed 1e-4; (\\d+)x textbook; 3} times |",
-    "as wide as a sensor, a hundred times | {psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2} times |",
-    "| a round pillar by the modal method to 1e-4 in 50 ms | {modal; tolerance 0.0001; seconds; ms} ms,",
-    "of 22 000 entries in 60 s | {library; 200 x 11; seconds; 2} s (",
-    "150 frames/s (earlier image model) | {codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} at 9.7 MMACs, "
-    "{codesign; 9.7 MMACs, true image & lens and pitch moving; seconds; rate} where the lens moves (",
+ROOT = HERE.parent
+TEMPLATE, RESULTS = HERE / "figures.md", HERE / "results"
+LIMITS = ROOT / "docs" / "limits.md"
+SENTENCES = (  # of docs/limits.md
+    "{characterize; fit & rms; seconds; 2} s where 8 s were asked",
+    "{psf; 1 mm free-form & windowed 1e-4; (\\d+)x textbook; 3} times as fast as the angular spectrum",
+    "{psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2} times in windows as wide as a sensor",
+    "{modal; tolerance 0.0001; seconds; ms} ms in the mean",
+    "{library; 200 x 11; seconds; 2} s where 60 s were asked",
+    "{codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} frames/s with a fixed lens and "
+    "{codesign; 9.7 MMACs, true image & lens and pitch moving; seconds; rate} with a moving one",
 )
 REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
 
@@ -93,18 +87,24 @@ def _written(value: float, form: str) -> str:
     return f"{mantissa}e{int(power)}"
 
 
-def table() -> str:
-    """The README's table as the result files have it now."""
-    return filled(TEMPLATE.read_text(encoding="utf-8")).rstrip("\n")
+def tables() -> dict[Path, str]:
+    """Table of each page, with the figures that the result files hold now."""
+    parts = re.split(r"^# (\S+)\n+", TEMPLATE.read_text(encoding="utf-8"), flags=re.M)
+    return {
+        ROOT / page: filled(text).strip("\n")
+        for page, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
 
 
 def write() -> None:
-    """Put the table in the place of the README's."""
-    text = README.read_text(encoding="utf-8")
-    old = re.search(r"^\| job \| time .*?(?=\n\n)", text, re.M | re.S)
-    if not old:
-        raise LookupError("README.md has no table that begins with '| job | time'")
-    README.write_text(text.replace(old[0], table()), encoding="utf-8")
+    """Put every table in the place of the one with the same head in its page."""
+    for page, table in tables().items():
+        text = page.read_text(encoding="utf-8")
+        head = table.splitlines()[0]
+        old = re.search(rf"^{re.escape(head)}$.*?(?=\n\n)", text, re.M | re.S)
+        if not old:
+            raise LookupError(f"{page.name} has no table that begins with {head!r}")
+        page.write_text(text.replace(old[0], table), encoding="utf-8")
 
 
 if __name__ == "__main__":
