@@ -24,8 +24,15 @@ import torch
 
 from metalens.cell import Film
 from metalens.design import Focus
-from metalens.field import SmoothWave
-from metalens.image import Frames, Grid, basis, image, imager, uniform_imager
+from metalens.image import (
+    Frames,
+    Grid,
+    SmoothWave,
+    basis,
+    image,
+    imager,
+    uniform_imager,
+)
 from metalens.lens import Layers
 from metalens.psf import Source
 

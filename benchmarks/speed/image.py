@@ -12,11 +12,10 @@ import torch
 from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
-from metalens.field import Grid, Layers, Optics, PillarWave, SmoothWave, Window, imager
-from metalens.field.left_out import Judged, neglected, unpolarised
-from metalens.field.plan import spectral
-from metalens.image import Frames
-from metalens.lens import DiameterMap, Lens
+from metalens.image import Frames, Grid, Optics, PillarWave, SmoothWave, Window, imager
+from metalens.image.left_out import Judged, neglected, unpolarised
+from metalens.image.plan import spectral
+from metalens.lens import DiameterMap, Layers, Lens
 from metalens.library import Proxy
 from metalens.psf import Source, SpectralNodes, spectrum
 

@@ -10,8 +10,9 @@ from benchmarks.peers import layered
 from codesign.eye import dataset, renderer
 from codesign.eye.population import CameraRig, model_parameters
 from codesign.eye.renderer import PinholeCamera
-from metalens.image import pupil, scene, sensor
+from metalens.image import pupil, scene
 from metalens.image.pupil import Pupil
+from metalens.psf import integrate_pixels
 
 NONE = float("nan")
 
@@ -122,7 +123,7 @@ def _imaging(threads: int) -> list[Row]:
     optics = Pupil(nodes=224)
     fine = pupil.psf(torch.zeros(224, 224, dtype=torch.float64), optics, depths_um=depths, focus_um=20e3,
                      sample_um=0.75, samples=372)  # fmt: skip
-    stack = sensor.integrate(fine, 0.75, pitch_um=9.0, shape=(31, 31))
+    stack = integrate_pixels(fine, 0.75, pitch_um=9.0, shape=(31, 31))
     stack = stack / stack.sum((1, 2), keepdim=True)
     layers = scene.cut(frames, depths)
     order = [int((depths - d).abs().argmin()) for d in layers.depth_um]
@@ -189,9 +190,9 @@ def _imaging(threads: int) -> list[Row]:
 
 def _sensor(threads: int) -> list[Row]:
     image = torch.rand(8, 640, 640)
-    seconds = fastest(lambda: sensor.integrate(image, 1.0, pitch_um=3.7)) / 8
+    seconds = fastest(lambda: integrate_pixels(image, 1.0, pitch_um=3.7)) / 8
     kept = torch.nn.functional.pad(image.double(), (12, 12, 12, 12))
-    error = abs(float(sensor.integrate(kept, 1.0, pitch_um=3.7).sum() / kept.sum()) - 1)
+    error = abs(float(integrate_pixels(kept, 1.0, pitch_um=3.7).sum() / kept.sum()) - 1)
     return [
         Row(
             "640² samples on 3.7 um pixels",

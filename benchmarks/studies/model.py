@@ -28,9 +28,20 @@ from metalens.cell import Cell, Film, Index
 from metalens.core.arrays import Array
 from metalens.design import Focus
 from metalens.design.neighbours import neighbours
-from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.image import Frames, UniformImager, basis, image, uniform_imager
-from metalens.lens import Lens
+from metalens.image import (
+    Frames,
+    Grid,
+    Optics,
+    SmoothWave,
+    UniformImager,
+    Window,
+    basis,
+    image,
+    imager,
+    psfs,
+    uniform_imager,
+)
+from metalens.lens import Layers, Lens
 from metalens.psf import PsfStack, Source, View, from_lens, spectrum
 
 PITCH, COUNT, WAVELENGTH = 0.4, 3600, 0.85

@@ -8,7 +8,7 @@ from codesign.batches import EXPERIMENT
 from codesign.network import Architecture, Supernet, exported
 from codesign.network.subnet import Subnet
 from codesign.train import CodesignRun
-from metalens.image import sensor as camera
+from metalens.psf import pixel_count
 
 
 def scale_of(run: CodesignRun) -> exported.OutputScale:
@@ -26,7 +26,7 @@ def scale_of(run: CodesignRun) -> exported.OutputScale:
 def pixels_of(run: CodesignRun) -> int:
     """Pixels along a side of the run's sensor."""
     settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
-    return camera.pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
+    return pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
 
 
 def write_network_file(

@@ -22,17 +22,9 @@ from codesign.eye import (
 )
 from codesign.optics import formed
 from metalens.core.errors import ConfigError, SceneError
-from metalens.image import (
-    Grid,
-    Imager,
-    Normalisation,
-    axial_information,
-    imager,
-    integrate,
-    scene,
-)
+from metalens.image import Grid, Imager, Normalisation, axial_information, imager, scene
 from metalens.lens import Lens, reach
-from metalens.psf import View, from_lens, passed_um2
+from metalens.psf import View, from_lens, integrate_pixels, passed_um2
 
 WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 
@@ -428,7 +420,7 @@ def lens_basis(
     view = View(tuple(depths.tolist()), ((0.0, 0.0),), window * pitch_um, window * fine)
     stack = from_lens(lens, view, tolerance=1e-3)
     intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
-    pixels = integrate(
+    pixels = integrate_pixels(
         intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1)
     )  # odd: centred
     light = float(

@@ -9,7 +9,7 @@ import torch
 
 from codesign.evaluate.optics import AxialInformation, ResolvedSettings, SceneEnergy
 from metalens.core.report import figure_png, make_figure
-from metalens.image import pixel_weights
+from metalens.psf import pixel_weights
 
 CAPTIONS = {
     "axial": "Axial information on axis (Eq. 11) over depth for each binning, averaged over sub-pixel positions.",

@@ -45,8 +45,14 @@ from codesign.optics import OpticsConfig, formed
 from codesign.train import LearningRateSchedule, read_out
 from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.field import node_light, normalised, term, with_psfs
-from metalens.image import Imager, UniformImager
+from metalens.image import (
+    Imager,
+    UniformImager,
+    node_light,
+    normalised,
+    term,
+    with_psfs,
+)
 
 
 @dataclass(frozen=True, slots=True)

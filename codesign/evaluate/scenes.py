@@ -14,15 +14,9 @@ from torch import Tensor
 from codesign.evaluate.optics import SensitivityScenes, scene_views
 from codesign.eye import states_at
 from metalens.design.free_form import DesignScore, ResolvedFisherSettings
-from metalens.image import (
-    OpticsLoss,
-    Pupil,
-    encircled_energy,
-    integrate,
-    optics_loss,
-    scene,
-)
+from metalens.image import OpticsLoss, Pupil, encircled_energy, optics_loss, scene
 from metalens.image import pupil as pupils
+from metalens.psf import integrate_pixels
 
 DEPTHS = 14  # of the PSF stack, at equal steps of 1/z over what the scenes hold
 
@@ -113,7 +107,7 @@ class SceneObjective:
             samples=samples,
         )
         energy = encircled_energy(fine, sample, radius_um=self.settings.radius_um)
-        stack = integrate(
+        stack = integrate_pixels(
             fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size)
         )
         optics = scene.with_kernels(

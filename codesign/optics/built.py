@@ -30,8 +30,16 @@ from metalens.fabrication import (
     sensitivity,
     transmission,
 )
-from metalens.field import Optics, cell_um
-from metalens.image import Field, Pupil, amplitude, aperture_light, coordinates, view
+from metalens.image import (
+    Field,
+    Optics,
+    Pupil,
+    amplitude,
+    aperture_light,
+    cell_um,
+    coordinates,
+    view,
+)
 from metalens.lens import Lens
 
 OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")

@@ -8,7 +8,7 @@ While the lens moves, its PSFs over the field are formed anew every few steps; b
 them the gradient of the light at
 the nodes of the field goes to the phase through a few field points and wavelengths that
 are drawn at random, which is
-unbiased (:mod:`metalens.field.slopes`).
+unbiased (:mod:`metalens.image.slopes`).
 """
 
 import functools
@@ -23,17 +23,20 @@ from codesign.optics import stack as lens
 from codesign.optics.lens_errors import LensError, variance_rad2
 from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from metalens.core.errors import PropagationError, SceneError, TrainingError
-from metalens.field import (
-    Layers,
+from metalens.image import (
+    Grid,
+    Imager,
     Optics,
     SmoothWave,
+    UniformImager,
     normalised,
+    scene,
     surrogate,
     textured_frames,
     with_psfs,
 )
-from metalens.image import Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
+from metalens.lens import Layers
 from metalens.psf import Source
 
 There = tuple[
@@ -176,7 +179,7 @@ class DifferentiableImager:
     light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes
     that were asked for. ready:
     the imager, differentiable in it. pairs: what was drawn of
-    :func:`metalens.field.drawn`; None for all nodes.
+    :func:`metalens.image.drawn`; None for all nodes.
     """
 
     light: Tensor

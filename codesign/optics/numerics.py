@@ -15,9 +15,9 @@ import torch
 
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.image import PsfBasis, integrate, scene
+from metalens.image import PsfBasis, scene
 from metalens.lens import Lens
-from metalens.psf import Source, SpectralNodes, psf_stack, spectrum
+from metalens.psf import Source, SpectralNodes, integrate_pixels, psf_stack, spectrum
 
 ENTRIES = 8192  # of the table of diameters
 SLACK_UM = 0.012  # that the table reaches beyond the pillars, for bias
@@ -189,7 +189,7 @@ def pixel_kernels(
     light = torch.as_tensor(stack.intensity).reshape(
         len(depths), size * fine, size * fine
     )
-    pixels = integrate(
+    pixels = integrate_pixels(
         light,
         window.pitch_um / fine,
         pitch_um=window.pitch_um,

@@ -33,9 +33,9 @@ from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.core.paths import source_path
 from metalens.design import Focus, PhaseOf, profiles
-from metalens.field import Layers, Optics
 from metalens.image import (
     Field,
+    Optics,
     PsfBasis,
     Pupil,
     Seen,
@@ -47,6 +47,7 @@ from metalens.image import (
     uniform_imager,
     view,
 )
+from metalens.lens import Layers
 from metalens.library import DEFAULT_CELL, Proxy
 
 

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from metalens.design import Focus
-from metalens.field import (
-    Layers,
+from metalens.image import (
+    Grid,
+    Imager,
     Optics,
     Plan,
     SmoothWave,
@@ -26,9 +27,8 @@ from metalens.field import (
     normalised,
     with_psfs,
 )
-from metalens.image import Grid, Imager
 from metalens.image import imager as field_imager
-from metalens.lens import Lens
+from metalens.lens import Layers, Lens
 from metalens.psf import Source, SpectralNodes, among
 
 ROWS = 256  # of pillars at a time
@@ -113,7 +113,7 @@ def gather_lens_plane(
             Taken one by one: unlike
             neighbours are put on here, where the lens holds their rows.
         window_um: of the PSFs, which says over how many pillars the mean may be
-            (:func:`metalens.field.cell_um`).
+            (:func:`metalens.image.cell_um`).
     """
     d = lens.diameters
     radius = d.radius_um + d.pitch_um / 2
@@ -286,7 +286,7 @@ def make_device(
     """A device whose image is prepared.
 
     Raises:
-        SceneError, PropagationError: as :func:`metalens.field.imager`.
+        SceneError, PropagationError: as :func:`metalens.image.imager`.
     """
     with torch.no_grad():
         whole = field_imager(

@@ -12,6 +12,7 @@ from codesign.network import Architecture, Supernet, cost
 from codesign.optics import OpticsConfig, PixelPsfStack
 from metalens.image import Sensor, encircled_energy, texture_information
 from metalens.image import sensor as camera
+from metalens.psf import pixel_count
 
 
 def read_out(
@@ -103,11 +104,7 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
     it, so its labels are those of the frame
     (:func:`codesign.network.losses.mask_in_frame`).
     """
-    wide = (
-        camera.pixel_count(samples, sample_um, pitch_um)
-        * pitch_um
-        / (samples * sample_um)
-    )
+    wide = pixel_count(samples, sample_um, pitch_um) * pitch_um / (samples * sample_um)
     return 1.0 if abs(wide - 1) < 1e-9 else wide
 
 

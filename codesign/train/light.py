@@ -11,8 +11,7 @@ from torch import Tensor
 
 from codesign.optics import LensError, OpticsConfig, PixelPsfStack, formed
 from codesign.optics import stack as lens
-from metalens.field import drawn
-from metalens.image import Imager, UniformImager
+from metalens.image import Imager, UniformImager, drawn
 
 Draw = Callable[[int], LensError | None]
 

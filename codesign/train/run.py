@@ -39,7 +39,7 @@ from codesign.train.words import Part
 from metalens.core import config
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.image import Sensor
-from metalens.image.sensor import pixel_count
+from metalens.psf import pixel_count
 
 Preset = Literal["none", "smoke", "laptop", "paper"]
 

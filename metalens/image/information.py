@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
-from metalens.image.sensor import integrate, whole_pixels
+from metalens.psf import integrate_pixels, whole_pixels
 
 Normalisation = Literal["sum", "l2", "none"]
 
@@ -136,7 +136,7 @@ def pixel_information(
     grid = dict(pitch_um=pixel_um, shape=(shape[0], shape[1]), shift_um=shift_um)
     a, b = (
         _normalised(
-            integrate(image, sample_um, **grid),  # type: ignore[arg-type]
+            integrate_pixels(image, sample_um, **grid),  # type: ignore[arg-type]
             normalisation,
         )
         for image in (near, far)

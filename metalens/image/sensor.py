@@ -3,13 +3,13 @@
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
+from metalens.psf import integrate_pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,147 +53,6 @@ def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
     return (pitch_um / base_pitch_um) ** 2
 
 
-def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that cover ``samples`` samples; one where the pixel is
-    larger than the image.
-    """
-    return max(1, math.ceil(samples * sample_um / pitch_um * (1 - 1e-12)))
-
-
-def whole_pixels(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that lie wholly inside ``samples`` samples, however the
-    lengths are rounded.
-    """
-    return math.floor(samples * sample_um / pitch_um * (1 + 1e-12))
-
-
-def pixel_weights(
-    samples: int,
-    sample_um: float,
-    *,
-    pitch_um: float | Tensor,
-    count: int | None = None,
-    shift_um: float = 0.0,
-    grid_um: float | None = None,
-) -> Tensor:
-    """(pixels, samples) share of each sample's light that falls on each pixel, in
-    float64.
-
-    The cumulative light at the sample edges is interpolated by a Catmull-Rom cubic and
-    differenced at the pixel
-    edges: exact area overlap where the edges coincide, telescoping (so the energy is
-    kept), and with a continuous
-    derivative in the pitch everywhere. Plain overlap has a kink wherever a pixel edge
-    meets a sample edge.
-
-    Args:
-        samples: of the image along this axis; the image is centred on the pixel row.
-        pitch_um: float, or a tensor that the weights are differentiable in.
-        count: of pixels; by default as many as cover the image.
-        shift_um: of the pixel row towards + along the axis.
-        grid_um: distance of the pixels, the pitch by default. Where it is given the
-            places stay and ``pitch_um`` is
-            the width of the box alone (the paper's learnable box filter), in the light
-            of a box of ``grid_um``.
-
-    Accuracy:
-        Column sums are 1 to rounding where the pixels reach one sample beyond the
-        image. A pixel cut by an
-        isolated bright sample takes up to -0.075 of it: the overshoot of the cubic;
-        none on sampled PSFs.
-    """
-    pitch = torch.as_tensor(pitch_um, dtype=torch.float64)
-    pixels = pixel_count(
-        samples, sample_um, float(pitch.detach()) if grid_um is None else grid_um
-    )
-    pixels = pixels if count is None else count
-    place = torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2
-
-    def light(edge_um: Tensor) -> Tensor:
-        position = (edge_um + shift_um) / sample_um + samples / 2
-        return _smooth_step(
-            position[:, None] - torch.arange(samples, dtype=torch.float64)
-        )
-
-    if grid_um is None:
-        step = light(place * pitch)
-        return step[1:] - step[:-1]
-    middle = (place[:-1] + 0.5) * grid_um
-    return (light(middle + pitch / 2) - light(middle - pitch / 2)) * (grid_um / pitch)
-
-
-def integrate(
-    image: Tensor,
-    sample_um: float,
-    *,
-    pitch_um: float | Tensor,
-    shape: tuple[int, int] | None = None,
-    shift_um: tuple[float, float] = (0.0, 0.0),
-    grid_um: float | None = None,
-) -> Tensor:
-    """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's
-    area.
-
-    Args:
-        image: (..., y, x).
-        shape: (rows, columns) of pixels; by default as many as cover the image.
-        shift_um: (y, x) of the pixel grid.
-        grid_um: see :func:`pixel_weights`.
-
-    Returns:
-        (..., rows, columns) in the dtype of ``image``; differentiable in image and
-        pitch.
-    """
-    axes = list(
-        zip(
-            image.shape[-2:],
-            (None, None) if shape is None else shape,
-            shift_um,
-            strict=True,
-        )
-    )
-    if not (
-        isinstance(pitch_um, Tensor)
-        and pitch_um.requires_grad
-        and torch.is_grad_enabled()
-    ):
-        width = float(pitch_um.detach()) if isinstance(pitch_um, Tensor) else pitch_um
-        lengths = [
-            length / sample_um
-            for length in (width, width if grid_um is None else grid_um)
-        ]
-        if all(
-            _samples(n, count, shift / sample_um, lengths) for n, count, shift in axes
-        ):
-            return image
-    rows, columns = (
-        pixel_weights(
-            n,
-            sample_um,
-            pitch_um=pitch_um,
-            count=count,
-            shift_um=shift,
-            grid_um=grid_um,
-        )
-        for n, count, shift in axes
-    )
-    return rows.to(image) @ image @ columns.to(image).mT
-
-
-def _samples(
-    samples: int, count: int | None, shift: float, lengths: Sequence[float]
-) -> bool:
-    """Whether every pixel is one sample, to the rounding of its edges' places (double
-    precision).
-
-    count: of pixels. shift: of the grid. lengths: width and distance of the pixels, all
-    in samples.
-    """
-    if (pixel_count(samples, 1.0, lengths[1]) if count is None else count) != samples:
-        return False
-    return max(abs(length - 1) for length in lengths) * samples / 2 + abs(shift) < 5e-12
-
-
 def mean_electrons(
     irradiance: Tensor,
     sample_um: float,
@@ -210,7 +69,7 @@ def mean_electrons(
             electrons.
         pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
         count: pixels along each axis.
-        grid_um: see :func:`pixel_weights`; light and ambient are then those of a pixel
+        grid_um: see :func:`metalens.psf.pixel_weights`; light and ambient are then those of a pixel
             of this size.
 
     Returns:
@@ -223,7 +82,7 @@ def mean_electrons(
         else pitch_um
     )
     shape = None if count is None else (count, count)
-    light = integrate(
+    light = integrate_pixels(
         irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um
     )
     light = light * (sample_um / sensor.base_pitch_um) ** 2
@@ -328,20 +187,6 @@ def low_snr(
     return replace(
         sensor, exposure_e=signal / mean_irradiance, ambient_e=signal * ambient_ratio
     )
-
-
-def _smooth_step(t: Tensor) -> Tensor:
-    """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left
-    of -1, 1 right of 2.
-    """
-    u, w = t + 1, t - 1
-    before = 0.5 * u**2 * (u - 1)
-    inside = t * (0.5 + t * (1.5 - t))
-    after = 1 + 0.5 * w * (1 - w) ** 2
-    left = torch.where(
-        t < 0, torch.where(t < -1, 0.0, before), inside
-    )  # one piece each: its slope counts once
-    return torch.where(t < 1, left, torch.where(t < 2, after, 1.0))
 
 
 def _check(name: str, value: float, *, above: bool) -> None:

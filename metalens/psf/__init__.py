@@ -38,7 +38,11 @@ if TYPE_CHECKING:
     from metalens.psf.of_lens import library_incidence as library_incidence
     from metalens.psf.of_lens import mean_over_polarizations as mean_over_polarizations
     from metalens.psf.of_lens import passed_um2 as passed_um2
+    from metalens.psf.pixels import integrate_pixels as integrate_pixels
     from metalens.psf.pixels import on_pixels as on_pixels
+    from metalens.psf.pixels import pixel_count as pixel_count
+    from metalens.psf.pixels import pixel_weights as pixel_weights
+    from metalens.psf.pixels import whole_pixels as whole_pixels
     from metalens.psf.record import PsfStack as PsfStack
     from metalens.psf.record import SourceShape as SourceShape
     from metalens.psf.record import load as load
@@ -91,6 +95,10 @@ __getattr__, __dir__, __all__ = attach_lazy_exports(
         "load": "record",
         "of_flux": "vector",
         "on_pixels": "pixels",
+        "integrate_pixels": "pixels",
+        "pixel_count": "pixels",
+        "pixel_weights": "pixels",
+        "whole_pixels": "pixels",
         "passed_um2": "of_lens",
         "plots": "",
         "psf_stack": "stack",

@@ -19,9 +19,9 @@ from codesign.optics import formed
 from codesign.optics.stack import OpticsConfig
 from codesign.train import LearningRateSchedule
 from metalens.core.errors import ConfigError
-from metalens.field.engine import normalised
-from metalens.field.forming import build_imager
-from metalens.field.plan import spectral
+from metalens.image.engine import normalised
+from metalens.image.forming import build_imager
+from metalens.image.plan import spectral
 from metalens.psf.spectrum import SpectralNodes
 
 CONFIG = ReaderConfig(

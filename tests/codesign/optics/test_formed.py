@@ -15,11 +15,10 @@ from codesign.optics.lens_errors import LensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig
 from metalens.cell import Film, Index
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.field import normalised, textured_frames
-from metalens.field.forming import with_psfs
-from metalens.field.plan import spectral
-from metalens.field.slopes import drawn, term
-from metalens.image import Frames, Imager, UniformImager
+from metalens.image import Frames, Imager, UniformImager, normalised, textured_frames
+from metalens.image.forming import with_psfs
+from metalens.image.plan import spectral
+from metalens.image.slopes import drawn, term
 from metalens.lens import Layers, Stop
 
 SMALL = OpticsConfig(

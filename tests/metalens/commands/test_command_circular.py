@@ -167,7 +167,7 @@ def test_the_image_is_that_of_the_converted_light(folder):
 
 def test_vectors_and_the_image_of_the_field_are_refused_by_name(folder):
     from metalens import psf
-    from metalens.field.waves import PillarWave
+    from metalens.image.waves import PillarWave
 
     lens = lenses.load(folder / "right.h5")
     with pytest.raises(PropagationError, match="circular light"):

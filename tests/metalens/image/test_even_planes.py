@@ -12,9 +12,9 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import (
+from metalens.image import (
+    Frames,
     Grid,
-    Layers,
     Optics,
     SmoothWave,
     Window,
@@ -22,8 +22,7 @@ from metalens.field import (
     imager,
     psfs,
 )
-from metalens.image import Frames
-from metalens.lens import Stop
+from metalens.lens import Layers, Stop
 from metalens.psf import SpectralNodes
 
 DISTANCE, RADIUS, STEP, SAMPLES, MARGIN = 600.0, 90.0, 10.0, 14, 4

@@ -13,7 +13,7 @@ from metalens.core.errors import SceneError
 from metalens.image import pupil as pupils
 from metalens.image.information import pixel_information
 from metalens.image.pupil import Pupil
-from metalens.image.sensor import whole_pixels
+from metalens.psf import whole_pixels
 
 torch.manual_seed(0)
 J = torch.randn(2, 30, 40, dtype=torch.float64)

@@ -10,13 +10,14 @@ import torch
 from metalens.core.errors import SceneError
 from metalens.image import sensor as sensors
 from metalens.image.sensor import Sensor
+from metalens.psf import integrate_pixels, pixel_count, pixel_weights
 
 torch.manual_seed(0)
 IMAGE = torch.rand(40, 52, dtype=torch.float64) + 0.1
 
 
 def test_coinciding_edges_give_the_exact_area_sum():
-    binned = sensors.integrate(IMAGE, 1.0, pitch_um=4.0)
+    binned = integrate_pixels(IMAGE, 1.0, pitch_um=4.0)
     want = IMAGE.reshape(10, 4, 13, 4).sum((1, 3))
     assert (
         (binned - want).abs().max() < 1e-12
@@ -26,14 +27,14 @@ def test_coinciding_edges_give_the_exact_area_sum():
 @pytest.mark.parametrize("pitch", [2.0, 2.37, math.pi, 7.77, 10.0])
 def test_energy_is_kept_at_any_pitch(pitch):
     padded = torch.nn.functional.pad(IMAGE, (12, 12, 12, 12))
-    total = sensors.integrate(padded, 1.0, pitch_um=pitch).sum()
+    total = integrate_pixels(padded, 1.0, pitch_um=pitch).sum()
     assert abs(total / IMAGE.sum() - 1) < 1e-12  # telescoping sum; asked: 1e-6
 
 
 def test_pitch_gradient_is_continuous_where_edges_meet():
     def gradient(pitch):
         p = torch.tensor(pitch, dtype=torch.float64, requires_grad=True)
-        pixels = sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(5, 5))
+        pixels = integrate_pixels(IMAGE, 1.0, pitch_um=p, shape=(5, 5))
         (pixels * torch.arange(25.0).reshape(5, 5)).sum().backward()
         return float(p.grad)
 
@@ -47,7 +48,7 @@ def test_pitch_gradient_is_continuous_where_edges_meet():
         assert jump < 1e-5 * abs(gradient(meeting))
     step = 1e-5
     pixels = [
-        sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(5, 5))
+        integrate_pixels(IMAGE, 1.0, pitch_um=p, shape=(5, 5))
         for p in (3.3 - step, 3.3 + step)
     ]
     slope = (
@@ -62,11 +63,11 @@ def test_pitch_gradient_where_a_pixel_edge_lies_on_a_sample_edge():
     """
     p = torch.tensor(4.0, dtype=torch.float64, requires_grad=True)
     got = torch.autograd.grad(
-        (sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p
+        (integrate_pixels(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p
     )[0]
     step = 1e-5
     high, low = (
-        (sensors.integrate(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum()
+        (integrate_pixels(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum()
         for s in (step, -step)
     )
     assert float(got) == pytest.approx(
@@ -75,18 +76,18 @@ def test_pitch_gradient_where_a_pixel_edge_lies_on_a_sample_edge():
 
 
 def test_pixel_larger_than_the_image_holds_all_its_light():
-    pixels = sensors.integrate(IMAGE, 1.0, pitch_um=60.0)
+    pixels = integrate_pixels(IMAGE, 1.0, pitch_um=60.0)
     assert pixels.shape == (1, 1)
     assert float(pixels) == pytest.approx(float(IMAGE.sum()), rel=1e-12)
 
 
 def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
-    assert torch.equal(sensors.integrate(IMAGE, 1.7, pitch_um=1.7), IMAGE)
-    aside = sensors.integrate(IMAGE, 1.7, pitch_um=1.7, shift_um=(0.0, 1.7))
+    assert torch.equal(integrate_pixels(IMAGE, 1.7, pitch_um=1.7), IMAGE)
+    aside = integrate_pixels(IMAGE, 1.7, pitch_um=1.7, shift_um=(0.0, 1.7))
     assert torch.allclose(
         aside[:, :-1], IMAGE[:, 1:], rtol=0, atol=1e-12
     )  # places of edges to 1e-14 of 50 samples
-    more = sensors.integrate(
+    more = integrate_pixels(
         IMAGE, 1.7, pitch_um=1.7, shape=(len(IMAGE) + 2, IMAGE.shape[1])
     )
     assert more.shape == (len(IMAGE) + 2, IMAGE.shape[1])
@@ -96,18 +97,18 @@ def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
         {"pitch_um": 1.7 * (1 + 1e-9)},
         {"pitch_um": 1.7, "grid_um": 1.7 * (1 + 1e-9)},
     ):
-        near = sensors.integrate(IMAGE, 1.7, shape=(len(IMAGE), n), **about)
+        near = integrate_pixels(IMAGE, 1.7, shape=(len(IMAGE), n), **about)
         assert (
             0 < float((near - IMAGE).abs().max()) < 1e-9 * n * float(IMAGE.abs().max())
         )  # edges move so far, 4 of them
     width = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
     with torch.no_grad():
-        assert sensors.integrate(IMAGE, 1.7, pitch_um=width) is IMAGE
+        assert integrate_pixels(IMAGE, 1.7, pitch_um=width) is IMAGE
     slope = torch.autograd.grad(
-        sensors.integrate(IMAGE, 1.7, pitch_um=width, grid_um=1.7)[20, 30], width
+        integrate_pixels(IMAGE, 1.7, pitch_um=width, grid_um=1.7)[20, 30], width
     )[0]
     low, high = (
-        float(sensors.integrate(IMAGE, 1.7, pitch_um=1.7 + s, grid_um=1.7)[20, 30])
+        float(integrate_pixels(IMAGE, 1.7, pitch_um=1.7 + s, grid_um=1.7)[20, 30])
         for s in (-1e-6, 1e-6)
     )
     assert float(slope) == pytest.approx(
@@ -118,8 +119,8 @@ def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
 def test_shift_moves_the_pixel_grid_towards_plus_x():
     spot = torch.zeros(30, 30, dtype=torch.float64)
     spot[15, 17] = 1
-    moved = sensors.integrate(spot, 1.0, pitch_um=5.0, shift_um=(0.0, 5.0))
-    still = sensors.integrate(spot, 1.0, pitch_um=5.0)
+    moved = integrate_pixels(spot, 1.0, pitch_um=5.0, shift_um=(0.0, 5.0))
+    still = integrate_pixels(spot, 1.0, pitch_um=5.0)
     assert torch.allclose(moved[:, :-1], still[:, 1:], atol=1e-12)
 
 
@@ -279,7 +280,7 @@ def test_a_narrower_box_on_the_same_grid_keeps_the_mean_of_flat_light():
     """
     ramp = (torch.arange(80, dtype=torch.float64) + 0.5) * 0.31
     image = ramp[:, None] + 0 * ramp
-    got = sensors.integrate(image, 0.31, pitch_um=2.3, grid_um=4.1, shape=(3, 4))
+    got = integrate_pixels(image, 0.31, pitch_um=2.3, grid_um=4.1, shape=(3, 4))
     middles = 80 * 0.31 / 2 + (torch.arange(3, dtype=torch.float64) - 1) * 4.1
     assert torch.allclose(
         got, (middles * (4.1 / 0.31) ** 2)[:, None].expand(3, 4), rtol=1e-9
@@ -287,7 +288,7 @@ def test_a_narrower_box_on_the_same_grid_keeps_the_mean_of_flat_light():
     mean = sensors.mean_electrons(image, 0.31, sensor=ODD, count=3)
     want = 730 * middles * AREA + 41 * AREA
     assert torch.allclose(mean[:, 1], want, rtol=1e-9)
-    rows = sensors.pixel_weights(80, 0.31, pitch_um=4.1, count=3, shift_um=1.7)
+    rows = pixel_weights(80, 0.31, pitch_um=4.1, count=3, shift_um=1.7)
     assert torch.allclose(rows @ ramp / (4.1 / 0.31), middles + 1.7, rtol=1e-9)
 
 
@@ -298,4 +299,4 @@ def test_pixels_that_cover_an_image():
         (7, 0.1, 0.7, 1),
         (3, 0.1, 2.0, 1),
     ):
-        assert sensors.pixel_count(samples, sample, pitch) == want
+        assert pixel_count(samples, sample, pitch) == want

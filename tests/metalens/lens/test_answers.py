@@ -12,7 +12,7 @@ from numpy.polynomial import chebyshev
 from metalens.cell import Cell, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import DomainError
-from metalens.field import compiled
+from metalens.image import compiled
 from metalens.lens import DiameterMap, Lens, answers
 from metalens.lens.pairs import TwoSizeTable
 from metalens.library import Proxy

@@ -15,8 +15,8 @@ from metalens import propagate
 from metalens.cell import Cell, Film, Index
 from metalens.core.errors import ConfigError, PropagationError
 from metalens.design import Focus
-from metalens.field import Optics, SmoothWave, Window
-from metalens.field.points import psfs
+from metalens.image import Optics, SmoothWave, Window
+from metalens.image.points import psfs
 from metalens.lens import DiameterMap, Layers, Lens, Stop, TwoSizeTable, media
 from metalens.psf import Extent, View, blur_um, from_lens, psf_stack
 

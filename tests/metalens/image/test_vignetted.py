@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.image import Frames
-from metalens.lens import Stop
+from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
+from metalens.lens import Layers, Stop
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee

@@ -13,9 +13,9 @@ import torch
 from metalens.cell import Film, Index
 from metalens.core.errors import PropagationError, SceneError
 from metalens.design import Focus
-from metalens.field import (
+from metalens.image import (
+    Frames,
     Grid,
-    Layers,
     Optics,
     SmoothWave,
     Window,
@@ -24,8 +24,8 @@ from metalens.field import (
     psfs,
     with_psfs,
 )
-from metalens.field.texture import texture_error
-from metalens.image import Frames
+from metalens.image.texture import texture_error
+from metalens.lens import Layers
 from metalens.psf import SpectralNodes
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

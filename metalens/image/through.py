@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from metalens.field.points import Optics, Window, sampling, seen
-from metalens.field.rays import Rays
-from metalens.field.waves import PillarWave
+from metalens.image.points import Optics, Window, sampling, seen
+from metalens.image.rays import Rays
+from metalens.image.waves import PillarWave
 
 
 def through(
@@ -22,7 +22,7 @@ def through(
 ) -> Tensor:
     """(points, depths) light through stop, lens and faces behind it, over that on the
     aperture as
-    :func:`metalens.field.points.psfs` counts it: σ = Σ S |T|² spread / Σ spread on the
+    :func:`metalens.image.points.psfs` counts it: σ = Σ S |T|² spread / Σ spread on the
     nodes, S 1 for rays that pass
     the stop.
 

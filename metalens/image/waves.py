@@ -19,7 +19,8 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.design import Focus
-from metalens.field import compiled
+from metalens.image import compiled
+from metalens.image.scene import values
 from metalens.lens import Layers, Lens, Media, answers, media, smooth
 from metalens.psf import among
 
@@ -103,7 +104,7 @@ class PillarWave:
     the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image;
     what of it lands in the window is
-    measured by :mod:`metalens.field.left_out`.
+    measured by :mod:`metalens.image.left_out`.
 
     Raises:
         SceneError: another lattice than a square one, turned pillars, those of two
@@ -258,7 +259,7 @@ class PillarWave:
         """
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
-        if compiled.values(d):
+        if values(d):
             phases, levels = torch.empty(2, *d.shape)
             answers.fill_response_of(
                 proxy,
@@ -283,7 +284,7 @@ class PillarWave:
         """
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
-        if self.lens.neighbours is None and compiled.values(d):
+        if self.lens.neighbours is None and values(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
             known = answers.response_polynomials(self.lens.proxy, sizes, at)
@@ -297,7 +298,7 @@ class PillarWave:
         return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
 
     def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
-        """As :func:`metalens.field.compiled.cells`, with derivatives and the factor of
+        """As :func:`metalens.image.compiled.cells`, with derivatives and the factor of
         neighbours.
         """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)

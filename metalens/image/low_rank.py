@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
-from metalens.field.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
-from metalens.field.texture import scene_spectrum
+from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
+from metalens.image.texture import scene_spectrum
 
 SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
 MOST_KERNELS = 320

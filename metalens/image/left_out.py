@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from metalens import propagate
-from metalens.field.points import Optics, Window, psfs, sampling
-from metalens.field.texture import texture_error, weigh_by_light
-from metalens.field.waves import Pillars
+from metalens.image.points import Optics, Window, psfs, sampling
+from metalens.image.texture import texture_error, weigh_by_light
+from metalens.image.waves import Pillars
 from metalens.psf import Polarisation, SpectralNodes, psf_stack
 
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at

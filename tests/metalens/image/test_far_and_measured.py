@@ -11,8 +11,8 @@ import torch
 
 from metalens.core.errors import SceneError
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, imager, plan
-from metalens.image import Frames
+from metalens.image import Frames, Grid, Optics, SmoothWave, imager, plan
+from metalens.lens import Layers
 from metalens.psf import Source, spectrum
 from tests.referees.true_image import Referee
 

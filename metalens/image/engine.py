@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
-from metalens.field import left_out
-from metalens.field.forming import Imager, build_imager
-from metalens.field.low_rank import PsfField, frame_maps, plane_images, psf_nodes
-from metalens.field.plan import Grid, Plan, depth_nodes, planned, spectral
-from metalens.field.points import SPARE, Optics, Window, sampling
-from metalens.field.splines import spline_matrix
-from metalens.field.stray import stray_of
-from metalens.field.texture import CONTRAST, scene_error
-from metalens.field.through import through
-from metalens.field.waves import PillarWave, SmoothWave, Wave, wave_of
-from metalens.image import Frames
+from metalens.image import left_out
+from metalens.image.forming import Imager, build_imager
+from metalens.image.low_rank import PsfField, frame_maps, plane_images, psf_nodes
+from metalens.image.plan import Grid, Plan, depth_nodes, planned, spectral
+from metalens.image.points import SPARE, Optics, Window, sampling
+from metalens.image.scene import Frames
+from metalens.image.splines import spline_matrix
+from metalens.image.stray import stray_of
+from metalens.image.texture import CONTRAST, scene_error
+from metalens.image.through import through
+from metalens.image.waves import PillarWave, SmoothWave, Wave, wave_of
 from metalens.lens import Layers, Lens
 from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
 from metalens.psf import spectrum as spectra

@@ -12,11 +12,11 @@ from scipy.special import j1
 from metalens import design
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
-from metalens.field import Grid, Optics, SmoothWave, Window, imager
-from metalens.field.engine import normalised
-from metalens.field.plan import Plan
-from metalens.field.points import psfs
-from metalens.field.through import through
+from metalens.image import Grid, Optics, SmoothWave, Window, imager
+from metalens.image.engine import normalised
+from metalens.image.plan import Plan
+from metalens.image.points import psfs
+from metalens.image.through import through
 from metalens.lens import Layers, Stop
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
-from metalens.field import compiled
-from metalens.field.left_out import Judged, folded, neglected, polarised
-from metalens.field.points import Optics, Window, psfs
-from metalens.field.splines import TAPS, spline_matrix
-from metalens.field.texture import scene_error, texture_error
-from metalens.field.waves import PillarWave
+from metalens.image.left_out import Judged, folded, neglected, polarised
+from metalens.image.points import Optics, Window, psfs
+from metalens.image.scene import plain
+from metalens.image.splines import TAPS, spline_matrix
+from metalens.image.texture import scene_error, texture_error
+from metalens.image.waves import PillarWave
 from metalens.psf import Polarisation, Source, SpectralNodes
 from metalens.psf import spectrum as spectra
 
@@ -242,7 +242,7 @@ def spectral(
         for i in range(start, stop):
             found[i + 1] = of(others[i])
 
-    if compiled.plain(found[0]):
+    if plain(found[0]):
         run_split_torch(len(others), torch.no_grad()(some))
     else:  # derivatives, or another device
         some(0, len(others))

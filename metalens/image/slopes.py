@@ -7,7 +7,7 @@ an image is formed through kernels, and its derivative is that of the sum over a
     image(X) = Σ_nodes Σ_x s_node(x, z) source(x) E_node P_node(X - x)
     d loss / d P_node(k) = Σ_x s_node(x, z) source(x) E_node G(x + k)
 
-with the splines s of :mod:`metalens.field.splines` and G = d loss / d image:
+with the splines s of :mod:`metalens.image.splines` and G = d loss / d image:
 correlations of the source with G, one a node, by transforms.
 
 The image is linear in the light of the nodes. So a step goes in two halves: with the
@@ -28,10 +28,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from metalens.field.low_rank import PsfField, fast_shape, frame_maps
-from metalens.field.plan import Plan, spectral
-from metalens.field.points import Optics, psfs
-from metalens.field.splines import TAPS, spline_coefficients, spline_taps
+from metalens.image.low_rank import PsfField, fast_shape, frame_maps
+from metalens.image.plan import Plan, spectral
+from metalens.image.points import Optics, psfs
+from metalens.image.splines import TAPS, spline_coefficients, spline_taps
 
 
 def by_nodes(

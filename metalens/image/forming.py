@@ -21,18 +21,17 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
-from metalens.field.low_rank import (
+from metalens.image.low_rank import (
     KernelBasis,
     LowRankPsfs,
     PsfField,
     low_rank_psfs,
     principal_kernels,
 )
-from metalens.field.plan import SHARES, Grid, Plan
-from metalens.field.slopes import by_nodes
-from metalens.field.stray import Stray, add_stray
-from metalens.image import Frames
-from metalens.image.scene import fixed
+from metalens.image.plan import SHARES, Grid, Plan
+from metalens.image.scene import Frames, fixed
+from metalens.image.slopes import by_nodes
+from metalens.image.stray import Stray, add_stray
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
 # Kernels of coverage, of those of light and at least: it matters at the borders of
@@ -201,7 +200,7 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
 
     Changes that vary over field and depth in a way that the first stack does not show
     need an imager of their own. The gradient does not: it is that of the image through
-    the PSFs of all nodes (:func:`metalens.field.slopes.by_nodes`), whatever the kernels
+    the PSFs of all nodes (:func:`metalens.image.slopes.by_nodes`), whatever the kernels
     lack.
     """
     found = PsfField(stack, energy, optics.plan.depths_um)

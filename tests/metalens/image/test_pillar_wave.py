@@ -14,21 +14,11 @@ from metalens.cell import Cell, Film, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import SceneError
 from metalens.design import Focus, profiles
-from metalens.field import (
-    Grid,
-    Layers,
-    Optics,
-    PillarWave,
-    Window,
-    imager,
-    left_out,
-    psfs,
-)
-from metalens.field.texture import texture_error
-from metalens.image import integrate
-from metalens.lens import DiameterMap, Lens, NeighbourRows
+from metalens.image import Grid, Optics, PillarWave, Window, imager, left_out, psfs
+from metalens.image.texture import texture_error
+from metalens.lens import DiameterMap, Layers, Lens, NeighbourRows
 from metalens.library import Proxy
-from metalens.psf import View, from_lens
+from metalens.psf import View, from_lens, integrate_pixels
 
 PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15
 PROXY = Proxy(
@@ -74,7 +64,7 @@ def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
     )
     box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
     smooth = torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0]
-    want = integrate(smooth, STEP / fine, pitch_um=STEP)[2:-2, 2:-2]
+    want = integrate_pixels(smooth, STEP / fine, pitch_um=STEP)[2:-2, 2:-2]
     at = torch.tensor([[DISTANCE * math.tan(t) for t in tilt]], dtype=torch.float64)
     optics = Optics(PillarWave(lens), Layers(), DISTANCE)
     got = psfs(
@@ -222,7 +212,7 @@ def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
     )
     light = torch.as_tensor(seen.intensity[0, 0]).double()
     box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
-    want = integrate(
+    want = integrate_pixels(
         torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0],
         STEP / fine,
         pitch_um=STEP,

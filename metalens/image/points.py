@@ -26,9 +26,10 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import PropagationError
-from metalens.field import compiled, polarised
-from metalens.field.rays import Paths, Rays, landing, rays, source_paths, through_stop
-from metalens.field.waves import Wave
+from metalens.image import compiled, polarised
+from metalens.image.rays import Paths, Rays, landing, rays, source_paths, through_stop
+from metalens.image.scene import plain
+from metalens.image.waves import Wave
 from metalens.lens import Layers, media
 from metalens.psf import VectorPupil, dominant_components
 
@@ -46,7 +47,7 @@ class Window:
 
     curved: with the flux of the second order as well, three times the work.
     components: of the fields of both polarisations, so many of the strongest mixtures
-        (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one
+        (:mod:`metalens.image.polarised`), each as much work as a scalar; 0 for one
         scalar.
     flux: whether those give the flux through the sensor's plane, which a pixel counts, or |Ex|² + |Ey|² + |Ez|².
     period: of the nodes, in widths of the window. Light from beyond half of it is seen
@@ -377,7 +378,7 @@ def _fluxes(
     for sign, pupil in pupils:
         part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
-        if compiled.plain(spectrum):
+        if plain(spectrum):
             found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
         else:
             found = [

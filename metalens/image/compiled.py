@@ -5,9 +5,6 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
-from metalens.image.scene import fixed as fixed
-from metalens.image.scene import plain as plain
-from metalens.image.scene import values as values
 from metalens.lens import answers
 from metalens.propagate import sincos_turns32
 

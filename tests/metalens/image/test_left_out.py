@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from metalens.design import Focus
-from metalens.field import Layers, Optics, SmoothWave, Window, psfs
-from metalens.field.left_out import Judged, folded, polarised, unpolarised
-from metalens.field.texture import texture_error
+from metalens.image import Optics, SmoothWave, Window, psfs
+from metalens.image.left_out import Judged, folded, polarised, unpolarised
+from metalens.image.texture import texture_error
+from metalens.lens import Layers
 from metalens.psf import SpectralNodes
 
 WAVE, DISTANCE = 0.85, 33.0

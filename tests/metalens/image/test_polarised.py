@@ -14,11 +14,11 @@ from scipy import special
 
 from metalens.core.errors import PropagationError
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.field.polarised import factors
-from metalens.field.rays import Rays
-from metalens.field.texture import texture_error
-from metalens.image import Frames
+from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
+from metalens.image.polarised import factors
+from metalens.image.rays import Rays
+from metalens.image.texture import texture_error
+from metalens.lens import Layers
 from metalens.psf import (
     VectorPupil,
     dominant_components,

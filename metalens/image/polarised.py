@@ -21,7 +21,7 @@ passes; fields are how it lies on the window.
 import torch
 from torch import Tensor
 
-from metalens.field.rays import Rays
+from metalens.image.rays import Rays
 from metalens.psf import VectorPupil, beyond_faces, of_flux, transmitted_polarization
 
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out

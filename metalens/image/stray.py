@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from metalens.core.arrays import Array
-from metalens.field.plan import Grid
-from metalens.field.points import Optics
-from metalens.field.waves import PillarWave
+from metalens.image.plan import Grid
+from metalens.image.points import Optics
+from metalens.image.waves import PillarWave
 
 ORDERS = (-1, 0, 2, 3)
 NODES = 17  # directions along an axis whose light on the lens behind a stop is traced

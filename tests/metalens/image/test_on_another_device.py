@@ -9,9 +9,19 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import Grid, Layers, SmoothWave, drawn, imager, surrogate
-from metalens.field.points import Optics
-from metalens.image import Frames, basis, image, uniform_imager
+from metalens.image import (
+    Frames,
+    Grid,
+    SmoothWave,
+    basis,
+    drawn,
+    image,
+    imager,
+    surrogate,
+    uniform_imager,
+)
+from metalens.image.points import Optics
+from metalens.lens import Layers
 from tests.elsewhere import AWAY, elsewhere
 
 FOCUS = Focus(0.94, 900.0, 7e3)

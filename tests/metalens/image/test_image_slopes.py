@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from metalens.design import Focus
-from metalens.field import (
+from metalens.image import (
+    Frames,
     Grid,
-    Layers,
     Optics,
     SmoothWave,
     drawn,
@@ -20,8 +20,8 @@ from metalens.field import (
     surrogate,
     with_psfs,
 )
-from metalens.field.slopes import term
-from metalens.image import Frames
+from metalens.image.slopes import term
+from metalens.lens import Layers
 from metalens.psf import SpectralNodes
 
 RADIUS = 40.0
