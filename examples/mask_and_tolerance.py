@@ -31,7 +31,7 @@ from metalens import design, library
 from metalens.design.profiles import Focus
 from metalens.lens.record import DiameterMap
 
-rules = process.load("process.toml")
+rules = process.load_process("process.toml")
 focus = Focus(wavelength_um=0.85, sensor_distance_um=600.0, source_distance_um=20_000.0)
 proxy = library.proxy_of(library.sweep(library.DEFAULT_CELL))
 lens, quality = design.make(
@@ -78,8 +78,8 @@ made = build.prepare_mask(lens, rules, with_doses=False)
 report = check_plan(made.plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())
-oasis_write.write(made.plan, folder / "mask.oas")
-same = compare.compare(made.plan, oasis_read.read(folder / "mask.oas"))
+oasis_write.write_oasis(made.plan, folder / "mask.oas")
+same = compare.compare(made.plan, oasis_read.read_oasis(folder / "mask.oas"))
 print(
     f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as planned: {same.ok}"
 )

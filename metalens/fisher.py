@@ -1,35 +1,13 @@
 """What images tell of a state: Fisher information (paper Eqs. 4-6, 11)."""
 
-from typing import TYPE_CHECKING
-
-from metalens.core.lazy import attach_lazy_exports
-
-if TYPE_CHECKING:
-    from metalens.image.information import Normalisation as Normalisation
-    from metalens.image.information import OpticsLoss as OpticsLoss
-    from metalens.image.information import axial_information as axial_information
-    from metalens.image.information import cramer_rao as cramer_rao
-    from metalens.image.information import encircled_energy as encircled_energy
-    from metalens.image.information import information as information
-    from metalens.image.information import optics_loss as optics_loss
-    from metalens.image.information import pixel_information as pixel_information
-    from metalens.image.information import span_angle as span_angle
-    from metalens.image.information import texture_information as texture_information
-    from metalens.image.information import without_nuisance as without_nuisance
-
-__getattr__, __dir__, __all__ = attach_lazy_exports(
-    __name__,
-    {
-        "Normalisation": "metalens.image.information",
-        "OpticsLoss": "metalens.image.information",
-        "axial_information": "metalens.image.information",
-        "cramer_rao": "metalens.image.information",
-        "encircled_energy": "metalens.image.information",
-        "information": "metalens.image.information",
-        "optics_loss": "metalens.image.information",
-        "pixel_information": "metalens.image.information",
-        "span_angle": "metalens.image.information",
-        "texture_information": "metalens.image.information",
-        "without_nuisance": "metalens.image.information",
-    },
-)
+from metalens.image.information import Normalisation as Normalisation
+from metalens.image.information import OpticsLoss as OpticsLoss
+from metalens.image.information import axial_information as axial_information
+from metalens.image.information import cramer_rao as cramer_rao
+from metalens.image.information import encircled_energy as encircled_energy
+from metalens.image.information import information as information
+from metalens.image.information import optics_loss as optics_loss
+from metalens.image.information import pixel_information as pixel_information
+from metalens.image.information import span_angle as span_angle
+from metalens.image.information import texture_information as texture_information
+from metalens.image.information import without_nuisance as without_nuisance

@@ -74,33 +74,18 @@ def _imports(module):
 
 @functools.cache
 def _face(package):
-    """{public name: (module, name there)} of a folder, and the same as its
-    TYPE_CHECKING block has it.
-    """
-    table, typed = {}, {}
-    for node in _nodes(package):
-        if (
-            isinstance(node, ast.Call)
-            and getattr(node.func, "id", "") == "attach_lazy_exports"
-        ):
-            for key, value in zip(node.args[1].keys, node.args[1].values, strict=True):
-                module, _, there = value.value.partition(":")
-                module = module if "." in module else f"{package}.{module}".rstrip(".")
-                table[key.value] = (module, there or key.value)
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            typed |= {
-                a.asname: (line.module, a.name)
-                for line in node.body
-                for a in line.names
-            }
-    return table, typed
+    """{public name: module that defines it} of a folder, from its stub."""
+    stub = MODULES[package].with_suffix(".pyi")
+    lines = ast.parse(stub.read_text(encoding="utf-8")).body if stub.exists() else []
+    return {
+        alias.name: f"{package}.{line.module or alias.name}"
+        for line in lines
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
 
 
-FACES = [
-    name
-    for name, path in MODULES.items()
-    if "attach_lazy_exports(" in path.read_text(encoding="utf-8") and _face(name)[0]
-]
+FACES = [name for name in MODULES if _face(name)]
 
 
 @functools.cache
@@ -118,12 +103,8 @@ def _uses(module):
             ]
         elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
             for alias in node.names:
-                full, table = f"{node.module}.{alias.name}", _face(node.module)[0]
-                home = (
-                    full
-                    if full in MODULES
-                    else table.get(alias.name, (node.module,))[0]
-                )
+                full, table = f"{node.module}.{alias.name}", _face(node.module)
+                home = full if full in MODULES else table.get(alias.name, node.module)
                 found.append((node.module, home, alias.name))
     return found
 
@@ -223,9 +204,9 @@ def test_what_crosses_folders_is_public():
     for module in MODULES:
         for source, home, name in _uses(module):
             folder = _folder(home)
-            if folder in (_folder(module), *PACKAGES) or module in FACES:
+            if folder in (_folder(module), *PACKAGES) or _folder(module) in PACKAGES:
                 continue
-            public, last = _face(folder)[0], home.rpartition(".")[2]
+            public, last = _face(folder), home.rpartition(".")[2]
             offered = (
                 name in public or last in public or MODULES[home].name == "__init__.py"
             )
@@ -236,21 +217,10 @@ def test_what_crosses_folders_is_public():
 
 @pytest.mark.parametrize("package", FACES)
 def test_a_face_shows_what_is_public_and_nothing_else(package):
-    table, typed = _face(package)
-    as_typed = {
-        n: (f"{module}.{n}", n)
-        if not there or f"{module}.{n}" in MODULES
-        else (module, there)
-        for n, (module, there) in typed.items()
-    }
-    as_table = {
-        n: (f"{module}.{n}", n) if module == package else (module, there)
-        for n, (module, there) in table.items()
-    }
-    assert as_typed == as_table
+    table = _face(package)
     loaded = importlib.import_module(package)
     assert dir(loaded) == sorted(table) == loaded.__all__
-    for name, (module, _) in as_table.items():
+    for name, module in table.items():
         shadowed = f"{package}.{name}" in MODULES and module != f"{package}.{name}"
         assert not shadowed, (
             f"{package}.{name} is a module and a public name: whoever loads one hides the other"

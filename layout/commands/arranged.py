@@ -53,7 +53,7 @@ def run(options: Options) -> int:
     process = (
         processes.Process()
         if options.process is None
-        else processes.load(options.process)
+        else processes.load_process(options.process)
     )
     if not options.dose:
         process = dataclasses.replace(
@@ -189,9 +189,9 @@ def _write(work: FloorplanWork, made: MaskAssembly) -> None:
     options = work.options
     neither = not (options.oasis or options.gds)
     if options.oasis or neither:
-        _one(work, made, "mask.oas", oasis_write.write)
+        _one(work, made, "mask.oas", oasis_write.write_oasis)
     if options.gds or neither:
-        _one(work, made, "mask.gds", gdsii_write.write)
+        _one(work, made, "mask.gds", gdsii_write.write_gdsii)
 
 
 def _one(

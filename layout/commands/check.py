@@ -73,7 +73,7 @@ def run(options: Options) -> int:
     process = (
         processes.Process()
         if options.process is None
-        else processes.load(options.process)
+        else processes.load_process(options.process)
     )
     output = (
         options.claim(options.output)
@@ -150,7 +150,7 @@ def read_mask(
     if other:
         raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
     is_oasis = start.startswith(oasis_bytes.MAGIC)
-    reader = oasis_read.read if is_oasis else gdsii_read.read
+    reader = oasis_read.read_oasis if is_oasis else gdsii_read.read_gdsii
     return reader(
         path, limit=placement_limit(path) if limit is None else limit, keep=keep
     )

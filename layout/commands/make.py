@@ -74,7 +74,7 @@ def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnL
         process = (
             processes.Process()
             if options.process is None
-            else processes.load(options.process)
+            else processes.load_process(options.process)
         )
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
@@ -151,17 +151,17 @@ def _write_masks(job: LayoutJob, target: Path) -> None:
     if options.writes_oasis:
         path = target / "mask.oas"
         with job.stages("write OASIS"):
-            oasis_write.write(plan, path)
-        _read_back(job, path, oasis_read.read)
+            oasis_write.write_oasis(plan, path)
+        _read_back(job, path, oasis_read.read_oasis)
     if options.writes_gds:
         path = target / "mask.gds"
         with job.stages("write GDSII"):
-            gdsii_write.write(plan, path)
-        _read_back(job, path, gdsii_read.read)
+            gdsii_write.write_gdsii(plan, path)
+        _read_back(job, path, gdsii_read.read_gdsii)
     if options.dxf:
         path = target / "mask.dxf"
         with job.stages("write DXF"):
-            count = dxf.write(plan, path, window=options.window)
+            count = dxf.write_dxf(plan, path, window=options.window)
         with job.stages("read back dxf"):
             job.compared[path.name] = compare.ReadbackComparison(
                 count, dxf.dxf_differences(plan, path, window=options.window)

@@ -244,7 +244,7 @@ def written_part(work: FloorplanWork, made: build.MadePlan) -> parts.DieComponen
     with work.stages(f"{name}: check"):
         work.broken(name, check_plan(plan, process.rules))
     path = work.folder / f"{name}.oas"
-    oasis_write.write(plan, path)
+    oasis_write.write_oasis(plan, path)
     content = read_mask(path, make.MOST_READ)
     path.unlink()
     work.failures += [

@@ -55,7 +55,9 @@ def validate_mask(
     oasis = data[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
     try:
         if content is None:
-            content = oasis_read.read(path) if oasis else gdsii_read.read(path)
+            content = (
+                oasis_read.read_oasis(path) if oasis else gdsii_read.read_gdsii(path)
+            )
     except MaskFileError as error:
         return [FormatFinding(_offset(error), str(error))]
     own = _oasis(path, data) if oasis else _gdsii(content, data)

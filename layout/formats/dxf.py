@@ -44,7 +44,7 @@ class DxfWindow:
             raise ProcessError(f"window {self}: need a finite place and a size above 0")
 
 
-def write(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
+def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
     """Write the pillars whose site lies in the window, and all figures; the number of
     pillars.
 

@@ -73,7 +73,7 @@ class _Batch:
         return CellPlacements(names, *self.held.columns(), tuple(self.turns))
 
 
-def read(
+def read_gdsii(
     path: str | Path, *, limit: int = LIMIT, keep: int | None = None
 ) -> MaskContent:
     """Read a GDSII file.

@@ -31,7 +31,7 @@ REFERENCE_BYTES = 28  # of each pillar: a reference to a cell of a four-letter n
 MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
 
 
-def write(mask: MaskPlan | MaskAssembly, path: str | Path) -> None:
+def write_gdsii(mask: MaskPlan | MaskAssembly, path: str | Path) -> None:
     """Write a mask as GDSII; the file appears whole or not at all.
 
     Args:

@@ -31,7 +31,7 @@ _BYTES_EACH = 16  # of a compressed block, for each placement that may be read
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 
-def read(
+def read_oasis(
     path: str | Path, *, limit: int = LIMIT, keep: int | None = None
 ) -> MaskContent:
     """Read an OASIS file.

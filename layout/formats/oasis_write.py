@@ -31,7 +31,7 @@ _REPEATED = 8  # bit of a placement that says that a repetition follows
 _THREADS = 2
 
 
-def write(
+def write_oasis(
     mask: MaskPlan | MaskAssembly, path: str | Path, *, fold: bool = True
 ) -> None:
     """Write a mask as OASIS; the file appears whole or not at all.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.process.process import load
+from layout.process.process import load_process
 from layout.shapes import convex, polygon
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
@@ -24,7 +24,7 @@ def printable_limits(
         ConfigError, ProcessError: the file cannot be used; ProcessError: no diameter
             keeps both rules on this pitch.
     """
-    process = load(path)
+    process = load_process(path)
     rules, pitch = process.rules, pitch_um / nm
     least = max(4 * rules.grid_nm, rules.diameter_step_nm)
     sizes = np.arange(

@@ -401,7 +401,7 @@ class Process:
         return np.asarray(2 * area / (math.pi * np.maximum(written_nm, 1e-9)))
 
 
-def load(path: str | Path) -> Process:
+def load_process(path: str | Path) -> Process:
     """Read PROCESS.toml; CSV files that it names lie beside it.
 
     Raises:

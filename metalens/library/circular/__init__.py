@@ -2,22 +2,6 @@
 one by one.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from metalens.core.lazy import attach_lazy_exports
-
-if TYPE_CHECKING:
-    from metalens.library.circular.turned import GeometricPhase as GeometricPhase
-    from metalens.library.circular.turned import (
-        check_geometric_phase as check_geometric_phase,
-    )
-    from metalens.library.circular.turned import solve_rotations as solve_rotations
-
-__getattr__, __dir__, __all__ = attach_lazy_exports(
-    __name__,
-    {
-        "GeometricPhase": "turned",
-        "check_geometric_phase": "turned",
-        "solve_rotations": "turned",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -96,7 +96,7 @@ def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch
     assert "The next mask" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     assert lens.load(folder / "out" / "lens_corrected.h5").profile.endswith("corrected")
-    assert process.load(folder / "out" / "bias.toml").bias.table_nm
+    assert process.load_process(folder / "out" / "bias.toml").bias.table_nm
     kept = (folder / "out" / "retrained.safetensors").read_bytes()
 
     assert _retrain(folder, *truth) == 2

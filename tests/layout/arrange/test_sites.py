@@ -57,7 +57,10 @@ def assembly(block):
 
 @pytest.mark.parametrize(
     ("write", "read"),
-    [(gdsii_write.write, layout.read_gdsii), (oasis_write.write, layout.read_oasis)],
+    [
+        (gdsii_write.write_gdsii, layout.read_gdsii),
+        (oasis_write.write_oasis, layout.read_oasis),
+    ],
     ids=["gds", "oas"],
 )
 @pytest.mark.parametrize("keep", [None, 5])

@@ -61,7 +61,7 @@ def folder(tmp_path_factory):
     made = MaskAssembly(
         "PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0
     )
-    gdsii_write.write(made, target / "pads.gds")
+    gdsii_write.write_gdsii(made, target / "pads.gds")
     (target / "process.toml").write_text(
         "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
     )

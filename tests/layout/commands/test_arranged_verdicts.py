@@ -68,7 +68,7 @@ def folder(tmp_path_factory):
     )
     for cell in (pads, thin):
         file = target / f"{cell.name.lower()}.gds"
-        gdsii_write.write(MaskAssembly(cell.name, {cell.name: cell}, {}), file)
+        gdsii_write.write_gdsii(MaskAssembly(cell.name, {cell.name: cell}, {}), file)
     (target / "pec.toml").write_text(PEC)
     (target / "plain.toml").write_text(PLAIN)
     return target

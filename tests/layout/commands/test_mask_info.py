@@ -47,7 +47,7 @@ def test_shapes_of_every_layer_are_those_that_klayout_counts(
     make_plan, tmp_path, capsys, ending, kind
 ):
     path = tmp_path / f"m.{ending}"
-    (oasis_write.write if ending == "oas" else gdsii_write.write)(
+    (oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii)(
         make_plan(seed=7), path
     )
     assert main(["info", str(path), "--json"]) == SUCCESS
@@ -67,7 +67,7 @@ def test_shapes_of_every_layer_are_those_that_klayout_counts(
 
 def test_a_mask_cut_short_is_refused_by_name(make_plan, tmp_path, capsys):
     path = tmp_path / "m.gds"
-    gdsii_write.write(make_plan(seed=7), path)
+    gdsii_write.write_gdsii(make_plan(seed=7), path)
     path.write_bytes(path.read_bytes()[:-40])
     assert main(["info", str(path)]) == BAD_INPUT
     assert str(path) in capsys.readouterr().err
@@ -102,7 +102,7 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
         ),
     }
     cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
-    write = oasis_write.write if ending == "oas" else gdsii_write.write
+    write = oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii
     write(MaskAssembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
     assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
@@ -127,7 +127,7 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
         "ONE": (CellCopies("A", 0, 0), CellCopies("EMPTY", 0, 0, rows=9, up=(0, 5))),
         "TWO": (CellCopies("A", 3, 4),) * 3,
     }
-    gdsii_write.write(
+    gdsii_write.write_gdsii(
         MaskAssembly("L", {cell.name: cell for cell in cells}, copies),
         tmp_path / "w.gds",
     )

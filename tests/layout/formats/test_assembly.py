@@ -23,8 +23,8 @@ from layout.formats import (
 from metalens.core.errors import ProcessError
 
 WRITERS = {
-    ".gds": (gdsii_write.write, gdsii_read.read),
-    ".oas": (oasis_write.write, oasis_read.read),
+    ".gds": (gdsii_write.write_gdsii, gdsii_read.read_gdsii),
+    ".oas": (oasis_write.write_oasis, oasis_read.read_oasis),
 }
 BAR = np.array([[0, 0], [10, 0], [10, 23], [0, 23]])
 ELL = np.array([[0, 0], [90, 0], [90, 40], [31, 40], [31, 70], [0, 70]])
@@ -250,6 +250,6 @@ def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
         "TOP", cells, {"TOP": (CellCopies("A", 0, 0, columns=32768, across=(30, 0)),)}
     )
     with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
-        gdsii_write.write(long, tmp_path / "m.gds")
-    oasis_write.write(long, tmp_path / "m.oas")
-    assert len(oasis_read.read(tmp_path / "m.oas").cells["TOP"].placed.x) == 32768
+        gdsii_write.write_gdsii(long, tmp_path / "m.gds")
+    oasis_write.write_oasis(long, tmp_path / "m.oas")
+    assert len(oasis_read.read_oasis(tmp_path / "m.oas").cells["TOP"].placed.x) == 32768

@@ -16,7 +16,7 @@ from metalens import cli
 from metalens.core.errors import MaskFileError
 
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
-READ = {"gds": gdsii_read.read, "oas": oasis_read.read}
+READ = {"gds": gdsii_read.read_gdsii, "oas": oasis_read.read_oasis}
 PARSE = {"gds": gdsii_read.parse_gdsii, "oas": oasis_read.parse_oasis}
 FORMS = [("gds", {}), ("oas", {}), ("oas", {"fold": False})]
 

@@ -88,11 +88,11 @@ def written(made, folder, suffix):
     plan = build.plan(made, PROCESS, furnished=True)
     path = folder / f"m.{suffix}"
     if suffix == "gds":
-        gdsii_write.write(plan, path)
-        content = gdsii_read.read(path)
+        gdsii_write.write_gdsii(plan, path)
+        content = gdsii_read.read_gdsii(path)
     else:
-        oasis_write.write(plan, path)
-        content = oasis_read.read(path)
+        oasis_write.write_oasis(plan, path)
+        content = oasis_read.read_oasis(path)
     outcome = compare.compare(plan, content)
     assert outcome.ok, outcome.differences
     return plan, shapes(path)
@@ -599,7 +599,7 @@ def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
     db = pytest.importorskip("klayout.db")
     made = of_sizes(shape, kind)
     plan = build.plan(made, PROCESS, furnished=False)
-    gdsii_write.write(plan, tmp_path / "m.gds")
+    gdsii_write.write_gdsii(plan, tmp_path / "m.gds")
     drawn = region(tmp_path / "m.gds", "LENS")
     found = check_plan(plan, PROCESS.rules)
     # of curves chords at an angle are no widths; edges that share a corner count for
@@ -721,8 +721,8 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
     found = []
     for tone in ("positive", "negative"):
         plan = build.plan(made, dataclasses.replace(PROCESS, tone=tone))
-        gdsii_write.write(plan, tmp_path / f"{tone}.gds")
-        assert compare.compare(plan, gdsii_read.read(tmp_path / f"{tone}.gds")).ok
+        gdsii_write.write_gdsii(plan, tmp_path / f"{tone}.gds")
+        assert compare.compare(plan, gdsii_read.read_gdsii(tmp_path / f"{tone}.gds")).ok
         found.append(exposed(tmp_path / f"{tone}.gds"))
     (stays, _, die), (drawn, area, _) = found
     assert (drawn & stays).is_empty()

@@ -24,7 +24,7 @@ def test_designs_at_the_limits_are_drawn_within_the_rules(tmp_path, text):
     path = tmp_path / "process.toml"
     path.write_text(text)
     least, gap = printable_limits(path, pitch_um=0.4, height_um=0.7)
-    rules = process.load(path)
+    rules = process.load_process(path)
     sizes = np.random.default_rng(1).uniform(least, 400 - gap, (30, 30)) * 1e-3
     sizes[0, :3] = np.array([least, 400 - gap, 400 - gap]) * 1e-3
     found = layout.check_plan(
@@ -71,7 +71,7 @@ def test_a_tenth_of_a_step_beyond_the_limits_the_mask_breaks_a_rule(
     the widest loses what isolation takes."""
     path = tmp_path / "process.toml"
     path.write_text(text)
-    rules = process.load(path)
+    rules = process.load_process(path)
     least, gap = printable_limits(path, pitch_um=0.4, height_um=0.7)
     for one in (False, True):
         assert drawn_well(least + 0.05, rules, alone=one)

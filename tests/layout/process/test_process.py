@@ -27,7 +27,7 @@ DESIGN = np.arange(80, 340, 2.0)
 
 
 def test_the_example_says_what_the_defaults_say_but_for_the_bias_and_the_wall():
-    example = process.load(EXAMPLE)
+    example = process.load_process(EXAMPLE)
     assert example.rules == DesignRules()
     assert example.layers == LayerTable()
     assert example.exposure == ExposureSettings(
@@ -39,12 +39,12 @@ def test_the_example_says_what_the_defaults_say_but_for_the_bias_and_the_wall():
 
 
 def test_a_process_survives_its_own_toml():
-    example = process.load(EXAMPLE)
+    example = process.load_process(EXAMPLE)
     assert config.loads(config.dumps(example), Process) == example
 
 
 def test_the_drawn_pillar_makes_the_designed_one():
-    example = process.load(EXAMPLE)
+    example = process.load_process(EXAMPLE)
     for alone in (0.0, 0.4, 1.0):
         drawn = example.written_diameter_nm(DESIGN, alone)
         assert np.abs(example.made_diameter_nm(drawn, alone) - DESIGN).max() < 1e-8
@@ -76,12 +76,12 @@ def test_bias_and_exposure_tables_lie_beside_the_toml(tmp_path):
     toml.write_text(
         '[bias]\ncsv = "bias.csv"\n[exposure]\ncsv = "psf.csv"\n', encoding="utf-8"
     )
-    found = process.load(toml)
+    found = process.load_process(toml)
     assert found.bias.table_nm == ((100.0, -3.0), (200.0, 0.5))
     assert found.exposure.csv == tmp_path / "psf.csv"
     (tmp_path / "psf.csv").unlink()
     with pytest.raises(ConfigError, match="no such file"):
-        process.load(toml)
+        process.load_process(toml)
 
 
 @pytest.mark.parametrize(
@@ -121,4 +121,4 @@ def test_a_bad_process_file_is_refused_with_the_key(tmp_path, text, words):
     toml = tmp_path / "process.toml"
     toml.write_text(text, encoding="utf-8")
     with pytest.raises((ConfigError, ProcessError), match=words):
-        process.load(toml)
+        process.load_process(toml)

@@ -1,0 +1,15 @@
+from . import capture as capture
+from .alike import FrameSpectra as FrameSpectra
+from .alike import above_rim as above_rim
+from .alike import normalized_cross_correlation as normalized_cross_correlation
+from .alike import shift_frames as shift_frames
+from .capture import Capture as Capture
+from .electrons import ElectronFrames as ElectronFrames
+from .electrons import SensorNoise as SensorNoise
+from .electrons import merge_brackets as merge_brackets
+from .electrons import to_electrons as to_electrons
+from .rounding import quantization_score as quantization_score
+from .turns import MIRRORED as MIRRORED
+from .turns import TURNS as TURNS
+from .turns import orient_frames as orient_frames
+from .turns import relative_orientation as relative_orientation

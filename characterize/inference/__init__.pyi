@@ -1,0 +1,15 @@
+from . import asbuilt as asbuilt
+from . import knowable as knowable
+from . import leastsquares as leastsquares
+from . import missing as missing
+from . import posterior as posterior
+from .asbuilt import AsBuilt as AsBuilt
+from .estimate import FitOptions as FitOptions
+from .estimate import fit as fit
+from .leastsquares import FitImages as FitImages
+from .leastsquares import FitSolution as FitSolution
+from .leastsquares import GaussianPrior as GaussianPrior
+from .leastsquares import SolverSettings as SolverSettings
+from .leastsquares import invert_information as invert_information
+from .missing import UnmodelledShifts as UnmodelledShifts
+from .search import SearchTask as SearchTask

@@ -1,0 +1,4 @@
+from .fit import PupilFit as PupilFit
+from .fit import fit_pupil as fit_pupil
+from .fit import save as save
+from .record import PupilSpec as PupilSpec

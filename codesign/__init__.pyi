@@ -1,0 +1,5 @@
+from .adapt.train import retrain as retrain
+from .eye.renderer import render as render
+from .network.cost import macs as macs
+from .network.supernet import Supernet as Supernet
+from .train.evolution import search as search

@@ -1,0 +1,14 @@
+from . import bench as bench
+from . import people_file as people_file
+from . import personal as personal
+from . import shared as shared
+from .bench import GazeErrors as GazeErrors
+from .personal import PersonalGaze as PersonalGaze
+from .personal import SphereCalibrator as SphereCalibrator
+from .personal import angle_deg as angle_deg
+from .readings import CalibratedPerson as CalibratedPerson
+from .readings import NetworkReadings as NetworkReadings
+from .readings import PersonCalibrator as PersonCalibrator
+from .readings import face_angles as face_angles
+from .shared import MixedModelPerson as MixedModelPerson
+from .shared import PopulationPrior as PopulationPrior

@@ -1,0 +1,10 @@
+from .drc.lattice import check_plan as check_plan
+from .formats.compare import compare as compare
+from .formats.dxf import write_dxf as write_dxf
+from .formats.gdsii_read import read_gdsii as read_gdsii
+from .formats.gdsii_write import write_gdsii as write_gdsii
+from .formats.oasis_read import read_oasis as read_oasis
+from .formats.oasis_write import write_oasis as write_oasis
+from .mask.build import plan as plan
+from .process.process import Process as Process
+from .process.process import load_process as load_process

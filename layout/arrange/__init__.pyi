@@ -1,0 +1,12 @@
+from . import apart as apart
+from . import job_file as job_file
+from . import joined as joined
+from . import parts as parts
+from . import seen as seen
+from . import wafer as wafer
+from .record import CellPart as CellPart
+from .record import Floorplan as Floorplan
+from .record import FrameSettings as FrameSettings
+from .record import LensPart as LensPart
+from .record import Placement as Placement
+from .record import WaferSettings as WaferSettings

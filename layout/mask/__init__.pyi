@@ -1,0 +1,12 @@
+from . import build as build
+from . import fields as fields
+from . import symmetry as symmetry
+from . import tone as tone
+from .field_figure import with_fields as with_fields
+from .fields import FieldPlan as FieldPlan
+from .plan import EXPOSED as EXPOSED
+from .plan import UNDRAWN as UNDRAWN
+from .plan import FigureCell as FigureCell
+from .plan import MaskPlan as MaskPlan
+from .plan import PillarClass as PillarClass
+from .plan import PillarLattice as PillarLattice

@@ -1,0 +1,15 @@
+from . import bodies as bodies
+from . import correct as correct
+from . import nodes as nodes
+from . import psf as psf
+from . import sampled as sampled
+from .assign import DoseLadder as DoseLadder
+from .assign import dose_ladder as dose_ladder
+from .bodies import ExposedRectangles as ExposedRectangles
+from .bodies import PillarArray as PillarArray
+from .correct import DoseResult as DoseResult
+from .correct import DoseSolution as DoseSolution
+from .drawn import DrawnDiscs as DrawnDiscs
+from .drawn import DrawnKinds as DrawnKinds
+from .drawn import DrawnOutlines as DrawnOutlines
+from .uniformity import DoseUniformity as DoseUniformity

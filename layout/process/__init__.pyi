@@ -1,0 +1,11 @@
+from . import isolation as isolation
+from . import names as names
+from . import process as process
+from .jit import announce_compilation as announce_compilation
+from .jit import compile_loop as compile_loop
+from .process import DesignRules as DesignRules
+from .process import ExposureSettings as ExposureSettings
+from .process import KeepOutZone as KeepOutZone
+from .process import LayerNumber as LayerNumber
+from .process import Process as Process
+from .process import WriteField as WriteField

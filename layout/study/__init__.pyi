@@ -1,0 +1,2 @@
+from . import page as page
+from .focus import check_study_lens as check_study_lens

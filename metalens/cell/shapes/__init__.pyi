@@ -1,0 +1,14 @@
+from . import motion as motion
+from .every import Shape as Shape
+from .outline import EllipseArc as EllipseArc
+from .outline import Outline as Outline
+from .outline import PolygonLoop as PolygonLoop
+from .outline import rotate_corners as rotate_corners
+from .round import Circle as Circle
+from .round import Ellipse as Ellipse
+from .round import Ring as Ring
+from .straight import Cross as Cross
+from .straight import Polygon as Polygon
+from .straight import Rectangle as Rectangle
+from .straight import RegularPolygon as RegularPolygon
+from .straight import Square as Square

@@ -1,0 +1,15 @@
+from . import arrays as arrays
+from . import config as config
+from . import console as console
+from . import errors as errors
+from . import executor as executor
+from . import legendre as legendre
+from . import lock as lock
+from . import manifest as manifest
+from . import paths as paths
+from . import reading as reading
+from . import report as report
+from . import store as store
+from . import threads as threads
+from . import transaction as transaction
+from . import units as units

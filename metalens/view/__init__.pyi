@@ -1,0 +1,13 @@
+from .artefacts import lens_panels as lens_panels
+from .page import page_html as page_html
+from .page import write_page as write_page
+from .panels import ClassMapPanel as ClassMapPanel
+from .panels import CurvePanel as CurvePanel
+from .panels import DrawingPanel as DrawingPanel
+from .panels import ImagePanel as ImagePanel
+from .panels import OutlinePanel as OutlinePanel
+from .panels import Panel as Panel
+from .panels import PointPanel as PointPanel
+from .panels import SliderAxis as SliderAxis
+from .panels import TablePanel as TablePanel
+from .panels import at_brightest as at_brightest
