@@ -18,13 +18,12 @@ from characterize.model import (
     true_depth,
     usual_parameters,
 )
-from metalens import lens as lenses
 from metalens import psf as psfs
-from metalens.core import store
+from metalens.core import records, store
 from metalens.core.arrays import Array
 from metalens.core.reading import typed_reader
 from metalens.core.store import Provenance
-from metalens.fabrication import PairSensitivities, Sensitivity, Solved
+from metalens.fabrication import Sensitivity
 from metalens.lens import DiameterMap, Lens
 
 
@@ -355,71 +354,15 @@ def gaussian_draws(rng: np.random.Generator, count: int, covariance: Array) -> A
     )
 
 
-_ARRAYS = (
-    "value", "covariance", "information", "depth_um", "angle_rad", "measured", "predicted", "nominal", "residual_sigma",
-)  # fmt: skip
-_PAIRS = "width_um", "length_um", "rates"
-_OPTIONAL, _WITHIN = (
-    ("low", "high", "draws", "by_cause", "bench"),
-    ("covariance", "low", "high", "draws"),
-)
-_WORDS = (
-    "names",
-    "identifiable",
-    "degeneracies",
-    "cautions",
-    "problems",
-    "verdicts",
-    "causes",
-)
-
-
 def save(path: str | Path, result: AsBuilt) -> None:
     """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it can
     be used alone.
     """
-    arrays: dict[str, Array] = {name: getattr(result, name) for name in _ARRAYS}
-    arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
-    arrays["held_names"] = np.array(list(result.held))
-    arrays["held"] = np.array(list(result.held.values()), float)
-    arrays |= {
-        name: getattr(result, name) for name in _OPTIONAL if len(getattr(result, name))
-    }
-    arrays |= {
-        f"within/{name}": getattr(result.within, name)
-        for name in _WITHIN
-        if len(getattr(result.within, name))
-    }
-    if len(result.residual_modes):
-        arrays["residual_modes"] = result.residual_modes
-    arrays |= {f"curves/{name}": curve for name, curve in result.curves.items()}
-    arrays |= {"response/coefficients": result.response.coefficients}
-    if result.response.edges is not None:
-        arrays["response/edges"] = result.response.edges
-    if (pairs := result.response.pairs) is not None:
-        arrays |= {f"response/{name}": getattr(pairs, name) for name in _PAIRS}
-    if (solved := result.response.solved) is not None:
-        arrays |= {
-            "response/diameter_um": solved.diameter_um,
-            "response/powers": solved.powers,
-        }
-        arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
+    arrays, attributes = records.flatten_record(result)
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
-    design, about = lenses.lens_to_parts(result.design, group="design/")
-    arrays |= design | {
-        "design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)
-    }
-    about |= {
-        "pixel_um": result.pixel_um,
-        "chi2_per_dof": result.chi2_per_dof,
-        "converged": result.converged,
-        "reason": result.reason,
-        "response_center_um": result.response.center_um,
-        "response_error": result.response.error,
-        "response_low_um": result.response.low_um,
-        "response_high_um": result.response.high_um,
-    }
-    store.save(path, "asbuilt", arrays, attributes=about, provenance=result.provenance)
+    store.save(
+        path, "asbuilt", arrays, attributes=attributes, provenance=result.provenance
+    )
 
 
 @typed_reader
@@ -429,59 +372,4 @@ def load(path: str | Path) -> AsBuilt:
     Raises:
         StoreError: not an as-built file.
     """
-    stored = store.load(path, "asbuilt")
-    a, about = stored.arrays, stored.attributes
-    design = lenses.lens_from_parts(a, about, where=str(path), group="design/")
-    fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
-    fields |= {
-        name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS
-    }
-    fields |= {name: a[name] for name in _OPTIONAL if name in a}
-    fields["within"] = WithinModel(
-        **{name: a[f"within/{name}"] for name in _WITHIN if f"within/{name}" in a}
-    )
-    return AsBuilt(
-        design=design,
-        response=_response(a, about),
-        residual_modes=a.get("residual_modes", np.empty(0)),
-        curves={
-            name.removeprefix("curves/"): a[name]
-            for name in a
-            if name.startswith("curves/")
-        },
-        held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
-        pixel_um=about["pixel_um"],
-        chi2_per_dof=about["chi2_per_dof"],
-        converged=bool(about["converged"]),
-        reason=about["reason"],
-        provenance=stored.provenance,
-        **fields,
-    )
-
-
-def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
-    ends = (
-        about.get("response_low_um", -math.inf),
-        about.get("response_high_um", math.inf),
-    )
-    if "response/rates" in arrays:
-        width, length, rates = (arrays[f"response/{name}"] for name in _PAIRS)
-        return Sensitivity.of_pairs(
-            PairSensitivities(width, length, rates, about["response_error"])
-        )
-    solved = None
-    if "response/powers" in arrays:
-        wave = float(arrays["response/wavelength_um"])
-        solved = Solved(wave, arrays["response/diameter_um"], arrays["response/powers"])
-    more = (
-        about["response_center_um"],
-        about["response_error"],
-        *ends,
-        solved,
-        arrays.get("response/edges"),
-    )
-    return Sensitivity(arrays["response/coefficients"], *more)
-
-
-def _text(array: Array) -> list[str]:
-    return [w.decode() if isinstance(w, bytes) else str(w) for w in array.tolist()]
+    return records.load_record(path, "asbuilt", AsBuilt)

@@ -9,6 +9,7 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import kept, solving
 from metalens.cell import Cell, index
+from metalens.core import records
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
@@ -128,10 +129,8 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
     ]
     media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
     indices = [index(medium, lens.wavelength_um) for medium in media]
-    proxy = {
-        name: np.asarray(value).tolist()
-        for name, value in lens.proxy.to_arrays().items()
-    }
+    arrays, numbers = records.flatten_record(lens.proxy)
+    proxy = numbers | {name: array.tolist() for name, array in arrays.items()}
     return repr(
         (
             cell,

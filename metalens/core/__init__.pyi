@@ -8,6 +8,7 @@ from . import lock as lock
 from . import manifest as manifest
 from . import paths as paths
 from . import reading as reading
+from . import records as records
 from . import report as report
 from . import store as store
 from . import threads as threads

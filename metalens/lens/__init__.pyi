@@ -14,8 +14,6 @@ from .pairs import TwoSizeTable as TwoSizeTable
 from .record import HANDS as HANDS
 from .record import Hand as Hand
 from .record import Lens as Lens
-from .record import lens_from_parts as lens_from_parts
-from .record import lens_to_parts as lens_to_parts
 from .record import load as load
 from .record import load_out_of_core as load_out_of_core
 from .record import load_plain as load_plain

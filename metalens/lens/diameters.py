@@ -1,5 +1,6 @@
 """Sizes of pillars on the sites of a lattice."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -8,7 +9,6 @@ import numpy as np
 from metalens.cell import Lattice
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.lens.rows import RowsOnDisk
 
 _BLOCK_ROWS = 256
 
@@ -31,17 +31,19 @@ class DiameterMap:
     ``row_um`` along y: those with
     row + column odd hold no pillar.
 
-    diameter_um: (y, x) size of every pillar (its diameter where it is round), 0 where
-    there is no pillar and no light
-        passes; +x right, +y down.
-    pitch_um: lattice constant.
-    lattice: square, rectangular or hexagonal.
-    row_um: distance of the rows; 0 for that of the lattice (a mask on a grid may need
-    another, by a fraction).
-    angle_rad: (y, x) turn of every pillar in the plane, from +x to +y, beside that of
-    the shape; None for none.
-    length_um: (y, x) size along y where pillars have two; ``diameter_um`` is then that
-    along x. None: by the shape.
+    Attributes:
+        diameter_um: (y, x) size of every pillar (its diameter where it is round), 0
+            where there is no pillar and no light passes; +x right, +y down. An array,
+            or an HDF5 data set that is read in blocks of rows.
+        pitch_um: lattice constant.
+        lattice: square, rectangular or hexagonal.
+        row_um: distance of the rows; 0 for that of the lattice (a mask on a grid may
+            need another, by a fraction).
+        angle_rad: (y, x) turn of every pillar in the plane, from +x to +y, on top of
+            that of the shape; None for none.
+        length_um: (y, x) size along y where pillars have two; ``diameter_um`` is then
+            that along x. None: by the shape.
+        pillars: how many sites hold a pillar.
 
     Raises:
         LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and
@@ -55,6 +57,7 @@ class DiameterMap:
     row_um: float = 0.0
     angle_rad: Array | None = None
     length_um: Array | None = None
+    pillars: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         d = self.diameter_um
@@ -69,14 +72,18 @@ class DiameterMap:
                 f"row_um = {self.row_um}: rows of this {self.lattice.kind} lattice lie {self.lattice_row_um:.6g} um "
                 "apart; need 0, or that within 10 %"
             )
-        widest, thinnest = float(d.max(initial=0)), float(d.min(initial=0))
-        if not (thinnest >= 0 and widest < self.pitch_um):
-            row, column = _first_bad(d, self.pitch_um)
-            raise LensError(
-                f"diameter at row {row}, column {column} is {d[row, column]} um, "
-                f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
-            )
-        if widest == 0:
+        count = 0
+        for first, block in _blocks(d):
+            wrong = np.argwhere(~((block >= 0) & (block < self.pitch_um)))
+            for row, column in wrong[:1].tolist():
+                raise LensError(
+                    f"diameter at row {first + row}, column {column} is "
+                    f"{block[row, column]} um, "
+                    f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
+                )
+            count += int(np.count_nonzero(block))
+        object.__setattr__(self, "pillars", count)
+        if count == 0:
             raise LensError(
                 "empty aperture: the map holds no pillar; check the aperture and the profile"
             )
@@ -98,16 +105,6 @@ class DiameterMap:
                     raise LensError(
                         "a pillar between the sites of the hexagonal lattice: row + column is odd there"
                     )
-
-    @property
-    def pillars(self) -> int:
-        """How many sites hold a pillar."""
-        held: object = self.diameter_um
-        return (
-            held.count
-            if isinstance(held, RowsOnDisk)
-            else int(np.count_nonzero(self.diameter_um))
-        )
 
     @property
     def lattice_row_um(self) -> float:
@@ -165,9 +162,8 @@ class DiameterMap:
     def radius_um(self) -> float:
         """Distance from the axis to the outermost pillar centre; memory of a few rows."""
         farthest = 0.0
-        for start in range(0, len(self.diameter_um), _BLOCK_ROWS):
-            rows = slice(start, start + _BLOCK_ROWS)
-            there = self.diameter_um[rows] > 0
+        for start, block in _blocks(self.diameter_um):
+            there = block > 0
             held = there.any(axis=1)
             if held.any():
                 first, last = (
@@ -175,20 +171,15 @@ class DiameterMap:
                     there.shape[1] - 1 - there[:, ::-1].argmax(axis=1),
                 )
                 outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
-                farthest = max(
-                    farthest, float(np.hypot(outer, self.y_um[rows])[held].max())
-                )
+                y = self.y_um[start : start + len(block)]
+                farthest = max(farthest, float(np.hypot(outer, y)[held].max()))
         return farthest
 
 
-def _first_bad(d: Array, pitch_um: float) -> tuple[int, int]:
-    """(row, column) of the first diameter that cannot be."""
+def _blocks(d: Array) -> Iterator[tuple[int, Array]]:
+    """(first row, rows) of a map, block by block."""
     for first in range(0, len(d), _BLOCK_ROWS):
-        block = np.asarray(d[first : first + _BLOCK_ROWS])
-        wrong = np.argwhere(~((block >= 0) & (block < pitch_um)))
-        if len(wrong):
-            return first + int(wrong[0, 0]), int(wrong[0, 1])
-    return 0, 0
+        yield first, np.asarray(d[first : first + _BLOCK_ROWS])
 
 
 def _axis(count: int, pitch_um: float) -> Array:

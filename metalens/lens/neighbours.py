@@ -19,7 +19,6 @@ count (:mod:`metalens.psf.budget`).
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -179,18 +178,3 @@ class NeighbourRows:
         apart = [float(np.abs(other.mean(sine) - mine).max()) for other in self.others]
         less = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))
         return [self.coarser, *(self.others[k] for k in np.argsort(apart)[-1:]), less]
-
-    def to_arrays(self) -> dict[str, Array]:
-        """For a file."""
-        about = np.array([self.wavelength_um, self.cover])
-        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS} | {
-            "wavelength_um_cover": about
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "NeighbourRows":
-        """Inverse of :meth:`to_arrays`."""
-        wave, cover = arrays["wavelength_um_cover"].tolist()
-        return cls(
-            **{name: arrays[name] for name in _ARRAYS}, wavelength_um=wave, cover=cover
-        )

@@ -3,17 +3,13 @@ of light polarised along y.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn
 
 import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError, LensError
 from metalens.library import Proxy
-
-NAMES = ("wavelength_um", "x_um", "y_um", "t")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,67 +66,13 @@ class TwoSizeTable:
         )
 
     @property
-    def proxy(self) -> "NoProxy":
-        """What stands where a lens has a proxy: its domain and wavelengths, and a
-        refusal of the rest.
-        """
+    def proxy(self) -> Proxy:
+        """A proxy without a curve: domain, wavelengths and entry error alone."""
         domain = float(self.x_um[0]), float(self.x_um[-1]) + 1e-9
         ends = float(self.wavelength_um[0]), float(self.wavelength_um[-1])
         known = 0.0 if math.isnan(self.entry_error) else self.entry_error
-        return NoProxy(
-            np.zeros((1, 1)),
-            np.zeros((1, 1)),
-            domain,
-            ends,
-            0.0,
-            0.0,
-            entry_error=known,
-        )
-
-    def to_arrays(self) -> dict[str, Array]:
-        """Everything as arrays, for a store file."""
-        alone = {
-            name: np.array(getattr(self, name))
-            for name in ("focus_y_um", "entry_error")
-        }
-        return {name: getattr(self, name) for name in NAMES} | alone
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> "TwoSizeTable":
-        """Inverse of :meth:`to_arrays`."""
-        sensor, source = arrays["focus_y_um"].tolist()
-        wavelength, x, y, t = (arrays[name] for name in NAMES)
-        return cls(
-            wavelength,
-            x,
-            y,
-            t,
-            (sensor, source),
-            float(arrays.get("entry_error", math.nan)),
-        )
-
-
-class NoProxy(Proxy):
-    """Pillars of two sizes are no function of one: whatever asks for phase or level
-    over a diameter is refused.
-    """
-
-    __slots__ = ()
-
-    def at(self, *_: Any, **__: Any) -> NoReturn:
-        """Refuse.
-
-        Raises:
-            LensError: always.
-        """
-        raise LensError(
-            "pillars of two sizes (width and length) have a table, no proxy of one diameter; design, psf, layout, "
-            "export (arrays) and view take such lenses"
-        )
-
-    phase_rad = transmission = dphase_ddiameter = dtransmission_ddiameter = (
-        diameter_um
-    ) = coverage_rad = monotone = at
+        none = np.zeros((1, 0))
+        return Proxy(none, none, domain, ends, 0.0, 0.0, entry_error=known)
 
 
 def _place(axis: Array, size_um: Array) -> Array:

@@ -3,15 +3,15 @@ any wavelength.
 """
 
 import contextlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal
 
+import h5py
 import numpy as np
 
-from metalens.cell import Cell, Lattice
-from metalens.core import config, store
+from metalens.cell import Cell
+from metalens.core import records, store
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.core.reading import read_hdf5, typed_reader
@@ -20,7 +20,6 @@ from metalens.lens.diameters import DiameterMap as DiameterMap
 from metalens.lens.layers import Layers, check_gaps
 from metalens.lens.neighbours import NeighbourRows
 from metalens.lens.pairs import TwoSizeTable
-from metalens.lens.rows import RowsOnDisk
 from metalens.library import Proxy
 
 _NAME = "diameter_um"
@@ -67,7 +66,7 @@ class Lens:
             PropagationError: films thicker than their gap.
     """
 
-    diameters: DiameterMap
+    diameters: DiameterMap = field(metadata={"flat": True})
     cell: Cell
     proxy: Proxy
     wavelength_um: float
@@ -194,8 +193,7 @@ class Lens:
 
 def save(path: str | Path, lens: Lens) -> None:
     """Write a lens file (kind ``lens``); diameters keep their dtype."""
-    arrays, attributes = lens_to_parts(lens)
-    store.save(path, "lens", arrays, attributes=attributes, provenance=lens.provenance)
+    records.save_record(path, "lens", lens)
 
 
 @typed_reader
@@ -205,9 +203,7 @@ def load(path: str | Path) -> Lens:
     Raises:
         StoreError: not a lens file; LensError: its diameters are invalid.
     """
-    stored = store.load(path, "lens")
-    lens = lens_from_parts(stored.arrays, stored.attributes, where=str(path))
-    return replace(lens, provenance=stored.provenance)
+    return records.load_record(path, "lens", Lens)
 
 
 @typed_reader
@@ -235,127 +231,20 @@ def load_plain(path: str | Path) -> Lens:
 
 @typed_reader
 def load_out_of_core(path: str | Path) -> Lens:
-    """As :func:`load`; diameters that would take much memory stay in the file, as
-    :class:`RowsOnDisk`.
+    """As :func:`load`; diameters that would take much memory stay in the file.
 
-    What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray``
-    gives all of them.
+    ``diameters.diameter_um`` is then an HDF5 data set: blocks of its rows are arrays,
+    ``numpy.asarray`` reads all of it.
     """
     large = False
     if Path(path).is_file():  # what else it is tells the loader, and what is damaged
         with contextlib.suppress(*store.DAMAGE):
-            large = read_hdf5(path, _claimed) > MOST_HELD_BYTES
+            large = read_hdf5(path, lambda f: f[_NAME].nbytes) > MOST_HELD_BYTES
     if not large:
         return load(path)
     stored = store.load(path, "lens", without=(_NAME,))
-    held = {**stored.arrays, _NAME: cast(Array, RowsOnDisk(path, _NAME))}
-    return replace(
-        lens_from_parts(held, stored.attributes, where=str(path)),
-        provenance=stored.provenance,
-    )
-
-
-def _claimed(file: Any) -> int:
-    """Bytes of the diameters."""
-    return int(file[_NAME].nbytes)
-
-
-def lens_to_parts(
-    lens: Lens, *, group: str = ""
-) -> tuple[dict[str, Array], dict[str, Any]]:
-    """(arrays, attributes) of a lens for a store file; ``group`` stands before the
-    names of the arrays.
-    """
-    arrays: dict[str, Array] = {f"{group}diameter_um": lens.diameters.diameter_um}
-    about = (
-        ("proxy", lens.proxy.to_arrays())
-        if lens.pairs is None
-        else ("pairs", lens.pairs.to_arrays())
-    )
-    arrays |= {f"{group}{about[0]}/{name}": array for name, array in about[1].items()}
-    attributes = {
-        "pitch_um": lens.diameters.pitch_um,
-        "cell": config.dumps(lens.cell),
-        "wavelength_um": lens.wavelength_um,
-        "sensor_distance_um": lens.sensor_distance_um,
-        "source_distance_um": lens.source_distance_um,
-        "profile": lens.profile,
-    }
-    d = lens.diameters
-    if not d.plain:
-        attributes |= {
-            "lattice": config.dumps(d.lattice),
-            "row_um": d.steps_um[1],
-            "shape": lens.cell.shape.name,
-        }
-        attributes |= {"hand": lens.hand, "light": lens.light}
-    if lens.neighbours is not None:
-        arrays |= {
-            f"{group}neighbours/{name}": array
-            for name, array in lens.neighbours.to_arrays().items()
-        }
-    if d.angle_rad is not None:
-        arrays |= {f"{group}angle_rad": d.angle_rad}
-    if d.length_um is not None:
-        arrays |= {f"{group}length_um": d.length_um}
-    if lens.layers.films or lens.layers.stop is not None:
-        attributes["layers"] = config.dumps(lens.layers)
-    return arrays, attributes
-
-
-def lens_from_parts(
-    arrays: Mapping[str, Array],
-    attributes: Mapping[str, Any],
-    *,
-    where: str,
-    group: str = "",
-) -> Lens:
-    """Inverse of :func:`lens_to_parts`; ``where`` names the file in errors."""
-    proxy, held, rows = (
-        {
-            name.removeprefix(start): array
-            for name, array in arrays.items()
-            if name.startswith(start)
-        }
-        for start in (f"{group}proxy/", f"{group}pairs/", f"{group}neighbours/")
-    )
-    pairs = TwoSizeTable.from_arrays(held) if held else None
-    return Lens(
-        diameters=_diameters(arrays, attributes, where, group),
-        cell=config.loads(attributes["cell"], Cell, where=f"{where}: cell"),
-        proxy=Proxy.from_arrays(proxy) if pairs is None else pairs.proxy,
-        wavelength_um=attributes["wavelength_um"],
-        sensor_distance_um=attributes["sensor_distance_um"],
-        source_distance_um=attributes["source_distance_um"],
-        profile=attributes["profile"],
-        layers=_layers(attributes, where),
-        hand=attributes.get("hand", ""),
-        pairs=pairs,
-        light=attributes.get("light", "x"),
-        neighbours=NeighbourRows.from_arrays(rows) if rows else None,
-    )
-
-
-def _diameters(
-    arrays: Mapping[str, Array], attributes: Mapping[str, Any], where: str, group: str
-) -> DiameterMap:
-    """The map of a file; on a square lattice in files that name none."""
-    plain = DiameterMap(arrays[f"{group}diameter_um"], attributes["pitch_um"])
-    if "lattice" not in attributes:
-        return plain
-    lattice = config.loads(attributes["lattice"], Lattice, where=f"{where}: lattice")
-    row_um = 0.0 if lattice.kind == "square" else attributes["row_um"]
-    turn, length = (arrays.get(f"{group}{name}") for name in ("angle_rad", "length_um"))
-    return replace(
-        plain, lattice=lattice, row_um=row_um, angle_rad=turn, length_um=length
-    )
-
-
-def _layers(attributes: Mapping[str, Any], where: str) -> Layers:
-    """The films of a file; none in files that name none."""
-    text = attributes.get("layers")
-    return (
-        Layers()
-        if text is None
-        else config.loads(text, Layers, where=f"{where}: layers")
+    file = h5py.File(path, "r", rdcc_nbytes=MOST_HELD_BYTES)
+    arrays = {**stored.arrays, _NAME: file[_NAME]}
+    return records.build_record(
+        Lens, arrays, stored.attributes, where=str(path), provenance=stored.provenance
     )

@@ -74,6 +74,8 @@ class Proxy:
             raise DomainError(
                 f"proxy domain is {self.domain_um} um, need 0 <= least < largest"
             )
+        if not self.phase_coefficients.size:
+            return
         least, most = polynomial.certified_bounds(self.transmission_coefficients)
         slack = (
             3e-3 * (most - least) + 1e-12
@@ -232,6 +234,11 @@ class Proxy:
         angle_rad: float,
         ceiling: float = math.inf,
     ) -> polynomial.ChebyshevCurve:
+        if not coefficients.size:
+            raise DomainError(
+                "pillars of two sizes (width and length) have a table, no proxy of one "
+                "diameter; design, psf, layout, export (arrays) and view take such lenses"
+            )
         if coefficients.ndim == 3:
             coefficients = np.asarray(
                 chebyshev.chebval(self._angle_unit(angle_rad), coefficients)
@@ -269,41 +276,6 @@ class Proxy:
         array = np.asarray(diameter_um)
         array = array if array.dtype.kind == "f" else array.astype(float)
         return cast(Values, getattr(polynomial, verb)(p, array)[()])
-
-    def to_arrays(self) -> dict[str, Array]:
-        """Everything as arrays, for a store file."""
-        return {
-            "phase_coefficients": self.phase_coefficients,
-            "transmission_coefficients": self.transmission_coefficients,
-            "domain_um": np.array(self.domain_um),
-            "wavelengths_um": np.array(self.wavelengths_um),
-            "max_error": np.array(
-                [self.max_phase_error_rad, self.max_transmission_error]
-            ),
-            "power": np.array(self.power),
-            "max_angle_rad": np.array(self.max_angle_rad),
-            "entry_error": np.array(self.entry_error),
-            "gaps_um": np.array(self.gaps_um, float).reshape(-1, 2),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Array]) -> "Proxy":
-        """Inverse of :meth:`to_arrays`."""
-        domain, waves, error = (
-            arrays[k].tolist() for k in ("domain_um", "wavelengths_um", "max_error")
-        )
-        return cls(
-            arrays["phase_coefficients"],
-            arrays["transmission_coefficients"],
-            (domain[0], domain[1]),
-            (waves[0], waves[1]),
-            error[0],
-            error[1],
-            int(arrays["power"]),
-            float(arrays["max_angle_rad"]),
-            float(arrays["entry_error"]),
-            tuple((low, high) for low, high in arrays["gaps_um"].tolist()),
-        )
 
 
 def _is_torch(values: object) -> bool:

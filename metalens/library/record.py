@@ -7,12 +7,12 @@ import itertools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
-from metalens.core import config, store
+from metalens.core import records
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.reading import typed_reader
@@ -293,38 +293,7 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
 
 def save(path: str | Path, library: PillarLibrary) -> None:
     """Write a library file (kind ``library``)."""
-    names = (
-        "angle_rad",
-        "wavelength_um",
-        "diameter_um",
-        "t",
-        "r",
-        "t_error",
-        "energy",
-        "resonances",
-    )
-    arrays: dict[str, Array] = {name: getattr(library, name) for name in names}
-    arrays["polarization"] = np.array(library.polarization)
-    arrays["notes"] = np.array(library.notes, dtype=str)
-    if library.proxy is not None:
-        arrays |= {
-            f"proxy/{name}": array for name, array in library.proxy.to_arrays().items()
-        }
-    if library.turned is not None:
-        arrays |= {
-            f"turned/{name}": array
-            for name, array in library.turned.to_arrays().items()
-        }
-    attributes: dict[str, Any] = {
-        "cell": config.dumps(library.cell),
-        "sweep": config.dumps(library.sweep),
-        "engine": library.engine,
-        "solves": library.solves,
-        "axes": "polarization, angle_rad, wavelength_um, diameter_um",
-    }
-    store.save(
-        path, "library", arrays, attributes=attributes, provenance=library.provenance
-    )
+    records.save_record(path, "library", library)
 
 
 @typed_reader
@@ -334,39 +303,4 @@ def load(path: str | Path) -> PillarLibrary:
     Raises:
         StoreError: not a library file; DomainError: its arrays do not fit together.
     """
-    stored = store.load(path, "library")
-    arrays, about = stored.arrays, stored.attributes
-    proxy, turned = (
-        {
-            name.removeprefix(group): array
-            for name, array in arrays.items()
-            if name.startswith(group)
-        }
-        for group in ("proxy/", "turned/")
-    )
-    names = (
-        "angle_rad",
-        "wavelength_um",
-        "diameter_um",
-        "t",
-        "r",
-        "t_error",
-        "energy",
-        "resonances",
-    )
-    return PillarLibrary(
-        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
-        sweep=config.loads(about["sweep"], Sweep, where=f"{path}: sweep"),
-        polarization=tuple(_text(v) for v in arrays["polarization"]),
-        **{name: arrays[name] for name in names},
-        engine=about["engine"],
-        solves=about["solves"],
-        proxy=Proxy.from_arrays(proxy) if proxy else None,
-        notes=tuple(_text(v) for v in arrays["notes"]),
-        provenance=stored.provenance,
-        turned=GeometricPhase.from_arrays(turned) if turned else None,
-    )
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+    return records.load_record(path, "library", PillarLibrary)

@@ -39,9 +39,15 @@ class Table:
         self.diameter_um = np.array(stored["diameter_um"])
         t = np.array(stored["real"]) + 1j * np.array(stored["imaginary"])
         self._spline = CubicSpline(self.diameter_um, np.moveaxis(t, -1, 0))
-        arrays = {name: np.array(value) for name, value in stored["proxy"].items()}
-        self.proxy = Proxy.from_arrays(
-            {"entry_error": np.array(0.0), "gaps_um": np.empty((0, 2))} | arrays
+        about = stored["proxy"]
+        self.proxy = Proxy(
+            np.array(about["phase_coefficients"]),
+            np.array(about["transmission_coefficients"]),
+            tuple(about["domain_um"]),
+            tuple(about["wavelengths_um"]),
+            *about["max_error"],
+            about["power"],
+            about["max_angle_rad"],
         )
 
     def at(self, diameter_um, height_um, wavelength_um):
@@ -84,8 +90,13 @@ def make():
         "real": t.real.round(6).tolist(),
         "imaginary": t.imag.round(6).tolist(),
         "proxy": {
-            name: np.asarray(value).tolist()
-            for name, value in proxy.to_arrays().items()
+            "phase_coefficients": proxy.phase_coefficients.tolist(),
+            "transmission_coefficients": proxy.transmission_coefficients.tolist(),
+            "domain_um": proxy.domain_um,
+            "wavelengths_um": proxy.wavelengths_um,
+            "max_error": [proxy.max_phase_error_rad, proxy.max_transmission_error],
+            "power": proxy.power,
+            "max_angle_rad": proxy.max_angle_rad,
         },
     }
     store.write_text(PATH, json.dumps(stored) + "\n")

@@ -12,7 +12,7 @@ import numpy as np
 
 from metalens.cell import Cell
 from metalens.cell.shapes import Ellipse, Rectangle
-from metalens.core import config, store
+from metalens.core import records
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.reading import typed_reader
@@ -20,7 +20,6 @@ from metalens.core.store import Provenance
 from metalens.library.record import Sweep, check_light
 
 KIND = "axes-library"
-_NAMES = ("wavelength_um", "x_um", "y_um", "t", "t_error", "held_out")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -165,15 +164,7 @@ def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
 
 def save(path: str | Path, library: AxesLibrary) -> None:
     """Write a library file (kind ``axes-library``)."""
-    attributes: dict[str, store.Attribute] = {
-        "cell": config.dumps(library.cell),
-        "sweep": config.dumps(library.sweep),
-        "solves": library.solves,
-        "harmonics": library.harmonics,
-        "axes": "wavelength_um, x_um, y_um, leaves, comes",
-    }
-    arrays = {name: getattr(library, name) for name in _NAMES}
-    store.save(path, KIND, arrays, attributes=attributes, provenance=library.provenance)
+    records.save_record(path, KIND, library)
 
 
 @typed_reader
@@ -183,13 +174,4 @@ def load(path: str | Path) -> AxesLibrary:
     Raises:
         StoreError: not such a file; DomainError: its arrays do not fit together.
     """
-    stored = store.load(path, KIND)
-    about = stored.attributes
-    return AxesLibrary(
-        cell=config.loads(about["cell"], Cell, where=f"{path}: cell"),
-        sweep=config.loads(about["sweep"], Sweep, where=f"{path}: sweep"),
-        **{name: stored.arrays[name] for name in _NAMES},
-        solves=about["solves"],
-        harmonics=about["harmonics"],
-        provenance=stored.provenance,
-    )
+    return records.load_record(path, KIND, AxesLibrary)

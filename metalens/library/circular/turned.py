@@ -94,24 +94,6 @@ class GeometricPhase:
             for hand in (1.0, -1.0)
         )
 
-    def to_arrays(self) -> dict[str, Array]:
-        """Everything as arrays, for a store file."""
-        at = np.array([self.size_um, self.wavelength_um])
-        return {"at": at} | {
-            name: getattr(self, name)
-            for name in ("angle_rad", "t", "t_error", "earlier")
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Array]) -> "GeometricPhase":
-        """Inverse of :meth:`to_arrays`."""
-        size, wavelength = arrays["at"].tolist()
-        return cls(
-            size,
-            wavelength,
-            *(arrays[name] for name in ("angle_rad", "t", "t_error", "earlier")),
-        )
-
 
 def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
     """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1)

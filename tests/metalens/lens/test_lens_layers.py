@@ -9,7 +9,6 @@ import pytest
 
 from metalens import design, lens, psf
 from metalens.cell.record import Cell, Film, Index
-from metalens.core import store
 from metalens.core.errors import LensError, PropagationError
 from metalens.design import Focus, check_focus
 from metalens.lens import Layers, Stop
@@ -72,13 +71,11 @@ def test_the_psf_of_a_lens_goes_through_its_films(proxy):
     )  # 69 um of glass are 15 um of focus, 0.8 of the depth of focus
 
 
-def test_films_are_kept_in_the_file_and_older_files_read_as_before(proxy, tmp_path):
+def test_films_are_kept_in_the_file(proxy, tmp_path):
     one, _ = made(proxy)
     lens.save(tmp_path / "lens.h5", one)
     assert lens.load(tmp_path / "lens.h5").layers == one.layers == LAYERS
     lens.save(tmp_path / "bare.h5", replace(one, layers=Layers()))
-    stored = store.load(tmp_path / "bare.h5", "lens")
-    assert "layers" not in stored.attributes
     assert lens.load(tmp_path / "bare.h5").layers == Layers(cover=CELL.cover)
 
 

@@ -5,6 +5,7 @@ polarisation, and nothing between.
 import numpy as np
 import pytest
 
+from metalens.core import records
 from metalens.core.errors import DomainError, LensError
 from metalens.lens.pairs import TwoSizeTable
 
@@ -66,7 +67,9 @@ def test_a_table_of_another_shape_or_not_finite_is_refused():
 
 
 def test_it_comes_back_from_arrays_and_stands_where_a_proxy_does():
-    back = TwoSizeTable.from_arrays(pairs().to_arrays())
+    back = records.build_record(
+        TwoSizeTable, *records.flatten_record(pairs()), where="a file"
+    )
     assert back.focus_y_um == (210.0, 900.0)
     for name in ("wavelength_um", "x_um", "y_um", "t"):
         assert np.array_equal(getattr(back, name), getattr(pairs(), name))
@@ -74,5 +77,5 @@ def test_it_comes_back_from_arrays_and_stands_where_a_proxy_does():
     low, high = proxy.domain_um
     assert low == X[0]
     assert X[-1] < high < X[-1] + 1e-6
-    with pytest.raises(LensError, match="no proxy of one diameter"):
+    with pytest.raises(DomainError, match="no proxy of one diameter"):
         proxy.transmission(0.1, 0.85)

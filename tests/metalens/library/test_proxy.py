@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from metalens.core import records
 from metalens.core.errors import DomainError
 from metalens.library.proxy import Proxy
 
@@ -240,7 +241,7 @@ def test_inverse_refuses_what_has_no_single_answer():
 
 def test_store_round_trip():
     p = proxy(power=3)
-    q = Proxy.from_arrays(p.to_arrays())
+    q = records.build_record(Proxy, *records.flatten_record(p), where="a file")
     assert (q.domain_um, q.wavelengths_um, q.power) == (
         p.domain_um,
         p.wavelengths_um,

@@ -466,5 +466,3 @@ def test_pillars_on_both_sides_of_a_very_narrow_resonance_are_used():
     # half of the gap, or the tolerance and the resonance's tail
     assert np.abs(reached).max() < steepest / 2 + 3e-3
     assert np.median(np.abs(reached)) < 3e-3
-    again = proxy.Proxy.from_arrays(found.proxy.to_arrays())
-    assert again.gaps_um == found.proxy.gaps_um
