@@ -144,8 +144,8 @@ TOLD = {"mask": "layout.commands.info"}
 # files that a verb reads a part of, and who knows the whole: "module:function" that
 # refuses it
 WHOLE = {
-    "budget": {"process": "layout.process.process:load"},
-    "retrain": {"process": "layout.process.process:load"},
+    "budget": {"process": "layout.process.process:load_process"},
+    "retrain": {"process": "layout.process.process:load_process"},
 }
 
 _LARGEST = 1e9  # size of a number among options, in its unit
