@@ -1,8 +1,7 @@
-"""Rendering, derivatives and image formation: frames a second beside errors."""
+"""Rendering and image formation: frames a second beside errors."""
 
 import time
 
-import numpy as np
 import torch
 
 from benchmarks import Row, fastest
@@ -13,6 +12,7 @@ from codesign.eye.renderer import PinholeCamera
 from metalens.image import pupil, scene
 from metalens.image.pupil import Pupil
 from metalens.psf import integrate_pixels
+from tests.codesign.eye import plain_eye
 
 NONE = float("nan")
 
@@ -26,12 +26,7 @@ def rows() -> list[Row]:
     for threads in sorted({1, numba.config.NUMBA_NUM_THREADS}):
         numba.set_num_threads(threads)
         torch.set_num_threads(threads)
-        out += [
-            *_rendering(threads),
-            *_derivatives(threads),
-            *_imaging(threads),
-            *_sensor(threads),
-        ]
+        out += [*_rendering(threads), *_imaging(threads), *_sensor(threads)]
     numba.set_num_threads(before[0])
     torch.set_num_threads(before[1])
     return out
@@ -41,7 +36,7 @@ def _twin_error(states: object, camera: PinholeCamera) -> float:
     few = states[:2]  # type: ignore[index]
     out = renderer.render(few, camera=camera)
     p = model_parameters(few, CameraRig(), pixel_rad=camera.pitch_um / 2000.0)
-    light, *_ = renderer.render_in_torch(p, CameraRig(), camera)
+    light, *_ = plain_eye.render_in_torch(p, CameraRig(), camera)
     return float((out.frames.radiance - light).norm() / light.norm())
 
 
@@ -60,59 +55,6 @@ def _rendering(threads: int) -> list[Row]:
             "float64 twin, relative L2", threads, goal=f"{1 / seconds:.0f}/s; asked {goal}/s",
         )  # fmt: skip
         out.append(row)
-    return out
-
-
-def _derivatives(threads: int) -> list[Row]:
-    camera, states = PinholeCamera(), dataset.states_at(torch.arange(16), 1)
-    plain = fastest(lambda: renderer.render(states, camera=camera), repeats=12) / len(
-        states
-    )
-    dual = fastest(
-        lambda: renderer.render_sensitivities(states, camera=camera), repeats=12
-    ) / len(states)
-    few = states[:3]
-    made = renderer.render_sensitivities(few, camera=camera)
-    p, first, second = renderer.parameter_tangents(
-        few, ("gaze_x", "slip_z"), rig=CameraRig(), camera=camera
-    )
-    triple = dataset.render_triplets(
-        few, gaze_step_rad=np.radians(0.5), slip_step_um=200.0, camera=camera
-    )
-    coarse = {
-        "gaze": (triple.gaze.pinhole() - triple.anchor.pinhole())
-        / triple.gaze_step_rad,
-        "slip": (triple.slip.pinhole() - triple.anchor.pinhole()) / triple.slip_step_um,
-    }
-    out = []
-    for name, got, tangent in (
-        ("gaze", made.first, first),
-        ("slip", made.second, second),
-    ):
-        _, want = torch.func.jvp(
-            lambda q: renderer.render_in_torch(q, CameraRig(), camera)[0],
-            (p,),
-            (tangent,),
-        )
-        error = float((got.radiance - want).norm() / want.norm())
-        goal = f"{dual / plain:.1f} x the primal for both tangents; asked 4 x at 1e-3"
-        out.append(
-            Row(
-                f"d frame / d {name}",
-                "compiled dual numbers",
-                dual,
-                error,
-                "float64 twin",
-                threads,
-                goal=goal,
-            )
-        )
-        flat = want.sum(1)
-        wrong = float((coarse[name] - flat).norm() / flat.norm())
-        label = "difference over 0.5 deg / 0.2 mm"
-        out.append(
-            Row(f"d frame / d {name}", label, 2 * plain, wrong, "float64 twin", threads)
-        )
     return out
 
 

@@ -65,7 +65,7 @@ def render_triplets(
 
     Accuracy:
         Divided by the default steps, the differences agree with the exact derivatives
-        to 2 % (gaze) and 8 % (slip),
+        to 2 % (gaze) and 10 % (slip),
         with an error in proportion to the step: lashes and lid edges are a few tens of
         um wide. At half a degree,
         where edges move by pixels, they are wrong by 40 % and more.

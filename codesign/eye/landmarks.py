@@ -55,6 +55,35 @@ def landmark_points(p: Tensor) -> Tensor:
     return project_points(torch.stack(points, 1))
 
 
+def trace_to_iris(p: Tensor, tangents: Tensor) -> Tensor:
+    """(k, n, m, 2) points of the iris plane, um, that rays meet behind the cornea: Snell's
+    law at its sphere, as in :mod:`codesign.eye.kernel`.
+
+    Args:
+        p: (n, COUNT) parameters. tangents: (k, n, m, 2) of the rays.
+    """
+    q = p.mT[:, None, :, None]  # vectors along the first axis: sums over it are quick
+    centre, axis, across, below = (
+        q[k : k + 3] for k in (model.CENTRE, model.AXIS, model.IRIS_X, model.IRIS_Y)
+    )
+    ray = torch.stack([*tangents.unbind(-1), torch.ones_like(tangents[..., 0])])
+    ray = ray / (ray * ray).sum(0).sqrt()
+    ball = centre + q[model.CORNEA_D] * axis
+    along = (ball * ray).sum(0)
+    off = ball - along * ray
+    free = q[model.CORNEA_R] ** 2 - (off * off).sum(0)
+    hit = (along - free.clamp_min(1e4).sqrt()) * ray
+    normal = (hit - ball) / q[model.CORNEA_R]
+    eta, cosine = 1 / q[model.INDEX], -(normal * ray).sum(0)
+    bend = eta * cosine - (1 - eta**2 * (1 - cosine**2)).clamp_min(1e-4).sqrt()
+    inward = eta * ray + bend * normal
+    point = hit - centre - q[model.PUPIL_D] * axis
+    slope = -(inward * axis).sum(0)
+    path = ((point * axis).sum(0) / slope.clamp_min(0.05)).clamp_min(0)
+    point = point + path * inward
+    return torch.stack([(point * across).sum(0), (point * below).sum(0)], -1)
+
+
 def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
     """Tangents of the rays that reach points of the iris plane after refraction, by a
     damped Newton iteration.
@@ -81,20 +110,12 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         + lift * axis
         + 1.13 * (iris_um[..., :1] * across + iris_um[..., 1:] * below)
     )
-    q = p.mT[:, :, None]
-
-    def land(t: Tensor) -> Tensor:
-        dx, dy, dz = model.ray(t[..., 0], t[..., 1])
-        tc, cx, cy, cz, _ = model.cornea(q, dx, dy, dz)
-        x, y, _ = model.refract(q, tc, cx, cy, cz, dx, dy, dz)
-        return torch.stack([x, y], -1)
-
     t, h = straight, 1e-6
     around = h * torch.tensor(
         [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=t.dtype
     )
     for _ in range(steps):
-        here, right, left, down, up = land(t + around[:, None, None])
+        here, right, left, down, up = trace_to_iris(p, t + around[:, None, None])
         miss = here - iris_um
         if not t.requires_grad and float(miss.abs().max()) < SETTLED_UM:
             break
@@ -104,7 +125,7 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         dx = (along_y[..., 1] * miss[..., 0] - along_y[..., 0] * miss[..., 1]) / det
         dy = (along_x[..., 0] * miss[..., 1] - along_x[..., 1] * miss[..., 0]) / det
         t = t - torch.stack([dx, dy], -1).clamp(-0.05, 0.05)
-    good = ((land(t) - iris_um).norm(dim=-1, keepdim=True) < 1.0) & (
-        (t - straight).norm(dim=-1, keepdim=True) < 0.3
-    )
+    good = (
+        (trace_to_iris(p, t[None])[0] - iris_um).norm(dim=-1, keepdim=True) < 1.0
+    ) & ((t - straight).norm(dim=-1, keepdim=True) < 0.3)
     return torch.where(good, t, straight)

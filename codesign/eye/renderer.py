@@ -1,15 +1,13 @@
-"""Frames of eyes: radiance and coverage of two sheets, depth, pupil masks, labels, and
-exact derivatives.
-"""
+"""Frames of eyes: radiance and coverage of two sheets, depth, pupil masks and labels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import model, textures
-from codesign.eye.landmarks import NAMES, iris_to_camera, landmark_points
+from codesign.eye import kernel, model, textures
+from codesign.eye.landmarks import iris_to_camera, landmark_points
 from codesign.eye.population import (
     CameraRig,
     EyeStates,
@@ -21,8 +19,6 @@ from codesign.eye.view import CameraView
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
 from metalens.image import Frames
-
-MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z")  # rad, rad, um, um, um
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +141,6 @@ def _compiled(
     seed: int,
     wide: Array,
 ) -> tuple[Frames, Tensor]:
-    from codesign.eye import kernel as render_kernel
-
     n, size = len(p), camera.pixels
     light, cover, depth = (np.empty((n, 2, size, size), np.float32) for _ in range(3))
     pupil = np.empty((n, 1, size, size), np.float32)
@@ -158,9 +152,7 @@ def _compiled(
             slice(first, end),
         )
         out = (light[run], cover[run], depth[run], pupil[run])
-        render_kernel.render(
-            values[run], factor[run], textures.packed_bank(seed), t, t, *out
-        )
+        kernel.render(values[run], factor[run], textures.packed_bank(seed), t, t, *out)
     return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(
         pupil[:, 0]
     )
@@ -231,129 +223,3 @@ def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
         ]
     )
     return p[:, model.PUPIL_R, None, None] * circle
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FrameSensitivities:
-    """Frames and their exact derivatives along two motions.
-
-    frames: as rendered. first, second: derivative of every field of ``frames`` (per
-    rad, per um).
-    """
-
-    frames: Frames
-    first: Frames
-    second: Frames
-
-
-def render_sensitivities(
-    states: EyeStates,
-    motions: tuple[str, str] = ("gaze_x", "slip_z"),
-    *,
-    rig: CameraRig | None = None,
-    camera: PinholeCamera | None = None,
-    texture_seed: int = 0,
-) -> FrameSensitivities:
-    """Derivatives of the rendered sheets by forward-mode dual numbers, compiled
-    (float32).
-
-    The brightness is held: the automatic exposure does not follow the motion.
-
-    Raises:
-        SceneError: a motion is none of MOTIONS.
-    """
-    from codesign.eye import kernel as render_kernel
-
-    rig, camera = rig or CameraRig(), camera or PinholeCamera()
-    packed = torch.stack(parameter_tangents(states, motions, rig=rig, camera=camera), 1)
-    n, size = len(states), camera.pixels
-    t = camera.tangents(rig).astype(np.float32)
-    out = np.empty((n, 3, 5, size, size), np.float32)
-    render_kernel.differentiate(
-        packed.numpy().astype(np.float32),
-        textures.packed_bank(texture_seed),
-        t,
-        t,
-        out.reshape(n, 15, size, size),
-    )
-    scale = states.scale.to(torch.float32)[:, None, None, None]
-    value, first, second = (torch.from_numpy(out[:, k]) for k in range(3))
-    hidden = torch.stack([1 - value[:, 2], value[:, 2]], 1)
-    turns = [torch.stack([-d[:, 2], d[:, 2]], 1) for d in (first, second)]
-    return FrameSensitivities(
-        Frames(value[:, :2], hidden, value[:, 3:] * scale),
-        Frames(first[:, :2], turns[0], first[:, 3:] * scale),
-        Frames(second[:, :2], turns[1], second[:, 3:] * scale),
-    )
-
-
-def parameter_tangents(
-    states: EyeStates,
-    motions: tuple[str, str],
-    *,
-    rig: CameraRig,
-    camera: PinholeCamera,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Parameters (n, COUNT) and their derivatives along two motions."""
-    for name in motions:
-        if name not in MOTIONS:
-            raise SceneError(f"motion {name!r}: need one of {', '.join(MOTIONS)}")
-
-    def packed(change: Tensor) -> Tensor:
-        moved = replace(
-            states,
-            gaze_rad=states.gaze_rad + change[:, :2],
-            slip_um=states.slip_um + change[:, 2:],
-        )
-        return model_parameters(
-            moved, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
-        )
-
-    still = torch.zeros(len(states), len(MOTIONS), dtype=torch.float64)
-    values, slopes = still, []
-    for name in motions:
-        along = still.clone()
-        along[:, MOTIONS.index(name)] = 1
-        values, slope = torch.func.jvp(packed, (still,), (along,))  # type: ignore[misc]
-        slopes.append(slope)
-    return values, slopes[0], slopes[1]
-
-
-def render_in_torch(
-    p: Tensor, rig: CameraRig, camera: PinholeCamera, *, texture_seed: int = 0
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The compiled frames again, in torch and the dtype of ``p``: exact,
-    differentiable, and slow.
-
-    Args:
-        p: (n, COUNT) parameters.
-
-    Returns:
-        light, coverage, depth (n, 2, y, x) and pupil (n, y, x).
-    """
-    bank = torch.tensor(textures.texture_bank(texture_seed), dtype=p.dtype)
-    t = torch.from_numpy(camera.tangents(rig)).to(p)
-    q = p.mT[:, :, None, None]
-    dx, dy, dz = model.ray(t, t[:, None])
-    s, seen, gx, gy, upper, lower, nx, ny, nz = model.lids(q, dx, dy, dz)
-    near = model.skin(q, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz)
-    far, z, hole = model.eye(q, bank, gx, gy, upper, lower, dx, dy, dz)
-    light = torch.stack([near * (1 - seen), far * seen], 1)
-    return (
-        light,
-        torch.stack([1 - seen, seen], 1),
-        torch.stack([s * dz, z * dz], 1),
-        hole * seen,
-    )
-
-
-__all__ = [
-    "NAMES",
-    "FrameLabels",
-    "FrameSensitivities",
-    "PinholeCamera",
-    "RenderedFrames",
-    "render",
-    "render_in_torch",
-    "render_sensitivities",
-]

@@ -34,6 +34,7 @@ from codesign.eye import (
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
+from tests.codesign.eye import plain_eye
 from tests.referees.traced_shapes import LAMP_RADIUS_MM, build
 
 REGIONS = ("pupil", "iris", "sclera", "skin", "edges", "mirrors")
@@ -215,9 +216,11 @@ def _regions(
     the cornea, and the others.
     """
     p, t = _parameters(states, rig, camera), torch.from_numpy(camera.tangents(rig))
-    dx, dy, dz = model.ray(t[None], t[:, None])
-    seen = model.lids(p, dx, dy, dz)[1]
-    disc, pupil, *_ = model.iris(p, _bank(), *model.cornea(p, dx, dy, dz), dx, dy, dz)
+    dx, dy, dz = plain_eye.ray(t[None], t[:, None])
+    seen = plain_eye.lids(p, dx, dy, dz)[1]
+    disc, pupil, *_ = plain_eye.iris(
+        p, _bank(), *plain_eye.cornea(p, dx, dy, dz), dx, dy, dz
+    )
     mirrors = (seen > 0) & _mirrors(p, dx, dy, dz)
     eye = (seen > 0.999) & ~mirrors
     masks = {
@@ -235,7 +238,7 @@ def _mirrors(p: Tensor, dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
     """Where the cornea's sphere mirrors a lamp, or what is within a lamp's radius of
     it.
     """
-    tc, cx, cy, cz, inside = model.cornea(p, dx, dy, dz)
+    tc, cx, cy, cz, inside = plain_eye.cornea(p, dx, dy, dz)
     ray, normal = torch.stack([dx, dy, dz], -1), torch.stack([cx, cy, cz], -1)
     back = ray - 2 * (ray * normal).sum(-1, keepdim=True) * normal
     lamps = p[model.LED : model.LED + 3 * model.LED_COUNT].reshape(-1, 1, 1, 3)

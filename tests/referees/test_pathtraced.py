@@ -13,6 +13,7 @@ from codesign.eye import population as eye
 from codesign.eye.population import CameraRig
 from codesign.eye.renderer import PinholeCamera
 from metalens.core.errors import SceneError
+from tests.codesign.eye import plain_eye
 from tests.referees import pathtraced, traced_shapes
 from tests.referees.pathtraced import Comparison
 
@@ -117,5 +118,5 @@ def test_ambient_light_on_white_skin_is_the_models():
     for normal in (down, -down, np.array([0.0, 0.6, -0.8])):
         cosine = (way @ normal).clip(0)
         got = (sky * cosine).mean() * 4  # radiance of a white surface: irradiance / pi
-        want = model.ambient(p, *torch.from_numpy(normal))
+        want = plain_eye.ambient(p, *torch.from_numpy(normal))
         assert got == pytest.approx(float(want), rel=0.02)  # 200 000 directions

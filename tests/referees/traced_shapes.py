@@ -11,6 +11,7 @@ from torch import Tensor
 
 from codesign.eye import CameraRig, PinholeCamera, model
 from metalens.core.arrays import Array
+from tests.codesign.eye import plain_eye
 
 LAMP_RADIUS_MM = (
     2.0  # of the emitting spheres, large enough to be met by chance through the cornea
@@ -97,7 +98,7 @@ def _rays(
     t = torch.linspace(-1, 1, int(3.2 * camera.pixels) + 1, dtype=p.dtype) * (
         1.6 * float(camera.tangents(rig)[-1])
     )
-    return len(t), model.ray(t[None], t[:, None])
+    return len(t), plain_eye.ray(t[None], t[:, None])
 
 
 def _face(
@@ -105,11 +106,11 @@ def _face(
 ) -> tuple[Array, Array, Array]:
     """Lids and skin: the near sheet without the opening."""
     side, (dx, dy, dz) = _rays(rig, camera, p)
-    s, seen, gx, gy, upper, lower, nx, ny, nz = model.lids(p, dx, dy, dz)
-    light = model.lamps(p, s * dx, s * dy, s * dz, nx, ny, nz, 0.35)
-    albedo = model.skin(p, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz) / (
-        light * p[model.GAIN]
-    )
+    s, seen, gx, gy, upper, lower, nx, ny, nz = plain_eye.lids(p, dx, dy, dz)
+    light = plain_eye.lamps(p, s * dx, s * dy, s * dz, nx, ny, nz, 0.35)
+    albedo = plain_eye.skin(
+        p, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz
+    ) / (light * p[model.GAIN])
     points = torch.stack([s * dx, s * dy, s * dz], -1)
     faces = _grid(side, side)
     open_ = seen.flatten().numpy()[faces].mean(1) > 0.5
@@ -125,10 +126,10 @@ def _globe(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
     unit = _about(p, torch.cos(angle), torch.sin(angle), 513)
     points = p[model.CENTRE : model.CENTRE + 3] + p[model.SCLERA_R] * unit
     dx, dy, dz = (points / points.norm(dim=-1, keepdim=True)).unbind(-1)
-    _, _, gx, gy, _, lower, *_ = model.lids(p, dx, dy, dz)
+    _, _, gx, gy, _, lower, *_ = plain_eye.lids(p, dx, dy, dz)
     zero = torch.zeros_like(gx)
     mx, my, mz = unit.unbind(-1)
-    albedo = model.sclera(p, bank, gx, gy, lower, mx, my, mz, zero, zero)
+    albedo = plain_eye.sclera(p, bank, gx, gy, lower, mx, my, mz, zero, zero)
     return (
         points.reshape(-1, 3).numpy() * 1e-3,
         _grid(240, 513),
@@ -143,10 +144,10 @@ def _fold(
     as the model continues it.
     """
     side, (dx, dy, dz) = _rays(rig, camera, p)
-    ts, mx, my, mz = model.globe(p, dx, dy, dz)
-    _, seen, gx, gy, _, lower, *_ = model.lids(p, dx, dy, dz)
+    ts, mx, my, mz = plain_eye.globe(p, dx, dy, dz)
+    _, seen, gx, gy, _, lower, *_ = plain_eye.lids(p, dx, dy, dz)
     zero = torch.zeros_like(gx)
-    albedo = model.sclera(p, bank, gx, gy, lower, mx, my, mz, zero, zero)
+    albedo = plain_eye.sclera(p, bank, gx, gy, lower, mx, my, mz, zero, zero)
     passes = (seen > 0) & (mx * mx + my * my + mz * mz > 1 + 1e-9)
     faces = _grid(side, side)
     points = torch.stack([ts * dx, ts * dy, ts * dz], -1)
@@ -182,7 +183,7 @@ def _iris(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
     )
     turn = torch.linspace(0, 2 * math.pi, 513, dtype=p.dtype)
     x, y = radius[:, None] * torch.cos(turn), radius[:, None] * torch.sin(turn)
-    albedo = model.pigment(p, bank, x, y, torch.sqrt(x * x + y * y + 1))
+    albedo = plain_eye.pigment(p, bank, x, y, torch.sqrt(x * x + y * y + 1))
     albedo[:3] = p[model.PUPIL]
     kept = (
         1 - 0.94 / p[model.INDEX] ** 2

@@ -14,6 +14,7 @@ from codesign.eye import population as eye
 from codesign.eye.population import POPULATION, CameraRig, EyeStates, MotionRanges
 from codesign.eye.renderer import PinholeCamera
 from metalens.core.errors import SceneError
+from tests.codesign.eye import plain_eye
 
 FRONTAL = CameraRig(elevation_rad=0.0, aim_um=(0.0, 0.0))
 
@@ -105,9 +106,9 @@ def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
     assert tangent * (apex + virtual) == pytest.approx(10.0 * n * virtual / s, rel=1e-4)
     ray = torch.tensor([[0.0]], dtype=torch.float64)
     q = p.mT[:, :, None]
-    dx, dy, dz = model.ray(ray, ray)
+    dx, dy, dz = plain_eye.ray(ray, ray)
     bank = torch.zeros(80, 256, 256, dtype=torch.float64)
-    _, depth, pupil = model.eye(q, bank, ray, ray, ray + 5e3, ray + 5e3, dx, dy, dz)
+    _, depth, pupil = plain_eye.eye(q, bank, ray, ray, ray + 5e3, ray + 5e3, dx, dy, dz)
     assert float(depth) == pytest.approx(apex + virtual, rel=1e-6)
     assert float(pupil) == 1.0
 

@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from codesign.eye import model, ops
+from codesign.eye import model
+from tests.codesign.eye import plain_eye
 
 BANK = torch.zeros(80, 256, 256, dtype=torch.float64)  # pictures without any texture
 FAR = 1e9
@@ -35,15 +36,15 @@ def test_a_lamp_falls_off_with_the_square_and_the_cosine_and_wraps():
     n = [number(x) for x in (0.36, -0.48, 0.8)]
     cosine = (3 * 0.36 + 4 * 0.48 + 12 * 0.8) / math.sqrt(170)
     for wrap in (0.0, 0.35):
-        assert float(model.lamp(*v, *n, wrap)) == pytest.approx(
+        assert float(plain_eye.lamp(*v, *n, wrap)) == pytest.approx(
             (cosine + wrap) * 400 / 170, rel=1e-12
         )
     behind = [-x for x in n]
-    assert float(model.lamp(*v, *behind, 0.35)) == 0
+    assert float(plain_eye.lamp(*v, *behind, 0.35)) == 0
     grazing = [
         number(x) for x in (0.8, 0.6, 0.0)
     ]  # at right angles to the lamp: only the wrap is left
-    assert float(model.lamp(*v, *grazing, 0.3)) == pytest.approx(
+    assert float(plain_eye.lamp(*v, *grazing, 0.3)) == pytest.approx(
         0.3 * 400 / 170, rel=1e-12
     )
 
@@ -65,12 +66,12 @@ def test_three_lamps_and_more_light_from_above():
         total += max(cosine + 0.35, 0) * 4e8 / square
     up = -0.3 * 0.6 + 0.8 * math.sqrt(0.9)
     want = total / 1.35 + 0.3 * (0.6 - 0.4 * up)
-    assert float(model.lamps(p, *point, *normal, 0.35)) == pytest.approx(
+    assert float(plain_eye.lamps(p, *point, *normal, 0.35)) == pytest.approx(
         want, rel=1e-12
     )
     above, below = ([number(0), number(-0.6 * s), number(0.8 * s)] for s in (1, -1))
-    assert float(model.ambient(p, *above)) == pytest.approx(0.3 * 1.0)
-    assert float(model.ambient(p, *below)) == pytest.approx(0.3 * 0.2)
+    assert float(plain_eye.ambient(p, *above)) == pytest.approx(0.3 * 1.0)
+    assert float(plain_eye.ambient(p, *below)) == pytest.approx(0.3 * 0.2)
 
 
 def test_a_wet_surface_and_the_iris_behind_it_have_the_light_of_three_lamps_and_two_mirror_images():
@@ -97,7 +98,7 @@ def test_a_wet_surface_and_the_iris_behind_it_have_the_light_of_three_lamps_and_
         )
     ambient = [0.3 * (0.6 - 0.4 * (0.6 * n[1] - 0.8 * n[2])) for n in (normal, axis)]
     ways = [[number(x) for x in part] for part in (point, normal, (0.0, 0.0, 1.0))]
-    outer, inner, mirrored = model.wet_lamps(p, *ways[0], *ways[1], *ways[2], 50.0)
+    outer, inner, mirrored = plain_eye.wet_lamps(p, *ways[0], *ways[1], *ways[2], 50.0)
     assert float(outer) == pytest.approx(sums[0] / 1.3 + ambient[0], rel=1e-12)
     assert float(inner) == pytest.approx(sums[1] / 1.15 + ambient[1], rel=1e-12)
     assert float(mirrored) == pytest.approx(lobes[0] + lobes[1], rel=1e-12)
@@ -121,7 +122,7 @@ def test_the_mirror_lobe_peaks_where_the_half_vector_is_the_normal(off):
     ]  # its mirror image about z
     normal = [number(math.sin(off)), number(0.0), number(-math.cos(off))]
     p = parameters(AXIS=[0.0, 0.0, -1.0])
-    outer, inner, shine = model.wet_lamp(p, *lamp, *normal, *view, sharp)
+    outer, inner, shine = plain_eye.wet_lamp(p, *lamp, *normal, *view, sharp)
     square = 4 * math.cos(turn) ** 2
     apart = 1 - math.cos(off) ** 2 * square / (square + 1e-3)
     assert float(shine) == pytest.approx(
@@ -148,10 +149,12 @@ def test_the_iris_darkens_at_the_limbus_and_at_the_pupil():
             * (1 - 0.45 * smooth((span - 0.94) * 9))
             * (1 - 0.35 * smooth((0.03 - span) * 25))
         )
-        got = model.pigment(p, BANK, number(0.6 * r), number(-0.8 * r), number(r))
+        got = plain_eye.pigment(p, BANK, number(0.6 * r), number(-0.8 * r), number(r))
         assert float(got) == pytest.approx(want, rel=1e-12)
     bright = BANK + 0.5
-    middle = model.pigment(p, bright, number(1800.0), number(-2400.0), number(3000.0))
+    middle = plain_eye.pigment(
+        p, bright, number(1800.0), number(-2400.0), number(3000.0)
+    )
     assert float(middle) == pytest.approx(0.37 * 1.2)
 
 
@@ -162,7 +165,9 @@ def test_the_sclera_has_its_ring_its_flesh_and_its_tear_film():
     def white(gx=FAR, gy=0.0, lower=FAR, r=FAR, inside=1.0):
         given = (number(v) for v in (gx, gy, lower))
         return float(
-            model.sclera(p, BANK, *given, axis, axis, axis, number(r), number(inside))
+            plain_eye.sclera(
+                p, BANK, *given, axis, axis, axis, number(r), number(inside)
+            )
         )
 
     assert white() == pytest.approx(0.61)
@@ -193,7 +198,7 @@ def test_creases_margins_and_brow_of_the_skin():
 
     def skin(upper=-FAR, lower=-FAR, gy=FAR, gx=0.0, p=p):
         given = (number(v) for v in (20e3, gx, gy, upper, lower))
-        return float(model.skin(p, BANK, *given, *ray, *up)) / (0.52 * 1.7)
+        return float(plain_eye.skin(p, BANK, *given, *ray, *up)) / (0.52 * 1.7)
 
     assert skin() == pytest.approx(1.0)
     margin = 1 - 0.25 / (1 + (2350 / 260) ** 2)
@@ -224,15 +229,15 @@ def test_rays_on_the_axis_meet_sphere_lids_and_cornea_where_they_stand():
         LIMBUS_D=10e3, LID_R=12.9e3, BLEND=1600.0, EDGE=40.0, UPPER=5100.0, LOWER=4300.0, HALF=11e3, MIDDLE=700.0,
     )  # fmt: skip
     ahead = [number(v) for v in (0.0, 0.0, 1.0)]
-    distance, mx, my, mz = model.globe(p, *ahead)
+    distance, mx, my, mz = plain_eye.globe(p, *ahead)
     assert [float(v) for v in (distance, mx, my, mz)] == pytest.approx(
         [18.2e3, 0, 0, -1]
     )
-    distance, cx, cy, cz, inside = model.cornea(p, *ahead)
+    distance, cx, cy, cz, inside = plain_eye.cornea(p, *ahead)
     assert [float(v) for v in (distance, cx, cy, cz, inside)] == pytest.approx(
         [16.7e3, 0, 0, -1, 1]
     )
-    s, openness, gx, gy, upper, lower, nx, ny, nz = model.lids(p, *ahead)
+    s, openness, gx, gy, upper, lower, nx, ny, nz = plain_eye.lids(p, *ahead)
     assert float(s) == pytest.approx(
         17.1e3
     )  # the shell; the plane stands 10 mm behind it
@@ -245,7 +250,7 @@ def test_rays_on_the_axis_meet_sphere_lids_and_cornea_where_they_stand():
 
 
 def test_steps_and_textures_between_their_pixels():
-    steps = ops.step(
+    steps = plain_eye.step(
         torch.tensor([-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0], dtype=torch.float64)
     )
     assert steps.tolist() == pytest.approx([0, 0, 0.15625, 0.5, 0.84375, 1, 1])
@@ -253,15 +258,15 @@ def test_steps_and_textures_between_their_pixels():
         3, 256, 256, generator=torch.Generator().manual_seed(1), dtype=torch.float64
     )
     which = number(2)
-    assert float(ops.tex(bank, which, number(17.0), number(255.0))) == float(
+    assert float(plain_eye.tex(bank, which, number(17.0), number(255.0))) == float(
         bank[2, 255, 17]
     )
-    assert float(ops.tex(bank, which, number(-1.0), number(256.0))) == float(
+    assert float(plain_eye.tex(bank, which, number(-1.0), number(256.0))) == float(
         bank[2, 0, 255]
     )  # pictures repeat
-    half = ops.tex(bank, which, number(255.5), number(31.0))
+    half = plain_eye.tex(bank, which, number(255.5), number(31.0))
     assert float(half) == pytest.approx(float((bank[2, 31, 255] + bank[2, 31, 0]) / 2))
-    part = ops.tex(bank, which, number(40.25), number(8.75))
+    part = plain_eye.tex(bank, which, number(40.25), number(8.75))
     s, t = 0.15625, 0.84375
     top = bank[2, 8, 40] * (1 - s) + bank[2, 8, 41] * s
     low = bank[2, 9, 40] * (1 - s) + bank[2, 9, 41] * s
