@@ -22,7 +22,7 @@ from characterize.inference import (
     UnmodelledShifts,
     invert_information,
     missing,
-    posterior,
+    uncertainty,
 )
 from characterize.model import (
     NAMES,
@@ -40,7 +40,7 @@ from metalens.core.errors import FitError, nearest_name_hint
 from metalens.fabrication import Sensitivity
 from metalens.lens import Lens
 
-REACH = posterior.REACH
+REACH = uncertainty.REACH
 # depths and angles, from which on a fit is tested on frames left out; one frame is
 # refused
 _LEAST_PLACES = 4

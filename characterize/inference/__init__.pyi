@@ -2,7 +2,7 @@ from . import asbuilt as asbuilt
 from . import knowable as knowable
 from . import leastsquares as leastsquares
 from . import missing as missing
-from . import posterior as posterior
+from . import uncertainty as uncertainty
 from .asbuilt import AsBuilt as AsBuilt
 from .estimate import FitOptions as FitOptions
 from .estimate import fit as fit
@@ -12,4 +12,4 @@ from .leastsquares import GaussianPrior as GaussianPrior
 from .leastsquares import SolverSettings as SolverSettings
 from .leastsquares import invert_information as invert_information
 from .missing import UnmodelledShifts as UnmodelledShifts
-from .search import SearchTask as SearchTask
+from .multistart import SearchTask as SearchTask

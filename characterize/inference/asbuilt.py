@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from characterize.inference.leastsquares import gaussian_draws
 from characterize.model import (
     PLACE,
     FrameSetting,
@@ -341,16 +342,6 @@ def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
     rows = usual_parameters(names, lens)
     return np.asarray(
         np.clip(draws, [row.low for row in rows], [row.high for row in rows])
-    )
-
-
-def gaussian_draws(rng: np.random.Generator, count: int, covariance: Array) -> Array:
-    """(count, p) Gaussian draws about 0."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(
-        rng.standard_normal((count, len(values)))
-        * np.sqrt(np.maximum(values, 0))
-        @ vectors.T
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from characterize.inference.search import SearchTask
+from characterize.inference.multistart import SearchTask
 from characterize.model import (
     LIGHT,
     MODES,

@@ -10,22 +10,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.captures import Capture, SensorNoise, to_electrons
-from characterize.inference import explore, knowable, missing, residual, search, verdict
+from characterize.inference import (
+    knowable,
+    missing,
+    multistart,
+    residual,
+    uncertainty,
+    verdict,
+)
 from characterize.inference.arrange import (
     FrameArrangement,
     find_arrangement,
     laid_words,
     rearrange_frames,
 )
-from characterize.inference.asbuilt import AsBuilt, WithinModel, gaussian_draws
-from characterize.inference.explore import Posterior
-from characterize.inference.leastsquares import FitSolution
+from characterize.inference.asbuilt import AsBuilt, WithinModel
+from characterize.inference.leastsquares import FitSolution, gaussian_draws
 from characterize.inference.missing import (
     ResidualFinding,
     ScoreTest,
     ScoreTests,
     UnmodelledShifts,
 )
+from characterize.inference.multistart import SearchTask, with_values
 from characterize.inference.prepare import (
     check_depths,
     check_enough,
@@ -37,7 +44,7 @@ from characterize.inference.prepare import (
     setting_of,
     stated_priors,
 )
-from characterize.inference.search import SearchTask, with_values
+from characterize.inference.uncertainty import Posterior
 from characterize.model import (
     NAMES,
     PARAMETERS,
@@ -119,7 +126,7 @@ def _fit(
     data = data_of(frames, window)
     known = {k.name: k for k in (*stated_priors(capture, lens), *options.known)}
     sizes = unfitted_sizes(known, lens)
-    check_enough(data, search.names_of(known, options.free))
+    check_enough(data, multistart.names_of(known, options.free))
     model = ForwardModel(
         lens, setting, response or log_response_slopes(lens, wanted=_spoken_of(options))
     )
@@ -134,7 +141,7 @@ def _fit(
     )
     _check_likeness(found, lens)
     whole = SearchTask(model, data, start, known, found, options.free, sizes)
-    task = search.choose_orientation(
+    task = multistart.choose_orientation(
         [_as_laid(whole, one) for one in (found, *found.others)]
     )
     cautions = [
@@ -143,12 +150,12 @@ def _fit(
         *verdict.spectrum_text(lens, known),
     ]
     cautions += roughly_known(lens, model.response)
-    unbiased = search.starting_points(task, biases_nm=(0.0,))[0]
+    unbiased = multistart.starting_points(task, biases_nm=(0.0,))[0]
     task = dataclasses.replace(
         task, model=quick_enough(task.model, task.data, unbiased)
     )
     task, ends = _unrounded(
-        *search.place_windows(*_ends(task, frames.gain, cautions)), frames.gain
+        *multistart.place_windows(*_ends(task, frames.gain, cautions)), frames.gain
     )
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
@@ -172,7 +179,7 @@ def _fit(
                 f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
             )
     _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
-    posterior = explore.explore_posterior(task, ends)
+    posterior = uncertainty.explore_posterior(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.run_score_tests(task, posterior.best)
     cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
@@ -185,7 +192,7 @@ def _reach_um(known: dict[str, KnownValue], lens: Lens) -> float:
     """Half the range of distances that is looked at: two sigma of what is known, within
     the bounds.
     """
-    prior = search.prior_of(("distance_um",), known, lens)
+    prior = multistart.prior_of(("distance_um",), known, lens)
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
@@ -212,11 +219,11 @@ def _ends(
     """The valleys of the usual parameters, or of more where these do not explain the
     frames.
     """
-    task, ends = search.search_modes(task)
+    task, ends = multistart.search_modes(task)
     if verdict.is_chi_square_consistent(ends[0], gain) or set(EXTRA) <= set(task.names):
         return task, ends
     more = dataclasses.replace(task, free=(*task.free, *EXTRA))
-    wide = search.widen_search(more, task.all_of(ends[0].value))
+    wide = multistart.widen_search(more, task.all_of(ends[0].value))
     if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
     cautions.append(
@@ -240,7 +247,9 @@ def _unrounded(
         )
         before, ends = (
             ends[0],
-            search.distinct_modes([search.refine_fit(task, end.value) for end in ends]),
+            multistart.distinct_modes(
+                [multistart.refine_fit(task, end.value) for end in ends]
+            ),
         )
         off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
         if np.abs(off).max() < _STAYS:
@@ -267,7 +276,7 @@ def _with_what_is_there(
         if cause is None:
             break
         more = dataclasses.replace(task, free=(*task.free, *cause.frees))
-        wide = search.widen_search(more, task.all_of(ends[0].value))
+        wide = multistart.widen_search(more, task.all_of(ends[0].value))
         if wide is None or wide[1][0].merit > ends[0].merit:
             break
         fall = ends[0].merit - wide[1][0].merit
@@ -294,7 +303,7 @@ def _best_cause(
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
     for cause in missing.to_fit(leans, stuck=stuck):
-        fall = best.merit - search.merit_with(task, best, cause.frees)
+        fall = best.merit - multistart.merit_with(task, best, cause.frees)
         if fall > (out_of_bounds if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
     return max(falls, key=lambda pair: pair[0])[1] if falls else None
@@ -319,7 +328,7 @@ def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
     """
     aside = found.clearly and found.orientation % 2 == 1
     model = task.model.exchanged() if aside else task.model
-    model = model.about(search.window_um(found, model))
+    model = model.about(multistart.window_um(found, model))
     return dataclasses.replace(
         task,
         model=model,
@@ -345,7 +354,7 @@ def _result(
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
     findings = _findings(task, solution, looked)
-    more, value = explore.REACH * unstated.sigma, solution.value
+    more, value = uncertainty.REACH * unstated.sigma, solution.value
     return AsBuilt(
         design=model.lens,
         response=model.response,
@@ -401,7 +410,7 @@ def _result(
 def _within(found: Posterior, covariance: Array, names: tuple[str, ...]) -> WithinModel:
     """The posterior with the error of the gain in what is counted in electrons."""
     value = found.best.value
-    counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
+    counted = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
     low, high = (
         np.minimum(found.low, value - counted),
         np.maximum(found.high, value + counted),
@@ -478,7 +487,7 @@ def _open(
     """
     pairs = knowable.correlated_pairs(task.names, covariance, task.prior.sigma)
     return (
-        *explore.posterior_text(task, found),
+        *uncertainty.posterior_text(task.names, found),
         *pairs,
         *(missing.undetectable_effects(looked.leans) if looked else ()),
     )
@@ -490,7 +499,9 @@ def _named(names: tuple[str, ...]) -> Array:
 
 def _told(task: SearchTask, found: Posterior) -> Array:
     """(p,) width of the intervals over that of the prior."""
-    return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
+    return np.asarray(
+        (found.high - found.low) / (2 * uncertainty.REACH) / task.prior.sigma
+    )
 
 
 def _psf_verdict(

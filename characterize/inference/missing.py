@@ -28,7 +28,7 @@ from scipy import stats
 from characterize.captures import shift_frames
 from characterize.inference import causes
 from characterize.inference.leastsquares import FitSolution
-from characterize.inference.search import SearchTask
+from characterize.inference.multistart import SearchTask
 from characterize.model import PLACE, background_planes
 from metalens.core.arrays import Array
 

@@ -13,11 +13,15 @@ import numpy as np
 
 from characterize.captures import SensorNoise
 from characterize.inference import residual
-from characterize.inference.explore import Posterior
-from characterize.inference.leastsquares import FitSolution, GaussianPrior
+from characterize.inference.leastsquares import (
+    FitProblem,
+    FitSolution,
+    GaussianPrior,
+    SolverSettings,
+)
 from characterize.inference.missing import ResidualFinding, UnmodelledShifts
-from characterize.inference.posterior import LocalMode
-from characterize.inference.search import WAVES_RAD, SearchTask
+from characterize.inference.multistart import WAVES_RAD, SearchTask
+from characterize.inference.uncertainty import Posterior
 from characterize.model import FitParameter, ForwardModel, KnownValue, thinplate
 from metalens.core import threads
 from metalens.core.arrays import Array
@@ -454,27 +458,25 @@ def left_out(task: SearchTask, mode: FitSolution) -> float:
 
 
 def _unseen(
-    task: SearchTask, mode: FitSolution, part: tuple[Array, Array]
+    task: SearchTask, mode: FitSolution, halves: tuple[Array, Array]
 ) -> tuple[float, int]:
     """(chi-square, pixels) of the second frames by what the first say."""
-    seen, hidden = part
+    seen, hidden = halves
     images = residual.residual_phase_problem(
         task.model.only(seen), task.names, task.start
     )
-    known = mode.image[seen], mode.slopes[:, seen]
-    valley = LocalMode(
-        images, task.data.planes(seen), mode.value, task.prior, known=known
+    problem = FitProblem(images, task.data.planes(seen), task.prior)
+    settings = SolverSettings(
+        iterations=6, step_tolerance=0.3, secant=True, near=math.inf, finish=False
     )
-    value, _ = valley.descend(mode.value, rounds=6)
+    part = problem.fit(mode.value, settings, mode.slopes[:, seen])
     rest = task.data.planes(hidden)
     image = residual.residual_phase_problem(
         task.model.only(hidden), task.names, task.start
-    )(value, False)[0]
+    )(part.value, False)[0]
     keep = rest.usable & ~rest.saturated
     slopes = mode.slopes[:, hidden][:, keep]
-    known_e2 = np.einsum(
-        "iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True
-    )
+    known_e2 = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)
     variance = rest.variance(image)[keep] + known_e2
     return float(
         np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()

@@ -14,7 +14,7 @@ from characterize.captures.capture import Capture
 from characterize.inference.asbuilt import AsBuilt
 from characterize.inference.estimate import FitOptions, fit
 from characterize.inference.leastsquares import FitImages, GaussianPrior
-from characterize.inference.search import SearchTask
+from characterize.inference.multistart import SearchTask
 from characterize.model import NAMES, ForwardModel
 from characterize.model.parameters import KnownValue
 from characterize.model.setting import FrameSetting

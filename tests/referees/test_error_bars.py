@@ -10,8 +10,8 @@ import pytest
 from characterize.captures import to_electrons
 from characterize.inference import leastsquares
 from characterize.inference.leastsquares import SolverSettings
+from characterize.inference.multistart import SearchTask
 from characterize.inference.prepare import data_of
-from characterize.inference.search import SearchTask
 from characterize.model import (
     PARAMETERS,
     PLACE,

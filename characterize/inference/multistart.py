@@ -12,9 +12,9 @@ import numpy as np
 from characterize.captures import relative_orientation
 from characterize.inference import leastsquares, residual
 from characterize.inference.arrange import FrameArrangement, few_frames
-from characterize.inference.constrained import BallConstraint
 from characterize.inference.leastsquares import (
     FitImages,
+    FitProblem,
     FitSolution,
     GaussianPrior,
     SolverSettings,
@@ -44,6 +44,11 @@ _ALONG_NM, _ASIDE_UM = (
 )  # bias by which starts are moved along the valley; where windows begin at most
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
+# sigma of a prior to either side that is scanned, and of a step
+_REACH, _STEP, _MINIMA = 2.5, 0.35, 3
+_SCANNED = SolverSettings(
+    iterations=5, step_tolerance=1.0, secant=True, near=math.inf, miss=0.7, finish=False
+)
 _ONWARD = SolverSettings(
     iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False
 )
@@ -93,6 +98,13 @@ class SearchTask:
             residual.residual_phase_problem(model, self.names, self.start), frames
         )
 
+    def posed(self, frames: Array | None = None) -> FitProblem:
+        """The least-squares problem of all frames, or of those of index ``frames`` with
+        rough images.
+        """
+        data = self.data if frames is None else self.data.planes(frames)
+        return FitProblem(self.problem(frames), data, self.prior)
+
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
         return with_values(
@@ -140,14 +152,7 @@ def choose_orientation(tasks: Sequence[SearchTask]) -> SearchTask:
     merits = np.array([one.merit for one in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
-            part, begin, prior = (
-                tasks[k].data.planes(few),
-                tries[k].value,
-                tasks[k].prior,
-            )
-            merits[k] = leastsquares.fit_levenberg_marquardt(
-                tasks[k].problem(few), part, begin, prior=prior, settings=_ONWARD
-            ).merit
+            merits[k] = tasks[k].posed(few).fit(tries[k].value, _ONWARD).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
     found = [task.found for task in tasks if task.found is not None]
     near = [
@@ -218,6 +223,56 @@ def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSo
     return ends
 
 
+def scan_parameter(
+    task: SearchTask, modes: Sequence[FitSolution], i: int
+) -> list[FitSolution]:
+    """The modes with those that a scan of parameter number ``i`` leads to, best first.
+
+    It is held at places across its prior with all others fitted to a few frames, from
+    the best mode outwards; minima on the way are followed with all free, on all frames.
+    """
+    kept = list(modes)
+    for _ in range(_AGAIN):
+        best, few = kept[0], few_frames(task.model.setting)
+        problem = task.posed(few)
+        here = dataclasses.replace(
+            best,
+            merit=problem.merit(best.value),
+            image=best.image[few],
+            slopes=best.slopes[:, few],
+        )
+        sides = threads.run_each(
+            lambda sign, p=problem, h=here: _scan_side(p, h, i, sign), (-1, 1)
+        )
+        stops = [*sides[0][::-1], here, *sides[1]]
+        wall = np.array([math.inf, *(one.merit for one in stops), math.inf])
+        low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))
+        begins = [stops[k].value for k in low[np.argsort(wall[1:-1][low])]]
+        begins = [x for x in begins if x[i] != best.value[i]][:_MINIMA]
+        kept = distinct_modes([*kept, *follow_starts(task, best, begins)])
+        if kept[0].merit > best.merit - 1:
+            break
+    return kept
+
+
+def _scan_side(
+    problem: FitProblem, mode: FitSolution, i: int, sign: int
+) -> list[FitSolution]:
+    """Fits with one parameter held at places from the mode to one end of its prior."""
+    prior, own = problem.prior, math.sqrt(float(mode.covariance[i, i]))
+    wide, middle = float(prior.sigma[i]), float(prior.mean[i])
+    if not math.isfinite(wide):
+        wide, middle = 3 * own, float(mode.value[i])
+    end = float(np.clip(middle + sign * _REACH * wide, prior.low[i], prior.high[i]))
+    count = max(math.ceil(sign * (end - float(mode.value[i])) / (_STEP * wide)), 0)
+    out, here = list[FitSolution](), mode
+    for goal in np.linspace(float(mode.value[i]), end, count + 1)[1:].tolist():
+        way = here.covariance[:, i] / here.covariance[i, i] * (goal - here.value[i])
+        here = problem.held(i, goal).fit(here.value + way, _SCANNED, here.slopes)
+        out.append(here)
+    return out
+
+
 def follow_starts(
     task: SearchTask, best: FitSolution, begins: Sequence[Array]
 ) -> list[FitSolution]:
@@ -235,9 +290,7 @@ def follow_starts(
             break
         if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
             continue
-        one = leastsquares.fit_levenberg_marquardt(
-            task.problem(), task.data, begin, prior=task.prior, settings=settings
-        )
+        one = task.posed().fit(begin, settings)
         if one.merit < best.merit + MODES_WITHIN + _WORTH and all(
             _apart(one.value, e) > 2.0 for e in [best, *ends]
         ):
@@ -338,9 +391,7 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
         iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
     try:
-        found = leastsquares.fit_levenberg_marquardt(
-            more.problem(), more.data, begin, prior=more.prior, settings=settings
-        )
+        found = more.posed().fit(begin, settings)
     except FitError:
         return math.inf
     return found.merit
@@ -367,27 +418,25 @@ def _apart(value: Array, end: FitSolution) -> float:
 
 
 def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSolution]:
+    """Short fits on few frames from several starts, best first; wave-front errors by a
+    prior that keeps them near 0.
+    """
     place = [PLACE[name] for name in task.names]
-    waves = BallConstraint(
-        np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]),
-        WAVES_RAD,
+    problem = task.posed(few)
+    waves = np.array([name.endswith("_rad") for name in task.names])
+    sigma = np.where(
+        waves, np.minimum(problem.prior.sigma, WAVES_RAD / 2), problem.prior.sigma
+    )
+    problem = dataclasses.replace(
+        problem, prior=dataclasses.replace(problem.prior, sigma=sigma)
     )
     short = SolverSettings(
-        iterations=4,
-        step_tolerance=1.0,
-        secant=True,
-        near=math.inf,
-        finish=False,
-        bounded=True,
-        ball=waves,
+        iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False
     )
-    part, seen = task.problem(few), task.data.planes(few)
 
     def one(begin: Array) -> FitSolution:
         opened = with_values(begin, _opened(task, begin))
-        return leastsquares.fit_levenberg_marquardt(
-            part, seen, opened[place], prior=task.prior, settings=short
-        )
+        return problem.fit(opened[place], short)
 
     return sorted(threads.run_each(one, begins), key=lambda t: t.merit)
 
@@ -395,39 +444,18 @@ def _short(task: SearchTask, few: Array, begins: Sequence[Array]) -> list[FitSol
 def _long(task: SearchTask, value: Array, slopes: Array | None = None) -> FitSolution:
     """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
     settings = SolverSettings(iterations=80, secant=True)
-    return leastsquares.fit_levenberg_marquardt(
-        task.problem(),
-        task.data,
-        value,
-        prior=task.prior,
-        settings=settings,
-        slopes=slopes,
-    )
+    return task.posed().fit(value, settings, slopes)
 
 
 def _nearer(task: SearchTask, value: Array) -> FitSolution:
     """Near the lowest place on all frames, by a quick model put right where a short fit
     ended.
     """
-    at = leastsquares.fit_levenberg_marquardt(
-        task.problem(),
-        task.data,
-        value,
-        prior=task.prior,
-        settings=SolverSettings(iterations=0),
-    )
-    images = correct_surrogate(task, at).problem()
+    at = task.posed().fit(value, SolverSettings(iterations=0))
     settings = SolverSettings(
         iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False
     )
-    return leastsquares.fit_levenberg_marquardt(
-        images,
-        task.data,
-        at.value,
-        prior=task.prior,
-        settings=settings,
-        slopes=at.slopes,
-    )
+    return correct_surrogate(task, at).posed().fit(at.value, settings, at.slopes)
 
 
 def _opened(task: SearchTask, x: Array) -> dict[str, float]:

@@ -1,0 +1,377 @@
+"""Posterior about the modes of a fit: profiles where the parabola fails, weighted draws.
+
+The one objective is -2 ln posterior of :mod:`leastsquares`. Where it is a parabola at
+the ends of a 95 % interval, the Laplace covariance is the answer; elsewhere the
+parameter is profiled (Venzon and Moolgavkar 1988) at up to four places a side. Draws
+come from a mixture of the Gaussians about all modes and profiled places, with
+importance weights.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from characterize.inference.leastsquares import (
+    FitProblem,
+    FitSolution,
+    SolverSettings,
+    gaussian_draws,
+    invert_information,
+    pixel_weights,
+)
+from characterize.inference.multistart import (
+    SearchTask,
+    add_mirrored_starts,
+    correct_surrogate,
+    distinct_modes,
+    refine_fit,
+    scan_parameter,
+)
+from metalens.core import threads
+from metalens.core.arrays import Array
+
+REACH = 1.959964  # sigma of a 95 % interval
+DRAWS = 96
+_PARABOLIC = 0.85, 1.18  # end of an interval over that of the parabola
+_SIDE = 4  # places of a profile on each side of the mode
+_CLOSE = 0.05  # share of the goal within which a place of a profile is its end
+_LOWER = 0.5  # of -2 ln posterior below the mode at which a better mode is followed
+_RESTARTS = 2
+_OF_THE_BENCH = ("log_gain", "background")
+_HELD = SolverSettings(
+    iterations=6, step_tolerance=0.3, secant=True, near=math.inf, miss=0.5, finish=False
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Profile:
+    """Profile likelihood of one parameter about a mode.
+
+    low, high: 95 % interval. value, rise: (k,) the parameter, and by how much -2 ln
+    posterior has risen with all others fitted. parabolic: whether the ends are those of
+    the parabola. found: whether the low and the high end were reached. stops: fits with
+    the parameter held.
+    """
+
+    low: float
+    high: float
+    value: Array
+    rise: Array
+    parabolic: bool
+    found: tuple[bool, bool] = (True, True)
+    stops: tuple[FitSolution, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Posterior:
+    """What is left open about the fitted parameters.
+
+    modes: best first; share: (k,) probability of each. low, high: (p,) 95 % intervals
+    over all modes. parabolic: (p,) whether the parabola of the best gives the same.
+    draws: (m, p); none where a parabola is all of it. effective_draws: effective sample
+    size of these. profiles: by name. covariance: (p, p).
+    """
+
+    modes: tuple[FitSolution, ...]
+    share: Array
+    low: Array
+    high: Array
+    parabolic: Array
+    draws: Array
+    effective_draws: float
+    profiles: dict[str, Profile]
+    covariance: Array
+
+    @property
+    def best(self) -> FitSolution:
+        """The mode of least misfit."""
+        return self.modes[0]
+
+
+def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> Posterior:
+    """Intervals, profiles, covariance and draws about the modes ``ends`` (best first)
+    of ``task``; a place below a mode that a profile meets is followed first.
+
+    They hold the errors of dark and flat too, which all frames have in common.
+    """
+    task, modes = correct_surrogate(task, ends[0]), list(ends)
+    if "bias_nm" in task.names:
+        modes = scan_parameter(task, modes, task.names.index("bias_nm"))
+    if modes[0] is not ends[0]:
+        modes = add_mirrored_starts(task, modes)
+    problem = task.posed()
+    named = [i for i, n in enumerate(task.names) if not n.startswith(_OF_THE_BENCH)]
+    for _ in range(_RESTARTS + 1):
+        spread = max(1.0, modes[0].chi2_per_dof)
+        found = profile_parameters(problem, modes[0], named, REACH**2 * spread)
+        lowest = min(
+            (stop for one in found.values() for stop in one.stops),
+            key=lambda stop: stop.merit,
+            default=modes[0],
+        )
+        if lowest.merit > modes[0].merit - _LOWER:
+            break
+        modes = distinct_modes([*modes, refine_fit(task, lowest.value)])
+    return _joined(task, problem, modes, found)
+
+
+def profile_parameters(
+    problem: FitProblem, mode: FitSolution, index: Sequence[int], level: float
+) -> dict[int, Profile]:
+    """Profile of each parameter in ``index`` about ``mode``, to a rise of ``level``.
+
+    Where -2 ln posterior at both ends of the parabola's interval is that of the
+    parabola, these are the ends, and no fit is made.
+    """
+    at = problem.merit(mode.value)
+    here = dataclasses.replace(mode, merit=at)
+    return dict(
+        zip(
+            index,
+            threads.run_each(lambda i: _profile(problem, here, i, level), index),
+            strict=True,
+        )
+    )
+
+
+def _profile(problem: FitProblem, mode: FitSolution, i: int, level: float) -> Profile:
+    sigma, goal = math.sqrt(float(mode.covariance[i, i])), math.sqrt(level)
+    middle, along = float(mode.value[i]), mode.covariance[:, i] / sigma
+    low, high = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
+    places = [mode.value + sign * goal * along for sign in (-1, 1)]
+    inside = all(
+        ((x >= problem.prior.low) & (x <= problem.prior.high)).all() for x in places
+    )
+    if inside and all(low < problem.merit(x) - mode.merit < high for x in places):
+        steps = np.array([-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5])
+        value = middle + steps * sigma
+        return Profile(
+            middle - goal * sigma, middle + goal * sigma, value, steps**2, True
+        )
+    sides = [_profile_side(problem, mode, i, sign, goal) for sign in (-1, 1)]
+    ends = [middle + sign * one[0] for sign, one in zip((-1, 1), sides, strict=True)]
+    stops = tuple(itertools.chain.from_iterable(one[2] for one in sides))
+    seen = sorted(
+        [(middle, 0.0), *((float(s.value[i]), s.merit - mode.merit) for s in stops)]
+    )
+    value, rise = np.array(seen).T
+    ratio = np.abs(np.array(ends) - middle) / (goal * sigma)
+    straight = bool(((ratio > _PARABOLIC[0]) & (ratio < _PARABOLIC[1])).all())
+    found = sides[0][1], sides[1][1]
+    return Profile(ends[0], ends[1], value, rise, straight, found, stops)
+
+
+def _profile_side(
+    problem: FitProblem, mode: FitSolution, i: int, sign: int, goal: float
+) -> tuple[float, bool, list[FitSolution]]:
+    """(distance of the end from the mode, whether it was reached, fits on the way).
+
+    The root of the rise grows evenly with the distance, so that each place is where the
+    line through the two nearest has it at ``goal``.
+    """
+    prior, middle = problem.prior, float(mode.value[i])
+    bound = abs(float((prior.high if sign > 0 else prior.low)[i]) - middle)
+    far = min(goal * math.sqrt(float(mode.covariance[i, i])), bound)
+    places, roots, stops, here = [0.0], [0.0], list[FitSolution](), mode
+    for _ in range(_SIDE):
+        value = middle + sign * far
+        way = here.covariance[:, i] / here.covariance[i, i] * (value - here.value[i])
+        held = problem.held(i, value)
+        stop = held.fit(here.value + way, _HELD, here.slopes)
+        stops.append(stop)
+        places.append(far)
+        roots.append(math.sqrt(max(stop.merit - mode.merit, 0.0)))
+        if abs(roots[-1] - goal) < _CLOSE * goal or (far >= bound and roots[-1] < goal):
+            break
+        order = np.argsort(places)
+        place, root = (np.array(v)[order] for v in (places, roots))
+        above = np.flatnonzero(root >= goal)
+        k = int(above[0]) if len(above) else len(root) - 1
+        slope = (root[k] - root[k - 1]) / max(place[k] - place[k - 1], 1e-300)
+        step = (goal - root[k - 1]) / slope if slope > 0 else math.inf
+        far = min(float(place[k - 1] + step), 2 * max(places), bound)
+        nearest = int(np.argmin(np.abs(np.array(places) - far)))
+        here = [mode, *stops][nearest]
+    order = np.argsort(places)
+    place, root = np.array(places)[order], np.maximum.accumulate(np.array(roots)[order])
+    reached = bool(root[-1] > (1 - _CLOSE) * goal)
+    if reached:
+        k = min(int(np.searchsorted(root, goal)), len(root) - 1)
+        rising = max(float(root[k] - root[k - 1]), 1e-300)
+        share = (goal - float(root[k - 1])) / rising
+        end = float(place[k - 1] + share * (place[k] - place[k - 1]))
+        return min(end, bound), True, stops
+    return float(place[-1]), bool(place[-1] >= bound), stops
+
+
+def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
+    """(p, p) covariance by what all frames of ``problem`` have in common beyond the
+    noise of each: errors of dark and flat, about ``mode``.
+
+    C AᵀW S W A C with S the covariance of the pixels by them, less what of it is in the
+    noise already.
+    """
+    noise, _, weight = pixel_weights(problem.data, mode.image)
+    root = np.sqrt(weight) / noise
+    slopes, p = mode.slopes * root, len(mode.value)
+    dark, light = problem.data.shared(mode.image) * root
+    flat, floor = ((slopes * c).sum(1).reshape(p, -1) for c in (light, dark))
+    counted = (slopes * dark).reshape(p, -1)
+    spread = flat @ flat.T + floor @ floor.T - counted @ counted.T
+    return np.asarray(mode.covariance @ spread @ mode.covariance)
+
+
+def mode_probabilities(modes: Sequence[FitSolution], spread: float = 1.0) -> Array:
+    """(k,) probability of every mode by Laplace's rule: exp(-merit / 2) times the
+    volume of its covariance; ``spread``: factor of all variances.
+    """
+    log = np.array([_log_mass(one.merit, one.covariance, spread) for one in modes])
+    return np.asarray(special.softmax(log))
+
+
+def _log_mass(merit: float, covariance: Array, spread: float) -> float:
+    return float(np.linalg.slogdet(covariance)[1]) / 2 - merit / (2 * spread)
+
+
+def draw_posterior(
+    problem: FitProblem,
+    components: Sequence[FitSolution],
+    *,
+    count: int = DRAWS,
+    spread: float = 1.0,
+    seed: int = 0,
+) -> tuple[Array, float]:
+    """((count, p) draws of the posterior, their effective sample size).
+
+    Importance resampling from the mixture of Gaussians about ``components``, twice
+    ``count`` of them, with weights truncated at their mean times the root of their
+    number (Ionides 2008). ``spread``: factor of all variances.
+    """
+    rng = np.random.default_rng(seed)
+    centre = np.array([one.value for one in components])
+    inverse = np.array([invert_information(one.covariance) for one in components])
+    inverse = inverse / spread
+    share = mode_probabilities(components, spread)
+    roots = [
+        np.linalg.cholesky(spread * one.covariance + 1e-12 * _diagonal(one.covariance))
+        for one in components
+    ]
+    total, drawn = 2 * count, list[Array]()
+    for _ in range(50):
+        kind = rng.choice(len(components), total, p=share)
+        normal = rng.standard_normal((total, centre.shape[1]))
+        x = np.array(
+            [centre[k] + roots[k] @ z for k, z in zip(kind, normal, strict=True)]
+        )
+        keep = ((x >= problem.prior.low) & (x <= problem.prior.high)).all(1)
+        drawn += list(x[keep])
+        if len(drawn) >= total:
+            break
+    x = np.array(drawn[:total])
+    off = x[:, None] - centre
+    square = np.einsum("nki,kij,nkj->nk", off, inverse, off)
+    volume = np.array([np.log(np.diag(root)).sum() for root in roots])
+    log_q = special.logsumexp(np.log(share) - volume - square / 2, axis=1)
+    merit = np.array(threads.run_each(problem.merit, list(x)))
+    log_w = -merit / (2 * spread) - log_q
+    weight = np.exp(log_w - log_w.max())
+    weight = np.minimum(weight, weight.mean() * math.sqrt(len(weight)))
+    weight /= weight.sum()
+    places = (rng.random() + np.arange(count)) / count
+    index = np.searchsorted(np.cumsum(weight), places).clip(0, len(x) - 1)
+    return rng.permutation(x[index]), float(1 / (weight**2).sum())
+
+
+def _diagonal(matrix: Array) -> Array:
+    return np.diag(np.diag(matrix))
+
+
+def _joined(
+    task: SearchTask,
+    problem: FitProblem,
+    modes: list[FitSolution],
+    found: dict[int, Profile],
+) -> Posterior:
+    """The posterior over all modes, with the errors of dark and flat."""
+    best, names, prior = modes[0], task.names, task.prior
+    spread = max(1.0, best.chi2_per_dof)
+    level, sigma = REACH**2 * spread, np.sqrt(spread * np.diag(best.covariance))
+    low, high = best.value - REACH * sigma, best.value + REACH * sigma
+    parabolic = np.ones(len(names), bool)
+    for i, one in found.items():
+        low[i], high[i], parabolic[i] = one.low, one.high, one.parabolic
+    for mode in modes[1:]:
+        room = math.sqrt(max(level - (mode.merit - best.merit), 0.0))
+        reach = room * np.sqrt(np.diag(mode.covariance))
+        low = np.minimum(low, np.where(room > 0, mode.value - reach, low))
+        high = np.maximum(high, np.where(room > 0, mode.value + reach, high))
+    apart = np.maximum(high - best.value, best.value - low) / (REACH * sigma)
+    parabolic &= apart < _PARABOLIC[1]
+    calibration = shared_calibration(problem, best)
+    common = REACH * np.sqrt(np.maximum(np.diag(calibration), 0.0))
+    low = np.maximum(best.value - np.hypot(best.value - low, common), prior.low)
+    high = np.minimum(best.value + np.hypot(high - best.value, common), prior.high)
+    share = mode_probabilities(modes, spread)
+    covariance = best.covariance * spread + calibration
+    draws, size = np.empty((0, len(names))), 0.0
+    if not parabolic.all() or share[0] < 0.99:
+        stops = [stop for one in found.values() for stop in one.stops]
+        draws, size = draw_posterior(problem, [*modes, *stops], spread=spread)
+        rng = np.random.default_rng(1)
+        shift = gaussian_draws(rng, len(draws), calibration)
+        draws = np.clip(draws + shift, prior.low, prior.high)
+        own = np.sqrt(np.diag(covariance))
+        wide = (high - low) / (2 * REACH)
+        covariance = covariance / np.outer(own, own) * np.outer(wide, wide)
+    profiles = {
+        names[i]: dataclasses.replace(one, low=float(low[i]), high=float(high[i]))
+        for i, one in found.items()
+    }
+    return Posterior(
+        tuple(modes), share, low, high, parabolic, draws, size, profiles, covariance
+    )
+
+
+def posterior_text(names: Sequence[str], found: Posterior) -> list[str]:
+    """What the posterior ``found`` of parameters ``names`` leaves open, in words:
+    ends that were not reached, skewed intervals, second modes.
+    """
+    out = [
+        f"the {which} end of {name} was not found: 95 % reach to {place:.3g} at least, "
+        "perhaps beyond"
+        for name, one in found.profiles.items()
+        for which, place, there in zip(
+            ("lower", "upper"), (one.low, one.high), one.found, strict=True
+        )
+        if not there
+    ]
+    for i, name in enumerate(names):
+        if not found.parabolic[i]:
+            out.append(
+                f"{name} is bent: 95 % within {found.low[i]:.3g} to "
+                f"{found.high[i]:.3g} about {found.best.value[i]:.3g}, not the same on "
+                "both sides; take draws, not value and sigma"
+            )
+    sigma = np.sqrt(np.diag(found.best.covariance))
+    for mode, share in zip(found.modes[1:], found.share[1:], strict=True):
+        most = np.argsort(-np.abs(mode.value - found.best.value) / sigma)[:3]
+        values = ", ".join(
+            f"{names[i]} {mode.value[i]:.3g} for {found.best.value[i]:.3g}"
+            for i in most
+        )
+        out.append(
+            "a second lens explains the frames nearly as well (misfit "
+            f"{mode.merit - found.best.merit:+.1f}, probability {share:.0%}): {values}; "
+            "frames farther from focus on both sides tell them apart"
+        )
+    if len(found.draws) and found.effective_draws < DRAWS / 4:
+        out.append(
+            f"draws of the posterior are worth {found.effective_draws:.0f} independent "
+            "ones: take intervals, not draws"
+        )
+    return out
