@@ -48,11 +48,16 @@ def invert_phase(
         raise DomainError(
             f"the phase is not monotone between {low} and {high} um: no unique diameter; give a narrower within_um"
         )
-    if type(phase_rad).__module__.partition(".")[0] == "torch":
+    if is_tensor(phase_rad):
         return cast(Values, _torch(p, phase_rad, (low, high), gap, excluded_um))
     phase = np.asarray(phase_rad)
     phase = phase if phase.dtype.kind == "f" else phase.astype(float)
     return cast(Values, _solve(p, phase, (low, high), gap, excluded_um)[()])
+
+
+def is_tensor(values: object) -> bool:
+    """Whether ``values`` is a torch tensor, told without loading torch."""
+    return type(values).__module__.partition(".")[0] == "torch"
 
 
 def _solve(

@@ -1,5 +1,5 @@
 """Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope
-and certified bounds.
+and certified bounds, for NumPy arrays and torch tensors.
 """
 
 import functools
@@ -18,6 +18,7 @@ from metalens.core.errors import DomainError
 
 CHUNK = 65536  # pillars a pass: its work arrays stay in the cache
 EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
+Monomials = tuple[float, ...]  # Python floats never raise the dtype of an array
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,16 +26,16 @@ class ChebyshevCurve:
     """p(x) with x = (2 D^power - low^power - high^power) / (high^power - low^power), x
     in [-1, 1] on the domain.
 
-    monomials: coefficients of 1, x, x², ... (Python floats, so that they never raise
-    the dtype of an array).
-    low, high: ends of the domain.
-    power: of the diameter; the phase of a pillar follows its area or a higher power
-    better than its diameter.
-    ceiling: above which the exact polynomial never is: what rounding adds there is
-    taken off.
+    Attributes:
+        monomials: coefficients of 1, x, x², …
+        low: least diameter of the domain, um.
+        high: largest diameter of the domain, um.
+        power: of the diameter; the phase of a pillar follows its area or a higher power
+            better than its diameter.
+        ceiling: the exact polynomial stays below it; rounding above it is removed.
     """
 
-    monomials: tuple[float, ...]
+    monomials: Monomials
     low: float
     high: float
     power: int = 1
@@ -50,17 +51,6 @@ class ChebyshevCurve:
         """x at D = 0."""
         return -1 - self.scale * self.low**self.power
 
-    @property
-    def slope(self) -> "ChebyshevCurve":
-        """dp/dx; times :meth:`inner_slope` it is dp/dD."""
-        terms = tuple(k * c for k, c in enumerate(self.monomials))[1:] or (0.0,)
-        return ChebyshevCurve(terms, self.low, self.high, self.power)
-
-    @property
-    def inner_slope(self) -> float:
-        """dx/dD = inner_slope * D^(power-1)."""
-        return self.scale * self.power
-
 
 def chebyshev_curve(
     coefficients: Array,
@@ -68,138 +58,144 @@ def chebyshev_curve(
     power: int,
     ceiling: float = math.inf,
 ) -> ChebyshevCurve:
-    """The curve of 1-D Chebyshev ``coefficients`` on ``domain``."""
-    return ChebyshevCurve(
-        _monomials(tuple(coefficients.tolist())), *domain, power, ceiling
-    )
+    """The curve of 1-D Chebyshev ``coefficients`` on ``domain``, see
+    :class:`ChebyshevCurve` for ``power`` and ``ceiling``.
+    """
+    monomials = _to_monomials(tuple(coefficients.tolist()))
+    return ChebyshevCurve(monomials, *domain, power, ceiling)
 
 
 @functools.lru_cache(maxsize=256)
-def _monomials(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """Of 1, x, x², ...: those of Chebyshev polynomials; value and slope at a wavelength
-    ask for the same.
-    """
+def _to_monomials(coefficients: tuple[float, ...]) -> Monomials:
     return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
-def evaluate_curve(p: ChebyshevCurve, diameter: Array) -> Array:
-    """p(D), shape and dtype of ``diameter``.
+def _derivative(monomials: Monomials) -> Monomials:
+    return tuple(k * c for k, c in enumerate(monomials))[1:] or (0.0,)
 
-    Accuracy: of Horner's rule, a few times the rounding of the dtype times the sum of
-    |monomials|.
+
+def evaluate_curve(p: ChebyshevCurve, diameter: Any) -> Any:
+    """p(D) by Horner's rule, in the shape, dtype and on the device of ``diameter``.
+
+    Args:
+        p: the curve.
+        diameter: NumPy array or torch tensor, um; tensors carry derivatives of every
+            order by backward, forward and vmap, and keep only x for them.
+
+    Accuracy: a few roundings of the dtype times the sum of |monomials|.
 
     Raises:
         DomainError: a diameter lies outside the domain, or is not a number.
     """
-    check_domain(p, diameter)
-    return over_chunks(
-        lambda d: np.minimum(
-            evaluate_horner(p.monomials, to_unit_interval(p, d)), p.ceiling
-        ),
-        diameter,
-    )
+    value = _evaluate_term(p, p.monomials, 0, diameter)
+    return value.clip(max=p.ceiling) if math.isfinite(p.ceiling) else value
 
 
-def evaluate_slope(p: ChebyshevCurve, diameter: Array) -> Array:
-    """dp/dD, shape and dtype of ``diameter``; raises as :func:`evaluate_curve`."""
-    check_domain(p, diameter)
-    return over_chunks(lambda d: slope_of(p, d), diameter)
-
-
-def pulled_back(p: ChebyshevCurve, diameter: Array, weight: Array) -> Array:
-    """``weight`` times dp/dD in one pass; the diameters were checked before, the weight
-    may be broadcast.
-    """
-
-    def part(start: int, d: Array) -> Array:
-        rise = slope_of(p, d)
-        rise *= weight if weight.ndim == 0 else weight[start : start + len(d)]
-        return rise
-
-    if weight.ndim and not any(weight.strides):
-        weight = weight[(0,) * weight.ndim]
-    if weight.ndim:
-        weight = np.ascontiguousarray(weight).reshape(-1)
-    return over_chunks(part, diameter, places=True)
-
-
-def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
-    """Refuse diameters (numpy or torch) outside the domain of ``p``."""
-    if 0 in diameter.shape:
-        return
-    least, most = float(diameter.min()), float(diameter.max())
-    if not (least >= p.low - EDGE_UM and most <= p.high + EDGE_UM):
-        raise DomainError(
-            f"diameters run from {least:.6g} to {most:.6g} um, but the proxy holds from {p.low:.6g} to "
-            f"{p.high:.6g} um; keep the diameters inside, or sweep a library over a wider range"
-        )
+def evaluate_slope(p: ChebyshevCurve, diameter: Any) -> Any:
+    """dp/dD at ``diameter`` (um); otherwise as :func:`evaluate_curve` of ``p``."""
+    slope = _derivative(p.monomials)
+    return p.scale * p.power * _evaluate_term(p, slope, p.power - 1, diameter)
 
 
 def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
-    """dp/dD of one chunk."""
-    rise = evaluate_horner(p.slope.monomials, to_unit_interval(p, diameter))
-    rise *= p.inner_slope
-    for _ in range(p.power - 1):
-        rise *= diameter
-    return rise
+    """dp/dD at ``diameter`` (um) without a check of the domain of ``p``."""
+    slope = _term(p, _derivative(p.monomials), p.power - 1, diameter)
+    return np.asarray(p.scale * p.power * slope)
 
 
-def to_unit_interval(p: ChebyshevCurve, diameter: Array) -> Array:
-    """x of one chunk."""
+def to_unit_interval(p: ChebyshevCurve, diameter: Any) -> Any:
+    """x of ``diameter`` (um) on the curve ``p``."""
     x = diameter * p.scale
     for _ in range(p.power - 1):
-        x *= diameter
-    x += p.shift
-    return x
+        x = x * diameter
+    return x + p.shift
 
 
-def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
-    """Whether the curve rises or falls throughout: no root of its slope lies inside
-    (certified, not sampled).
-    """
-    low, high = to_unit_interval(p, np.array(within, float))
-    roots = (
-        np.polynomial.Polynomial(p.slope.monomials).roots()
-        if len(p.monomials) > 2
-        else np.array([])
-    )
-    inside = (
-        (np.abs(roots.imag) < 1e-9)
-        & (roots.real > low + 1e-9)
-        & (roots.real < high - 1e-9)
-    )
-    return bool(np.any(p.slope.monomials) and not inside.any())
-
-
-def evaluate_horner(monomials: tuple[float, ...], x: Array) -> Array:
-    """Sum of monomials[k] x^k, in the dtype of ``x``."""
-    total = np.full_like(x, monomials[-1])
+def evaluate_horner(monomials: Monomials, x: Any) -> Any:
+    """Sum of monomials[k] x^k in the dtype of ``x``, NumPy or torch."""
+    total = x * 0 + monomials[-1]
     for c in monomials[-2::-1]:
         total *= x
         total += c
     return total
 
 
-def over_chunks(
-    work: Callable[..., Array], values: Array, *, places: bool = False
-) -> Array:
-    """``work`` elementwise over an array in cache-sized chunks, on all cores that the
-    process may use.
+def _term(p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any) -> Any:
+    """D^exponent q(x(D)) with q of these monomials, NumPy or torch."""
+    total = evaluate_horner(monomials, to_unit_interval(p, diameter))
+    for _ in range(exponent):
+        total *= diameter
+    return total
 
-    places: ``work`` also takes, first, where the chunk starts.
+
+def _evaluate_term(
+    p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any
+) -> Any:
+    """:func:`_term` inside the domain, differentiable where ``diameter`` is a tensor."""
+    if not isinstance(diameter, np.ndarray):
+        return _torch_term()(diameter, p, monomials, exponent)
+    check_domain(p, diameter)
+    return over_chunks(functools.partial(_term, p, monomials, exponent), diameter)
+
+
+@functools.cache
+def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
+    """:func:`_term` as a torch function that keeps its input alone for derivatives.
+
+    With a = dx/d(D^power) and m = power, terms are closed under differentiation:
+    d/dD [D^k q(x)] = k D^(k-1) q(x) + a m D^(k+m-1) q'(x).
+    """
+    import torch
+
+    class Term(torch.autograd.Function):
+        @staticmethod
+        def forward(diameter: Any, p: Any, monomials: Any, exponent: Any) -> Any:
+            if diameter.device.type == "cpu":
+                values = diameter.detach().numpy()
+                found = _evaluate_term(p, monomials, exponent, values)
+                return torch.from_numpy(found)
+            check_domain(p, diameter)
+            return _term(p, monomials, exponent, diameter)
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            diameter, *ctx.term = inputs
+            ctx.save_for_backward(diameter)
+            ctx.save_for_forward(diameter)
+
+        @staticmethod
+        def backward(ctx: Any, *gradients: Any) -> Any:
+            return gradients[0] * rise(ctx), None, None, None
+
+        @staticmethod
+        def jvp(ctx: Any, *tangents: Any) -> Any:
+            return tangents[0] * rise(ctx)
+
+        @staticmethod
+        def vmap(info: Any, dims: Any, diameter: Any, *term: Any) -> Any:
+            return apply(diameter, *term), dims[0]
+
+    def rise(ctx: Any) -> Any:
+        (diameter,), (p, q, k) = ctx.saved_tensors, ctx.term
+        found = apply(diameter, p, _derivative(q), k + p.power - 1)
+        found = p.scale * p.power * found
+        return found + k * apply(diameter, p, q, k - 1) if k else found
+
+    apply: Callable[..., Any] = Term.apply
+    return apply
+
+
+def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
+    """``work`` elementwise over the array ``values`` in cache-sized chunks, on all
+    cores that the process may use.
     """
     flat = np.ascontiguousarray(values).ravel()
-
-    def made(start: int) -> Array:
-        chunk = flat[start : start + CHUNK]
-        return work(start, chunk) if places else work(chunk)
-
     if flat.size <= CHUNK:
-        return made(0).reshape(values.shape)
+        return work(flat).reshape(values.shape)
     out = np.empty_like(flat)
 
     def run(start: int) -> None:
-        out[start : start + CHUNK] = made(start)
+        out[start : start + CHUNK] = work(flat[start : start + CHUNK])
 
     with ThreadPoolExecutor(
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
@@ -208,28 +204,59 @@ def over_chunks(
     return out.reshape(values.shape)
 
 
+def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
+    """Refuse diameters (NumPy or torch, um) outside the domain of ``p``.
+
+    Raises:
+        DomainError: naming both ranges.
+    """
+    if 0 in diameter.shape:
+        return
+    least, most = float(diameter.min()), float(diameter.max())
+    if not (least >= p.low - EDGE_UM and most <= p.high + EDGE_UM):
+        raise DomainError(
+            f"diameters run from {least:.6g} to {most:.6g} um, but the proxy holds from "
+            f"{p.low:.6g} to {p.high:.6g} um; keep the diameters inside, or sweep a "
+            "library over a wider range"
+        )
+
+
+def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
+    """Whether ``p`` rises or falls throughout ``within`` (um): no root of its slope
+    lies inside (certified, not sampled).
+    """
+    low, high = to_unit_interval(p, np.array(within, float))
+    slope = _derivative(p.monomials)
+    roots = np.polynomial.Polynomial(slope).roots() if len(slope) > 1 else np.empty(0)
+    inside = (
+        (np.abs(roots.imag) < 1e-9)
+        & (roots.real > low + 1e-9)
+        & (roots.real < high - 1e-9)
+    )
+    return bool(np.any(slope) and not inside.any())
+
+
 def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, float]:
     """Certified (lower, upper) bound of a tensor Chebyshev sum on [-1, 1]^n.
 
     With N >= points * degree Chebyshev nodes on the last axis (24 * degree on the
-    others), a polynomial q of degree d
-    has max|q| <= max over the nodes |q| / cos(pi d / 2N) an axis (Ehlich and Zeller 1964); applied to q = p - middle.
+    others), a polynomial q of degree d has max|q| <= max over the nodes
+    |q| / cos(pi d / 2N) an axis (Ehlich and Zeller 1964); applied to q = p - middle.
+
+    Args:
+        coefficients: (…) of the sum, an axis a variable.
+        points: nodes a degree on the last axis.
 
     Accuracy: the bound is too wide by at most 3e-4 (points = 64) of the polynomial's
-    half-range for the last axis and
-    2e-3 for each other.
+        half-range for the last axis and 2e-3 for each other.
     """
     values, slack = np.asarray(coefficients, float), 1.0
     for axis, count in enumerate(values.shape):
         degree = count - 1
-        nodes = chebyshev.chebpts1(
-            max(1, (points if axis == values.ndim - 1 else 24) * degree)
-        )
-        values = np.moveaxis(
-            np.tensordot(chebyshev.chebvander(nodes, degree), values, (1, axis)),
-            0,
-            axis,
-        )
+        dense = points if axis == values.ndim - 1 else 24
+        nodes = chebyshev.chebpts1(max(1, dense * degree))
+        basis = chebyshev.chebvander(nodes, degree)
+        values = np.moveaxis(np.tensordot(basis, values, (1, axis)), 0, axis)
         slack /= math.cos(math.pi * degree / (2 * len(nodes))) if degree else 1.0
     middle, half = (values.max() + values.min()) / 2, (values.max() - values.min()) / 2
     return float(middle - half * slack), float(middle + half * slack)

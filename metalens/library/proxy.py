@@ -3,8 +3,9 @@ transmission (paper Eq. 2).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -12,7 +13,7 @@ from numpy.polynomial import chebyshev
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 from metalens.library import inverse, polynomial
-from metalens.library.inverse import Values
+from metalens.library.inverse import Values, is_tensor
 
 AVERAGED = 65  # diameters over which |t| is averaged
 # of t: the largest tolerance of a library; pillars known less well (root mean square)
@@ -97,32 +98,29 @@ class Proxy:
             DomainError: a diameter, the wavelength or the angle lies outside the
                 proxy's domain.
         """
-        return self._verb(
-            "evaluate_curve", self.at(wavelength_um, angle_rad), diameter_um
-        )
+        curve = self.at(wavelength_um, angle_rad)
+        return _evaluate(polynomial.evaluate_curve, curve, diameter_um)
 
     def transmission(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Magnitude |T| in [0, 1]; otherwise as :meth:`phase_rad`."""
-        return self._verb(
-            "evaluate_curve", self.level_at(wavelength_um, angle_rad), diameter_um
-        )
+        curve = self.level_at(wavelength_um, angle_rad)
+        return _evaluate(polynomial.evaluate_curve, curve, diameter_um)
 
     def dphase_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of the phase, rad/um; otherwise as :meth:`phase_rad`."""
-        return self._verb(
-            "evaluate_slope", self.at(wavelength_um, angle_rad), diameter_um
-        )
+        curve = self.at(wavelength_um, angle_rad)
+        return _evaluate(polynomial.evaluate_slope, curve, diameter_um)
 
     def dtransmission_ddiameter(
         self, diameter_um: Values, wavelength_um: float, angle_rad: float = 0.0
     ) -> Values:
         """Slope of |T|, 1/um; otherwise as :meth:`phase_rad`."""
         curve = self._curve(self.transmission_coefficients, wavelength_um, angle_rad)
-        return self._verb("evaluate_slope", curve, diameter_um)
+        return _evaluate(polynomial.evaluate_slope, curve, diameter_um)
 
     def diameter_um(
         self,
@@ -266,17 +264,15 @@ class Proxy:
             1.0, 2 * (math.sin(angle_rad) / math.sin(self.max_angle_rad)) ** 2 - 1
         )
 
-    def _verb(
-        self, verb: str, p: polynomial.ChebyshevCurve, diameter_um: Values
-    ) -> Values:
-        if _is_torch(diameter_um):
-            from metalens.library import polynomial_torch
 
-            return cast(Values, getattr(polynomial_torch, verb)(p, diameter_um))
-        array = np.asarray(diameter_um)
-        array = array if array.dtype.kind == "f" else array.astype(float)
-        return cast(Values, getattr(polynomial, verb)(p, array)[()])
-
-
-def _is_torch(values: object) -> bool:
-    return type(values).__module__.partition(".")[0] == "torch"
+def _evaluate(
+    evaluator: Callable[[polynomial.ChebyshevCurve, Any], Any],
+    curve: polynomial.ChebyshevCurve,
+    diameter_um: Values,
+) -> Values:
+    """A curve at diameters, which leave as they came: array, tensor or number."""
+    if is_tensor(diameter_um):
+        return cast(Values, evaluator(curve, diameter_um))
+    array = np.asarray(diameter_um)
+    array = array if array.dtype.kind == "f" else array.astype(float)
+    return cast(Values, evaluator(curve, array)[()])
