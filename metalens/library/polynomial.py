@@ -70,8 +70,10 @@ def _to_monomials(coefficients: tuple[float, ...]) -> Monomials:
     return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
-def _derivative(monomials: Monomials) -> Monomials:
-    return tuple(k * c for k, c in enumerate(monomials))[1:] or (0.0,)
+def _derivative(p: ChebyshevCurve, monomials: Monomials) -> Monomials:
+    """Of dq/dD over D^(power-1): dx/dD = scale power D^(power-1)."""
+    inner = p.scale * p.power
+    return tuple(k * inner * c for k, c in enumerate(monomials))[1:] or (0.0,)
 
 
 def evaluate_curve(p: ChebyshevCurve, diameter: Any) -> Any:
@@ -93,22 +95,23 @@ def evaluate_curve(p: ChebyshevCurve, diameter: Any) -> Any:
 
 def evaluate_slope(p: ChebyshevCurve, diameter: Any) -> Any:
     """dp/dD at ``diameter`` (um); otherwise as :func:`evaluate_curve` of ``p``."""
-    slope = _derivative(p.monomials)
-    return p.scale * p.power * _evaluate_term(p, slope, p.power - 1, diameter)
+    slope = _derivative(p, p.monomials)
+    return _evaluate_term(p, slope, p.power - 1, diameter)
 
 
 def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
     """dp/dD at ``diameter`` (um) without a check of the domain of ``p``."""
-    slope = _term(p, _derivative(p.monomials), p.power - 1, diameter)
-    return np.asarray(p.scale * p.power * slope)
+    slope = _derivative(p, p.monomials)
+    return np.asarray(_term(p, slope, p.power - 1, diameter))
 
 
 def to_unit_interval(p: ChebyshevCurve, diameter: Any) -> Any:
     """x of ``diameter`` (um) on the curve ``p``."""
     x = diameter * p.scale
     for _ in range(p.power - 1):
-        x = x * diameter
-    return x + p.shift
+        x *= diameter
+    x += p.shift
+    return x
 
 
 def evaluate_horner(monomials: Monomials, x: Any) -> Any:
@@ -142,8 +145,8 @@ def _evaluate_term(
 def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
     """:func:`_term` as a torch function that keeps its input alone for derivatives.
 
-    With a = dx/d(D^power) and m = power, terms are closed under differentiation:
-    d/dD [D^k q(x)] = k D^(k-1) q(x) + a m D^(k+m-1) q'(x).
+    Terms are closed under differentiation: with a = dx/d(D^m) and m = power,
+    d/dD [D^k q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
     """
     import torch
 
@@ -177,8 +180,7 @@ def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
 
     def rise(ctx: Any) -> Any:
         (diameter,), (p, q, k) = ctx.saved_tensors, ctx.term
-        found = apply(diameter, p, _derivative(q), k + p.power - 1)
-        found = p.scale * p.power * found
+        found = apply(diameter, p, _derivative(p, q), k + p.power - 1)
         return found + k * apply(diameter, p, q, k - 1) if k else found
 
     apply: Callable[..., Any] = Term.apply
@@ -226,7 +228,7 @@ def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
     lies inside (certified, not sampled).
     """
     low, high = to_unit_interval(p, np.array(within, float))
-    slope = _derivative(p.monomials)
+    slope = _derivative(p, p.monomials)
     roots = np.polynomial.Polynomial(slope).roots() if len(slope) > 1 else np.empty(0)
     inside = (
         (np.abs(roots.imag) < 1e-9)
