@@ -27,17 +27,16 @@ from metalens.core.errors import DomainError
 from metalens.library import (
     DEFAULT_CELL,
     MOST_ERROR,
+    GeometricPhase,
     PillarLibrary,
     ProxyFit,
     ProxyTolerances,
     Sweep,
     axes,
-    converted,
     height_hint,
     workers,
 )
 from metalens.library import fit as proxy_fit
-from metalens.library.circular import GeometricPhase
 
 MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
@@ -95,7 +94,7 @@ def run(options: Options) -> int:
         )
         seconds = time.perf_counter() - start
         if wanted.sweep.light == "circular":
-            made = converted.with_rotations(made)
+            made = library.with_rotations(made)
         fitted, refusal = _fit(made, wanted.proxy)
         notes = (
             (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
@@ -131,9 +130,7 @@ def _inputs(path: Path, cell: Cell) -> dict[str, str]:
 
 def _fit(made: PillarLibrary, wanted: ProxyTolerances) -> tuple[ProxyFit | None, str]:
     try:
-        return (
-            converted.fit_converted if made.sweep.light == "circular" else proxy_fit.fit
-        )(made, wanted), ""
+        return proxy_fit.fit(made, wanted), ""
     except DomainError as refused:
         return None, str(refused)
 

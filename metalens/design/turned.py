@@ -14,8 +14,7 @@ from metalens.design.of_phase import Limits, MetricSums, Quality, lens_of
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf, lattice_sites, least_period_um
 from metalens.lens import HANDS, Lens
-from metalens.library import PillarLibrary, Proxy
-from metalens.library.circular import GeometricPhase
+from metalens.library import GeometricPhase, PillarLibrary, Proxy
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,5 +1,4 @@
 from . import axes as axes
-from . import converted as converted
 from . import curve as curve
 from . import engines as engines
 from . import fit as fit
@@ -11,6 +10,7 @@ from . import workers as workers
 from .fit import ProxyFit as ProxyFit
 from .fit import ProxyTolerances as ProxyTolerances
 from .fit import proxy_of as proxy_of
+from .geometric_phase import GeometricPhase as GeometricPhase
 from .proxy import MOST_ERROR as MOST_ERROR
 from .proxy import Proxy as Proxy
 from .proxy import height_hint as height_hint
@@ -23,4 +23,5 @@ from .record import save as save
 from .study import CellStudy as CellStudy
 from .study_plots import library_figure as library_figure
 from .sweeping import sweep as sweep
+from .sweeping import with_rotations as with_rotations
 from .workers import SweepJournal as SweepJournal

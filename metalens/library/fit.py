@@ -22,6 +22,8 @@ from metalens.library.stretch import (
 )
 
 TURN = 2 * math.pi
+# of the largest conversion, to which the domain reaches unless the tolerance ends it
+NEAREST_SHARE = 0.85
 FOLLOWED, KNOWN_SHARE = (
     1e-3,
     0.5,
@@ -125,6 +127,15 @@ class FitData:
     wavelength: Array
     angle: Array
 
+    def part(self, some: slice) -> "FitData":
+        """The same of some diameters."""
+        return dataclasses.replace(
+            self,
+            phase=self.phase[..., some],
+            level=self.level[..., some],
+            diameter=self.diameter[some],
+        )
+
 
 def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
     """The proxy of a library.
@@ -141,6 +152,8 @@ def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyF
         DomainError: no stretch of diameters without resonance holds enough entries.
     """
     wanted = wanted or ProxyTolerances()
+    if library.sweep.light == "circular":
+        return _fit_converted(library, wanted)
     found = _fitted(library, wanted, across_resonances=False)
     if any(width < wanted.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
@@ -240,7 +253,7 @@ def _shorter(
     are met so; they are excluded as
     the resonance is, up to a tenth of the phase. None where that is not enough."""
     for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
-        some = _head(data, count)
+        some = data.part(slice(count))
         if _turns(some) < (1 - EXCLUDED) * _turns(data):
             return None
         fewer = min(terms, count // 3)
@@ -261,13 +274,8 @@ def proxy_of(library: PillarLibrary) -> Proxy:
     """The proxy that a library holds, fitted now where it holds none.
 
     Raises:
-        DomainError: no proxy fits; a library for circular light holds none (it is
-            fitted where that is swept).
+        DomainError: no proxy fits.
     """
-    if library.proxy is None and library.sweep.light == "circular":
-        raise DomainError(
-            "a library for circular light without a proxy: make it with 'metalens library'"
-        )
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
@@ -278,7 +286,7 @@ def _longest(
     tolerances.
     """
     good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
-    best = _best(_head(data, good), wanted, terms)
+    best = _best(data.part(slice(good)), wanted, terms)
     if best is None:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
@@ -288,12 +296,12 @@ def _longest(
         middle = (
             (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
         )
-        trial = _best(_head(data, middle), wanted, terms)
+        trial = _best(data.part(slice(middle)), wanted, terms)
         if trial is not None and _cost(trial, wanted) <= 1:
             good, best = middle, trial
         else:
             bad = middle
-    return _head(data, good), best
+    return data.part(slice(good)), best
 
 
 def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
@@ -442,16 +450,6 @@ def _trial(data: FitData, power: int, coefficients: int) -> FitTrial | None:
     )
 
 
-def _head(data: FitData, count: int) -> FitData:
-    return FitData(
-        data.phase[..., :count],
-        data.level[..., :count],
-        data.diameter[:count],
-        data.wavelength,
-        data.angle,
-    )
-
-
 def _turns(data: FitData) -> float:
     return float(abs(data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
 
@@ -466,3 +464,83 @@ def _notes(
         f"cut at {kept.diameter[-1]:.4f} um: up to {data.diameter[-1]:.4f} um the phase is smooth, but {2 * terms} "
         "coefficients do not describe it within the tolerances",
     )
+
+
+def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
+    """The proxy of the light converted to the other hand, (t_x - t_y)/2, on the widest
+    run of sizes around the best one that meets the tolerances.
+
+    Pillars of such a lens may all have one size: their turn carries the phase, and the
+    proxy tells what another size does (bias, tolerance).
+
+    Raises:
+        DomainError: fewer than 12 sizes without resonance around the best one.
+    """
+    t, d = library.cross_polarized, library.diameter_um
+    middle = int(np.searchsorted(d, library.best_converting_um))
+    least = NEAREST_SHARE * np.abs(t[:, middle]).min()
+    good = (np.abs(t).min(axis=0) >= least) & ~_sharp(
+        library, wanted.least_half_width_um
+    )
+    if wanted.within_um is not None:
+        good &= (d >= wanted.within_um[0]) & (d <= wanted.within_um[1])
+    low = (
+        middle - int(np.argmin(good[middle::-1]))
+        if not good[: middle + 1].all()
+        else -1
+    )
+    high = middle + int(np.argmin(good[middle:])) if not good[middle:].all() else len(d)
+    run = slice(low + 1, high)
+    if not good[middle] or run.stop - run.start < LEAST_ENTRIES:
+        raise DomainError(
+            f"fewer than {LEAST_ENTRIES} sizes around {d[middle]:.4g} um, where most light is converted "
+            f"({np.abs(t[:, middle]).min() ** 2:.0%}), are free of resonances: sweep with more samples, or another cell"
+        )
+    phase = np.unwrap(np.angle(t[:, run]), axis=-1)
+    phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[
+        :, None
+    ]
+    kept = FitData(
+        phase[None],
+        np.abs(t[:, run])[None],
+        d[run],
+        library.wavelength_um,
+        library.angle_rad,
+    )
+    wanted = wanted.settled(entry_error(library, kept.diameter))
+    proxy = _widest(kept, middle - run.start, wanted)
+    inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
+    proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
+    notes = (
+        f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",
+    )
+    return ProxyFit(
+        proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, wanted), math.nan
+    )
+
+
+def _sharp(library: PillarLibrary, least_half_width_um: float) -> Array:
+    """(size,) whether a narrow resonance lies there."""
+    near = np.zeros(len(library.diameter_um), bool)
+    for *_, centre, width in library.resonances:
+        if width < least_half_width_um:
+            near |= np.abs(library.diameter_um - centre) <= 2 * width
+    return near
+
+
+def _widest(data: FitData, middle: int, wanted: ProxyTolerances) -> Proxy:
+    """The widest run about ``middle`` on which as many coefficients as are wanted meet
+    the tolerances.
+    """
+    reach = max(middle, len(data.diameter) - 1 - middle)
+    while True:
+        part = slice(max(0, middle - reach), middle + reach + 1)
+        some = data.part(part)
+        count = len(some.diameter)
+        proxy = fit_terms(some, 1, min(max(2, wanted.coefficients // 2), count // 3))
+        if tolerance_ratio(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
+            return proxy
+        nearer = max(LEAST_ENTRIES // 2, int(0.9 * reach))
+        if nearer >= reach:
+            return proxy
+        reach = nearer

@@ -17,8 +17,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.reading import typed_reader
 from metalens.core.store import Provenance
-from metalens.library.circular import GeometricPhase
-from metalens.library.circular import check_geometric_phase as check_turned
+from metalens.library.geometric_phase import GeometricPhase, check_geometric_phase
 from metalens.library.proxy import MOST_ERROR, Proxy
 
 # Hydrogenated amorphous silicon deposited for near-infrared optics: n of 3.5-3.7 and
@@ -233,6 +232,23 @@ class PillarLibrary:
         """
         return np.asarray(np.maximum(1 - self.energy, 0.0))
 
+    @property
+    def cross_polarized(self) -> Array:
+        """(wavelength, size) amplitude (t_x - t_y)/2 that leaves with the other hand,
+        of circular light on pillars that are not turned.
+        """
+        return np.asarray(self.t[0, 0] - self.t[1, 0]) / 2
+
+    @property
+    def best_converting_um(self) -> float:
+        """The size whose least conversion over the wavelengths is largest, off
+        resonances (bars within the tolerance).
+        """
+        least = np.abs(self.cross_polarized).min(axis=0)
+        sure = (self.t_error <= self.sweep.bar).all(axis=(0, 1, 2))
+        place = int(np.where(sure | ~sure.any(), least, -1.0).argmax())
+        return float(self.diameter_um[place])
+
     def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
         """Mean of :attr:`lost` over pillars, at the least angle of the library.
 
@@ -258,7 +274,7 @@ def check_sweep(cell: Cell, sweep: Sweep) -> None:
             "lengths_um: a library over two sizes is made by metalens.library.axes.sweep_two_sizes"
         )
     if sweep.light == "circular":
-        check_turned(cell, span[1])
+        check_geometric_phase(cell, span[1])
     check_light(cell, sweep)
 
 

@@ -17,6 +17,7 @@ from metalens.core.store import Provenance
 from metalens.library import engines, few_nodes, workers
 from metalens.library.curve import ResponseCurve
 from metalens.library.few_nodes import Rows
+from metalens.library.geometric_phase import solve_rotations
 from metalens.library.record import PillarLibrary, Sweep, check_sweep
 from metalens.library.workers import Result, SweepJournal, Task
 
@@ -253,3 +254,15 @@ def _library(
         *effort,
         provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
     )
+
+
+def with_rotations(library: PillarLibrary) -> PillarLibrary:
+    """``library`` with its best pillar solved at several turns, at the middle wavelength."""
+    wavelength = float(library.wavelength_um[len(library.wavelength_um) // 2])
+    turned = solve_rotations(
+        library.cell,
+        library.best_converting_um,
+        wavelength,
+        tolerance=library.sweep.bar,
+    )
+    return dataclasses.replace(library, turned=turned)

@@ -14,8 +14,7 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
 from metalens.core.errors import PropagationError, SceneError
-from metalens.library import Proxy
-from metalens.library.circular import GeometricPhase
+from metalens.library import GeometricPhase, Proxy
 from tests.referees.turned_pillar import isolated
 
 T_X, T_Y = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j)

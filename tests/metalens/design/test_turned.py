@@ -13,8 +13,7 @@ from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Rectangle
 from metalens.core.errors import LensError
 from metalens.design import Focus, Limits
-from metalens.library import PillarLibrary, Proxy, Sweep
-from metalens.library.circular import GeometricPhase
+from metalens.library import GeometricPhase, PillarLibrary, Proxy, Sweep
 from tests.referees.turned_pillar import isolated
 
 CELL = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))

@@ -12,14 +12,15 @@ from metalens import library, rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Square
 from metalens.core import records
-from metalens.core.errors import CellError, ConfigError, DomainError
-from metalens.library import ProxyTolerances, Sweep, converted
-from metalens.library.circular import (
+from metalens.core.errors import CellError, ConfigError
+from metalens.library import ProxyTolerances, Sweep, fit
+from metalens.library.geometric_phase import (
     GeometricPhase,
     check_geometric_phase,
+    mirror_jones,
     solve_rotations,
+    to_circular_basis,
 )
-from metalens.library.circular.turned import mirror_jones, to_circular_basis
 from tests.referees.turned_pillar import isolated
 
 # low contrast, so that few harmonics suffice; far enough apart that the neighbours
@@ -141,8 +142,6 @@ def test_a_library_for_circular_light_holds_both_axes(made, tmp_path):
                 abs(made.t[k, 0, 0, i] - own.t[k, k])
                 <= made.t_error[k, 0, 0, i] + own.t_error
             )
-    with pytest.raises(DomainError, match="circular light without a proxy"):
-        library.proxy_of(made)
 
 
 def test_its_proxy_is_that_of_the_converted_light(made, tmp_path):
@@ -157,10 +156,10 @@ def test_its_proxy_is_that_of_the_converted_light(made, tmp_path):
         ]
     )
     known = dataclasses.replace(made, t=t[:, None, None])
-    fitted = converted.fit_converted(
+    fitted = fit.fit(
         known, ProxyTolerances(phase_tolerance_rad=1e-4, transmission_tolerance=1e-4)
     )
-    size = converted.best_size_um(known)
+    size = known.best_converting_um
     assert size == pytest.approx(0.197, abs=0.0012)  # half a step of the sizes
     low, high = fitted.proxy.domain_um
     at = np.linspace(low, high, 31)
