@@ -29,6 +29,8 @@ def run(
     """Sweep and write; exit 1 where most bars miss the tolerance, or a pair held out
     lies above its bar.
     """
+    from metalens.library import plots
+
     with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
@@ -38,7 +40,7 @@ def run(
         seconds = time.perf_counter() - start
         made = dataclasses.replace(made, provenance=about)
         axes.save(draft.path, made)
-        axes.axes_library_figure(draft.path.with_suffix(".png"), made)
+        plots.axes_library_figure(draft.path.with_suffix(".png"), made)
     return options.console.judged(
         _values(made, seconds), _text(target, made, seconds), library_failures(made)
     )

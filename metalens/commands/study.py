@@ -15,7 +15,7 @@ import tyro
 from metalens.commands.common import DistributedOptions, Output
 from metalens.core import config
 from metalens.core.units import nm
-from metalens.library import CellStudy, SweepJournal, study_plots
+from metalens.library import CellStudy, SweepJournal, plots
 from metalens.library import study as cell_study
 
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
@@ -58,7 +58,7 @@ def run(options: Options) -> int:
             options.output.with_name(options.output.name + ".resume"), study
         )
         verdicts = cell_study.run_study(study, options.console, journal=journal)
-        study_plots.write_study(draft.path, study, verdicts, command=command)
+        plots.write_study(draft.path, study, verdicts, command=command)
     journal.finish()
     best = cell_study.best_cell(study, verdicts)
     values = {

@@ -2,15 +2,16 @@ from . import axes as axes
 from . import curve as curve
 from . import engines as engines
 from . import fit as fit
+from . import plots as plots
 from . import rational as rational
 from . import record as record
 from . import study as study
-from . import study_plots as study_plots
 from . import workers as workers
 from .fit import ProxyFit as ProxyFit
 from .fit import ProxyTolerances as ProxyTolerances
 from .fit import proxy_of as proxy_of
 from .geometric_phase import GeometricPhase as GeometricPhase
+from .plots import library_figure as library_figure
 from .proxy import MOST_ERROR as MOST_ERROR
 from .proxy import Proxy as Proxy
 from .proxy import height_hint as height_hint
@@ -21,7 +22,6 @@ from .record import check_sweep as check_sweep
 from .record import load as load
 from .record import save as save
 from .study import CellStudy as CellStudy
-from .study_plots import library_figure as library_figure
 from .sweeping import sweep as sweep
 from .sweeping import with_rotations as with_rotations
 from .workers import SweepJournal as SweepJournal

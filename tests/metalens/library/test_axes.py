@@ -64,8 +64,8 @@ def test_a_surface_holds_its_nodes():
 
 
 def test_exchanged_sizes_exchange_x_and_y(library):
-    assert not axes.record.is_exchange_symmetric(CELL, SETTINGS)
-    assert axes.record.is_exchange_symmetric(SQUARE, SETTINGS)
+    assert not axes.is_exchange_symmetric(CELL, SETTINGS)
+    assert axes.is_exchange_symmetric(SQUARE, SETTINGS)
     t = library.t[0]
     # solved one by one; normals of places that are as near to either edge of a corner
     # are a matter of rounding

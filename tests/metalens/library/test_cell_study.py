@@ -12,8 +12,8 @@ from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
 from metalens.core.console import Console
 from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
+from metalens.library import plots, workers
 from metalens.library import study as cell_study
-from metalens.library import study_plots, workers
 from metalens.library.study import CellStudy
 
 SMALL = CellStudy(
@@ -51,7 +51,7 @@ def test_choice_takes_the_lowest_then_the_most(verdicts):
 
 
 def test_page_json_and_figure(verdicts, tmp_path):
-    study_plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
+    plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
     page = (tmp_path / "README.md").read_text()
     assert f"| 700 | **{verdicts[0].turns:.2f}**" in page
     assert "pitch of 300 nm" in page
@@ -60,7 +60,7 @@ def test_page_json_and_figure(verdicts, tmp_path):
     assert values["verdicts"][1]["pitch_um"] == 0.4
     assert (tmp_path / "cell_study.png").read_bytes().startswith(b"\x89PNG")
     first = (tmp_path / "cell_study.png").read_bytes()
-    study_plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
+    plots.write_study(tmp_path, SMALL, verdicts, command="metalens study")
     assert (tmp_path / "cell_study.png").read_bytes() == first
 
 

@@ -1,30 +1,44 @@
-"""Run a sweep over two sizes: solves where two interpolations disagree, until they
-agree; judged on pairs held out.
+"""Libraries over two sizes, the width and length of a rectangle or the axes of an
+ellipse: Jones matrices of every pair, an error bar on each.
+
+t is meromorphic in each size, with poles that move with the other one. Hence
+
+    t(x, y_k) = r_k(x) for every node y_k, a rational function through the nodes x_j
+    (AAA, one set of poles for all elements of the Jones matrix); then, at each x, a
+    rational function of y through t(x, y_k).
+
+The order of the two is arbitrary: the mean of both orders is the value. Where poles are
+not resolved yet both orders may err by the same, so the doubt is the larger of their
+disagreement and of that with a fit of fewer nodes (one in four inner lines left out),
+the largest within half a distance of nodes. Nodes are added where the doubt is largest.
 """
 
+import dataclasses
 import itertools
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter
 
 from metalens.cell import Cell
-from metalens.core import config
+from metalens.cell.shapes import Ellipse, Rectangle
+from metalens.core import config, records
 from metalens.core.arrays import Array
 from metalens.core.console import Console
+from metalens.core.errors import CellError, ConfigError, DomainError
+from metalens.core.reading import typed_reader
 from metalens.core.store import Provenance
-from metalens.library import workers
-from metalens.library.axes.between import interpolate_table
-from metalens.library.axes.record import (
-    AxesLibrary,
-    cell_of_sizes,
-    check_axes_sweep,
-    is_exchange_symmetric,
-    size_ranges,
-)
-from metalens.library.record import Sweep
+from metalens.library import rational, workers
+from metalens.library.record import Sweep, check_light
 from metalens.library.workers import SweepJournal
+
+KIND = "axes-library"
+FLOOR_SHARE = 0.05  # of the tolerance: in every doubt, for what neither order shows
+FIT_SHARE = 0.1  # of the tolerance: residual of the rational fits
+
 
 FIRST, MOST, ADDED = (
     7,
@@ -48,6 +62,233 @@ _GOLDEN = (
     0.7548776662466927,
     0.5698402909980532,
 )  # of the plane: 1/g, 1/g², g³ = g + 1
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AxesLibrary:
+    """Transmission of one pillar cell over the size along x and the size along y, at
+    normal incidence.
+
+    Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the
+    pillar's foot to that of its top,
+    as :class:`metalens.cell.response.Response` has it. The sizes are those before the
+    turn of the shape.
+
+    cell, sweep: what was computed.
+    wavelength_um: (w,). x_um: (m,), y_um: (n,) sizes, evenly spaced with one step.
+    t: (w, m, n, 2, 2) Jones matrices; last axis: polarisation that comes (x, y), the
+    one before: that leaves.
+    t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not
+    below the true error: solver and
+        interpolation.
+    held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the
+    wavelength, x, y, largest
+        |interpolated - solved| on one truncation, error bar of the entry.
+    solves: behind the entries. harmonics: orders of the truncation, the same for all
+    entries.
+    """
+
+    cell: Cell
+    sweep: Sweep
+    wavelength_um: Array
+    x_um: Array
+    y_um: Array
+    t: Array
+    t_error: Array
+    held_out: Array
+    solves: int
+    harmonics: int
+    provenance: Provenance = field(default_factory=Provenance)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um))
+        if self.t.shape != (*shape, 2, 2) or self.t_error.shape != shape:
+            raise DomainError(
+                f"library t has shape {self.t.shape}, t_error {self.t_error.shape}; need {shape} and 2 x 2"
+            )
+        for name in ("t", "t_error"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise DomainError(f"library {name} holds values that are not finite")
+
+    @property
+    def usable(self) -> Array:
+        """(w, m, n) whether the error bar meets the tolerance; the others are the
+        excluded bands of resonances.
+        """
+        return np.asarray(self.t_error <= self.sweep.bar)
+
+    @property
+    def missed(self) -> int:
+        """Held-out pairs whose error lies above its bar."""
+        return int(np.count_nonzero(self.held_out[:, 3] > self.held_out[:, 4]))
+
+    def at(self, wavelength_um: float) -> int:
+        """Place of a wavelength.
+
+        Raises:
+            DomainError: the library does not hold it (nothing is interpolated between
+                wavelengths).
+        """
+        found = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
+        if not len(found):
+            held = ", ".join(f"{w:g}" for w in self.wavelength_um)
+            raise DomainError(
+                f"wavelength {wavelength_um:g} um: this library holds {held} um; sweep it there too"
+            )
+        return int(found[0])
+
+
+def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
+    """The cell whose pillar of size ``x_um`` is ``y_um`` long along its other axis."""
+    shape = cell.shape
+    if not isinstance(shape, Rectangle | Ellipse):
+        raise CellError(
+            f"lengths_um: a {shape.name} has one size; need a rectangle or an ellipse"
+        )
+    return dataclasses.replace(
+        cell, shape=dataclasses.replace(shape, ratio=y_um / x_um)
+    )
+
+
+def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
+    """Refuse a sweep over two sizes that cannot be computed, before anything is
+    computed.
+
+    Raises:
+        ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
+            with a ratio of its own, pillars
+            that touch; and as :func:`metalens.library.check_sweep`.
+    """
+    spans = size_ranges(sweep)
+    if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
+        cell.shape, "ratio", 1.0
+    ):
+        raise CellError(
+            "cell.shape.ratio: both sizes are swept (diameters_um, lengths_um); leave ratio out"
+        )
+    for x, y in itertools.product(*spans):
+        if not 0.01 <= y / x <= 100:
+            raise CellError(
+                f"sizes {x:g} by {y:g} um: need sides within a factor of 100"
+            )
+        if cell_of_sizes(cell, x, y).gap_um(x) <= 0:
+            raise CellError(
+                f"a {cell.shape.kind} of {x:g} by {y:g} um touches its neighbour on a pitch of {cell.pitch_um:g} um; "
+                "keep diameters_um and lengths_um smaller"
+            )
+    check_light(cell, sweep)
+
+
+def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(least, largest) size along x and along y.
+
+    Raises:
+        ConfigError: not both are given.
+    """
+    if sweep.diameters_um is None or sweep.lengths_um is None:
+        raise ConfigError(
+            "a library over two sizes needs diameters_um (along x) and lengths_um (along y)"
+        )
+    return sweep.diameters_um, sweep.lengths_um
+
+
+def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
+    """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square
+    lattice, not turned.
+    """
+    quarter = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
+    return (
+        cell.lattice.kind == "square"
+        and sweep.diameters_um == sweep.lengths_um
+        and quarter == round(quarter)
+    )
+
+
+def save(path: str | Path, library: AxesLibrary) -> None:
+    """Write a library file (kind ``axes-library``)."""
+    records.save_record(path, KIND, library)
+
+
+@typed_reader
+def load(path: str | Path) -> AxesLibrary:
+    """Read a library over two sizes.
+
+    Raises:
+        StoreError: not such a file; DomainError: its arrays do not fit together.
+    """
+    return records.load_record(path, KIND, AxesLibrary)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InterpolatedTable:
+    """value: (p, q, components) at the places asked for; doubt: (p, q), of the
+    interpolation alone.
+    """
+
+    value: Array
+    doubt: Array
+
+
+def interpolate_table(
+    nodes: tuple[Array, Array],
+    values: Array,
+    places: tuple[Array, Array],
+    *,
+    tolerance: float,
+) -> InterpolatedTable:
+    """t at all pairs of places.
+
+    Args:
+        nodes: (m,) and (n,) rising sizes along x and y; values: (m, n, components)
+            there.
+        places: (p,) and (q,) sizes, within the nodes, evenly spaced.
+    """
+    (x, y), (at_x, at_y) = nodes, places
+    first = _both(x, y, values, at_x, at_y, tolerance)
+    second = _both(y, x, values.swapaxes(0, 1), at_y, at_x, tolerance).swapaxes(0, 1)
+    apart = np.abs(first - second).max(axis=-1)
+    row, column = _fewer(len(x)), _fewer(len(y))
+    rival = _both(x[row], y[column], values[np.ix_(row, column)], at_x, at_y, tolerance)
+    apart = np.maximum(apart, np.abs(rival - (first + second) / 2).max(axis=-1))
+    reach = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
+    apart = maximum_filter(apart, size=[2 * n + 1 for n in reach], mode="nearest")
+    return InterpolatedTable(
+        (first + second) / 2, np.asarray(apart + FLOOR_SHARE * tolerance)
+    )
+
+
+def _fewer(count: int) -> Array:
+    """Places of the nodes of the rival: one in four inner ones is left out."""
+    place = np.arange(count)
+    return np.asarray(place[(place % 4 != 2) | (place == count - 1)])
+
+
+def _half_gap(nodes: Array, places: Array) -> int:
+    """Places within half the mean distance of nodes."""
+    if len(places) < 2:
+        return 0
+    return math.ceil(
+        float(np.diff(nodes).mean()) / 2 / abs(float(places[1] - places[0]))
+    )
+
+
+def _both(
+    x: Array, y: Array, values: Array, at_x: Array, at_y: Array, tolerance: float
+) -> Array:
+    """Along x on every line of nodes, then along y: (p, q, components)."""
+    lines = [
+        rational.fit_rational_aaa(x, values[:, k], tolerance=FIT_SHARE * tolerance)(
+            at_x
+        )
+        for k in range(len(y))
+    ]
+    along = np.stack(lines, axis=1)
+    return np.stack(
+        [
+            rational.fit_rational_aaa(y, line, tolerance=FIT_SHARE * tolerance)(at_y)
+            for line in along
+        ]
+    )
 
 
 class SolvedPillar(NamedTuple):
@@ -153,7 +394,7 @@ def sweep_two_sizes(
 
     Raises:
         ConfigError, CellError, MaterialError: see
-            :func:`metalens.library.axes.check_axes_sweep`.
+            :func:`check_axes_sweep`.
     """
     check_axes_sweep(cell, settings)
     settings = settings.settled(cell)

@@ -1,9 +1,0 @@
-from .between import interpolate_table as interpolate_table
-from .plots import axes_library_figure as axes_library_figure
-from .record import KIND as KIND
-from .record import AxesLibrary as AxesLibrary
-from .record import cell_of_sizes as cell_of_sizes
-from .record import check_axes_sweep as check_axes_sweep
-from .record import load as load
-from .record import save as save
-from .solving import sweep_two_sizes as sweep_two_sizes
