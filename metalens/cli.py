@@ -25,7 +25,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.core import console, lock
+from metalens.core import lock, report
 from metalens.core.errors import (
     ConfigError,
     FitRefused,
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # before the verb began
         status = _refuse("interrupted before the work began", INTERRUPTED)
     try:
-        console.flush_output()
+        report.flush_output()
     except MetalensError as error:
         status = _refuse(str(error))
     return status
@@ -197,12 +197,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a locale of ASCII alone
     if not words or words[0] in ("-h", "--help"):
-        console.flush_output(_help(VERBS) + _INTERRUPTED)
+        report.flush_output(_help(VERBS) + _INTERRUPTED)
         return SUCCESS if words else BAD_INPUT
     if words[0] == "--version":
         from metalens import __version__
 
-        console.flush_output(f"metalens {__version__}\n")
+        report.flush_output(f"metalens {__version__}\n")
         return SUCCESS
     if words[0] not in VERBS:
         return _refuse(
@@ -327,7 +327,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
     parts: dict[str, tuple[str, str]] = getattr(module, "PARTS", {})
     if parts:
         if not words or words[0] in ("-h", "--help"):
-            console.flush_output(_help(parts, f"metalens {verb}"))
+            report.flush_output(_help(parts, f"metalens {verb}"))
             return SUCCESS if words else BAD_INPUT
         meant = words[0] if words[0] in parts else module.part_of(words[0])
         if meant is None:
@@ -352,7 +352,7 @@ def _dispatch(verb: str, words: list[str]) -> int:
             description=module.__doc__,
         )
     except BrokenPipeError:  # whoever was shown the help went away
-        console.silence_output()
+        report.silence_output()
         return SUCCESS
     except SystemExit as end:
         if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):

@@ -41,8 +41,8 @@ from codesign.train import (
 from codesign.train import run as runs
 from metalens import design, lens, library
 from metalens.core import config, report, store, transaction
-from metalens.core.console import Console
 from metalens.core.errors import ConfigError, LensError
+from metalens.core.report import Console
 
 CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"

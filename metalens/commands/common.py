@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from metalens.core import executor, transaction
-from metalens.core.console import Console
+from metalens.core.report import Console
 from metalens.core.transaction import ClaimTerms, OutputDraft
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]

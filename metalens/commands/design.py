@@ -19,8 +19,8 @@ from metalens.commands.common import CommonOptions, Output
 from metalens.commands.paired import YPolarizationTarget
 from metalens.commands.several import AdditionalWavelength
 from metalens.core import config, reading, store, transaction
-from metalens.core.console import Console
 from metalens.core.errors import ConfigError
+from metalens.core.report import Console
 from metalens.core.store import write_bytes
 from metalens.design import (
     ConversionMetrics,

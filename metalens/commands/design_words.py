@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 
 from metalens import design
 from metalens.cell import Cell
-from metalens.core.console import Console
 from metalens.core.errors import ConfigError
+from metalens.core.report import Console
 from metalens.design import (
     ConversionMetrics,
     Focus,

@@ -11,9 +11,9 @@ import numpy as np
 
 from metalens import lens, psf
 from metalens.core import config, store
-from metalens.core.console import Console
 from metalens.core.errors import ConfigError
 from metalens.core.report import (
+    Console,
     Figure,
     KeyFigure,
     Section,

@@ -1,6 +1,5 @@
 from . import arrays as arrays
 from . import config as config
-from . import console as console
 from . import errors as errors
 from . import executor as executor
 from . import legendre as legendre

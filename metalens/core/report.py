@@ -1,20 +1,26 @@
-"""One self-contained report.html with a shared look: sections of text, figures, tables
-and key figures.
-"""
+"""What a command shows: results as tables or JSON, progress, and self-contained pages."""
 
 import base64
+import contextlib
 import io
-from collections.abc import Sequence
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from metalens import __version__
-from metalens.core import store
+from metalens.core.errors import OutputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +271,8 @@ def write_report(
     """
     from jinja2 import Environment
 
+    from metalens.core import store
+
     source = (
         resources.files("metalens")
         .joinpath("data/report.html")
@@ -283,3 +291,179 @@ def write_report(
         kind_of=lambda item: kinds[type(item)],
     )
     store.write_text(path, page)
+
+
+def format_summary(values: Mapping[str, Any], indent: str = "  ") -> list[str]:
+    r"""Lines of text for a result: label and value; inner mappings follow, indented.
+
+    Args:
+        values: numbers, texts, lists and mappings by key; keys end in their unit.
+        indent: blanks before every line.
+
+    >>> values = {"fwhm_um": 1.25, "depths_um": [1.0, 2.0], "focus": {"ok": True}}
+    >>> print("\n".join(format_summary(values)))
+      width at half maximum / µm  1.25
+      depths / µm                 1, 2
+      focus
+        ok  yes
+    """
+    plain = {in_words(k): v for k, v in values.items() if not _is_nested(v)}
+    width = max(map(len, plain), default=0)
+    lines = [f"{indent}{k.ljust(width)}  {_list_text(v)}" for k, v in plain.items()]
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            lines += [f"{indent}{in_words(key)}", *format_summary(value, indent + "  ")]
+        elif _is_nested(value):
+            for entry in value:
+                lines.append(f"{indent}{in_words(key)}")
+                lines += format_summary(entry, indent + "  ")
+    return lines
+
+
+def _is_nested(value: Any) -> bool:
+    """Whether a value is a mapping, or a list of mappings."""
+    if isinstance(value, list | tuple):
+        return bool(value) and all(isinstance(entry, Mapping) for entry in value)
+    return isinstance(value, Mapping) and bool(value)
+
+
+def _list_text(value: Any) -> str:
+    """One line for a value; of a long list of numbers, how many and their range."""
+    if not isinstance(value, list | tuple):
+        return in_figures(value).replace("\n", " ")
+    numbers = [v for v in value if isinstance(v, int | float) and math.isfinite(v)]
+    if len(value) > 6 and len(numbers) == len(value):
+        ends = in_figures(min(numbers)), in_figures(max(numbers))
+        return f"{len(value)} values, {ends[0]} to {ends[1]}"
+    return ", ".join(_list_text(entry) for entry in value[:6]) + (
+        ", ..." if len(value) > 6 else ""
+    )
+
+
+def flush_output(text: str = "") -> None:
+    """Write to standard output and flush it; a reader that went away (``| head``) is no
+    failure of the work.
+
+    Raises:
+        OutputError: it cannot be written otherwise, as to a full disk.
+    """
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        silence_output()
+    except OSError as error:
+        silence_output()
+        raise OutputError(f"standard output: {error.strerror}") from error
+
+
+def silence_output() -> None:
+    """Standard output leads nowhere from here on, what it still holds included."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with contextlib.suppress(OSError, ValueError):  # one that is no file
+        os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)
+
+
+@dataclass(frozen=True, slots=True)
+class Console:
+    """Standard output of one command.
+
+    quiet: only errors are shown.
+    json: results as one JSON object on standard output; progress is silent.
+    """
+
+    quiet: bool = False
+    json: bool = False
+
+    def say(self, text: str) -> None:
+        """One line for a person."""
+        if not (self.quiet or self.json):
+            flush_output(text + "\n")
+
+    def report(
+        self,
+        title: str,
+        values: Mapping[str, Any],
+        *,
+        notes: Iterable[str] = (),
+        failures: Iterable[str] = (),
+    ) -> int:
+        """Show the outcome of a command: JSON with --json, else a table of it.
+
+        Args:
+            title: first line for a person.
+            values: the result; see :func:`format_summary`.
+            notes: sentences that explain the result; empty ones are left out.
+            failures: checks that the result failed, as sentences; empty ones are none.
+
+        Returns:
+            The exit status of the command: 1 with a failure, else 0.
+        """
+        lines = [title, *format_summary(values)]
+        lines += [f"  {note.strip()}" for note in notes if note]
+        return self.judged(dict(values), "\n".join(lines), failures)
+
+    def result(self, values: dict[str, Any], text: str) -> None:
+        """The outcome: ``values`` with --json, else ``text``."""
+        if self.json:
+            flush_output(json.dumps(values, indent=1, default=float) + "\n")
+        else:
+            self.say(text)
+
+    def judged(self, values: dict[str, Any], text: str, failures: Iterable[str]) -> int:
+        """The outcome with the checks that it failed, in words (``failures`` of the
+        values, a line each of the text);
+        the status that the command ends with: 1 where any is told, else 0. Empty words
+        are no failure."""
+        told = [failure for failure in failures if failure]
+        self.result(
+            values | {"failures": told},
+            "\n".join([text, *(f"  FAILED: {failure}" for failure in told)]),
+        )
+        return 1 if told else 0
+
+    def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
+        """Pass ``items`` through, showing how far it is, the rate and the time left."""
+        if self.quiet or self.json:
+            yield from items
+        elif sys.stdout.isatty():
+            yield from _bar(items, total, label)
+        else:
+            yield from self._lines(items, total, label)
+
+    def _lines(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+        start = shown = time.monotonic()
+        for done, item in enumerate(items, 1):
+            yield item
+            now = time.monotonic()
+            if now - shown > 10 or (done == total and now - start > 2):
+                rate = done / (now - start)
+                left = (total - done) / rate
+                self.say(f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left")
+                shown = now
+
+
+def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, transient=True) as bar:
+        task = bar.add_task(label, total=total, rate="")
+        start = time.monotonic()
+        for done, item in enumerate(items, 1):
+            yield item
+            rate = done / max(time.monotonic() - start, 1e-9)
+            bar.update(task, advance=1, rate=f"{rate:.3g}/s")

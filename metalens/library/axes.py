@@ -27,9 +27,9 @@ from metalens.cell import Cell
 from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.core import config, records
 from metalens.core.arrays import Array
-from metalens.core.console import Console
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.reading import typed_reader
+from metalens.core.report import Console
 from metalens.core.store import Provenance
 from metalens.library import rational, workers
 from metalens.library.record import Sweep, check_light

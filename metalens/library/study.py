@@ -11,8 +11,8 @@ import numpy as np
 
 from metalens.cell import Blend, Cell, Incidence, Material, index, materials
 from metalens.core.arrays import Array
-from metalens.core.console import Console
 from metalens.core.errors import CellError, ConfigError
+from metalens.core.report import Console
 from metalens.library import engines, workers
 from metalens.library.curve import ResponseCurve
 from metalens.library.proxy import MOST_ERROR

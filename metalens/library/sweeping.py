@@ -12,7 +12,7 @@ import numpy as np
 from metalens.cell import Cell, Incidence
 from metalens.core import config
 from metalens.core.arrays import Array
-from metalens.core.console import Console
+from metalens.core.report import Console
 from metalens.core.store import Provenance
 from metalens.library import engines, few_nodes, workers
 from metalens.library.curve import ResponseCurve

@@ -13,7 +13,7 @@ import numpy as np
 from metalens import __version__
 from metalens.cell import Cell, Incidence, Response, materials
 from metalens.core import config, executor, manifest, reading, store
-from metalens.core.console import Console
+from metalens.core.report import Console
 from metalens.library import curve as reduced
 from metalens.library.curve import ResponseCurve, SolvedNodes
 from metalens.library.engines import (

@@ -10,8 +10,8 @@ import pytest
 from metalens import cli
 from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
-from metalens.core.console import Console
 from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
+from metalens.core.report import Console
 from metalens.library import plots, workers
 from metalens.library import study as cell_study
 from metalens.library.study import CellStudy

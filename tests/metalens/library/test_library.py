@@ -16,7 +16,6 @@ from metalens import library, modal, rcwa
 from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
-from metalens.core.console import Console
 from metalens.core.errors import (
     CellError,
     ConfigError,
@@ -24,6 +23,7 @@ from metalens.core.errors import (
     MaterialError,
     StoreError,
 )
+from metalens.core.report import Console
 from metalens.library import engines
 from metalens.library.record import DEFAULT_CELL, PillarLibrary, Sweep
 
