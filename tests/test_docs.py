@@ -259,7 +259,7 @@ def test_fields_and_roles_of_docstrings_are_set_as_lists_and_links():
     assert "Attributes:\n    material: a name, a file" in film.docstring.value
     assert film.docstring.value.startswith("A homogeneous layer")
     maker = griffe.load(
-        "metalens.design.of_phase", search_paths=[str(ROOT)], extensions=extensions
+        "metalens.design.assign", search_paths=[str(ROOT)], extensions=extensions
     )["make"]
     assert (
         "[`phase_of`]" not in maker.docstring.value

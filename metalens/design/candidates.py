@@ -11,20 +11,15 @@ given pistons the best pillars are those of (1). Both in turn never raise the su
 the sites, and end where neither lowers it, from several starts.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
-from metalens.design.sites import LatticeSites, PhaseOf
 
-_STARTS, _ROUNDS, _SAMPLE = (
-    16,
-    40,
-    1500,
-)  # of the pistons: starts, rounds of each at most, sites that choose them
+_STARTS, _ROUNDS = 16, 40  # of the pistons: starts, and rounds of each at most
 _CONVERGED_RAD = 1e-3  # pistons that move less have converged
 _ROWS = 256  # sites whose sums (1) stay in a processor's cache
 
@@ -120,30 +115,6 @@ def make_candidates(
     factors = np.concatenate([weighted.real, weighted.imag]).astype(np.float32)
     power = (weights @ np.abs(t) ** 2).astype(np.float32)
     return CandidateTable(t, weights, common_piston, factors, power)
-
-
-def sample_phases(place: LatticeSites, phases: Sequence[PhaseOf]) -> Array:
-    """(channels, sites) wanted phases at some of the sites, evenly picked."""
-    wanted = [
-        np.concatenate([block for *_, block in place.blocks(phase)]) for phase in phases
-    ]
-    pick = np.unique(np.linspace(0, len(wanted[0]) - 1, _SAMPLE).astype(int))
-    return np.stack([one[pick] for one in wanted])
-
-
-def wanted_blocks(
-    place: LatticeSites, phases: Sequence[PhaseOf], pistons: Array
-) -> Iterator[tuple[slice, Array, Array]]:
-    """Blocks of rows: which sites hold a pillar, and (channels, sites) wanted phases.
-
-    Args:
-        place: the sites of the lens.
-        phases: wanted by each channel.
-        pistons: (channels,) in rad, added to the phases.
-    """
-    for blocks in zip(*map(place.blocks, phases), strict=True):
-        rows, inside, _ = blocks[0]
-        yield rows, inside, np.stack([b[2] for b in blocks]) + pistons[:, None]
 
 
 def _vertices(sums: Array) -> Array:

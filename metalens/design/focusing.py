@@ -2,10 +2,13 @@
 meet the sensor.
 """
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from metalens.core.arrays import Array
-from metalens.design.profiles import Focus
+from metalens.design.profiles import Focus, hyperbolic_phase
 from metalens.design.sites import PhaseOf
 from metalens.lens import Lens, media
 
@@ -18,6 +21,8 @@ _APART = (
 SPREAD = 0.2
 # of the peak of a perfect lens, below which the place where they meet is dark: a vortex
 DARK = 1e-3
+PLACES, SEARCHED = 61, 121  # points across the lit part of a lens, and to look for it
+HALF_LIGHT = 0.5  # of the light at angle 0, below which the field behind a stop ends
 
 
 def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> bool:
@@ -151,3 +156,74 @@ def _leaving(
     slope = [((s + np.pi) % (2 * np.pi) - np.pi) / pitch_um / k for s in steps]
     away = np.sqrt(x**2 + y**2 + focus.source_distance_um**2)
     return slope[0] + x / away, slope[1] + y / away
+
+
+def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:
+    """Half field in rad at which coma, astigmatism and curvature of the field of the
+    hyperbolic lens leave
+    exp(-sigma²) = ``strehl`` on its sensor, which is flat.
+
+    sigma is the wave-front error over the aperture (of the lens, what the stop lets
+    light on), with piston and tilt
+    taken out: at most 60 degrees. Behind a stop it ends where the light of less than
+    half the pillars of angle 0 is
+    left, whatever the rest does.
+    """
+    low, high = 0.0, np.pi / 3
+    for _ in range(40):
+        middle = (low + high) / 2
+        if math.exp(-_wavefront_variance(focus, radius_um, middle)) >= strehl:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
+    """The largest of light from four sides, by turns of a stop beside the axis; of one
+    where all are alike.
+    """
+    stop, found = focus.layers.stop, []
+    for _ in range(4 if stop is not None and not stop.centred else 1):
+        found.append(
+            _from_the_side(
+                replace(focus, layers=replace(focus.layers, stop=stop)),
+                radius_um,
+                angle_rad,
+            )
+        )
+        stop = stop and replace(stop, centre_um=(-stop.centre_um[1], stop.centre_um[0]))
+    return max(found)
+
+
+def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
+    x, y, lit_um2 = _lit(focus, radius_um, math.tan(angle_rad))
+    if lit_um2 <= 0 or lit_um2 < HALF_LIGHT * _lit(focus, radius_um, 0.0)[2]:
+        return math.inf
+    path = hyperbolic_phase(x, y, focus)
+    for one in focus.paths_from(x, y, math.tan(angle_rad)):
+        path = path + 2 * np.pi / focus.wavelength_um * one
+    basis = np.stack([np.ones_like(x), x, y], axis=1)
+    basis /= np.abs(basis).max(axis=0)
+    residual = path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]
+    return float((residual**2).mean())
+
+
+def _lit(focus: Focus, radius_um: float, tangent: float) -> tuple[Array, Array, float]:
+    """Places (x,) and (y,) of the lens that an angle's light falls on, ``PLACES``
+    across, and their area in um².
+    """
+    middle, half = (0.0, 0.0), radius_um
+    for look in (PLACES,) if focus.layers.stop is None else (SEARCHED, PLACES):
+        unit, step = np.linspace(-half, half, look, retstep=True)
+        x, y = np.meshgrid(middle[0] + unit, middle[1] + unit)
+        there = np.hypot(x, y) <= radius_um * (1 + 1e-12)
+        if focus.layers.stop is not None:
+            source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um
+            there &= focus.layers.lit(*source, (x, y), 1e-6 * radius_um) > 0
+        x, y = x[there], y[there]
+        if not x.size:
+            break
+        middle = (float(x.max() + x.min()) / 2, float(y.max() + y.min()) / 2)
+        half = float(max(np.ptp(x), np.ptp(y)) / 2 + step)
+    return x, y, x.size * float(step) ** 2

@@ -3,7 +3,7 @@ them.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +36,18 @@ class LatticeSites:
     steps_um: tuple[float, float]
     aperture_um: float
 
-    def blocks(self, phase: PhaseOf) -> Iterator[tuple[slice, Array, Array]]:
-        """Blocks of rows: which of their sites hold a pillar, and the phase wanted
-        there.
+    def blocks(
+        self, phases: Sequence[PhaseOf], pistons_rad: Array | None = None
+    ) -> Iterator[tuple[slice, Array, Array]]:
+        """Blocks of rows: which sites hold a pillar, and the phases wanted there.
+
+        Args:
+            phases: function of position for every channel.
+            pistons_rad: (channels,) added to them.
+
+        Yields:
+            The rows, (rows, columns) whether a pillar stands, (channels, sites) phase
+            in rad.
 
         Raises:
             LensError: a phase of another shape than (rows, columns).
@@ -47,25 +56,37 @@ class LatticeSites:
             (np.arange(n) - (n - 1) / 2) * s
             for n, s in zip(self.shape[::-1], self.steps_um, strict=True)
         )
-        reach = (
-            self.aperture_um / 2 - self.pitch_um / 2 if self.shape != (1, 1) else 0.0
-        )
+        reach = (self.aperture_um - self.pitch_um) / 2 if self.shape != (1, 1) else 0.0
         size = max(1, _BLOCK_SITES // self.shape[1])
         for start in range(0, self.shape[0], size):
             rows = slice(start, start + size)
             inside = y[rows, None] ** 2 + x**2 <= reach**2 * (1 + 1e-12)
             if self.lattice.centred:
-                odd = (
-                    np.arange(self.shape[0])[rows, None] + np.arange(self.shape[1])
-                ) % 2
-                inside &= odd == 0
-            wanted = phase(x, y[rows])
-            if np.shape(wanted) != inside.shape:
-                raise LensError(
-                    f"phase of shape {np.shape(wanted)} for x of {x.shape} and y of {y[rows].shape}: need "
-                    f"{inside.shape}, as phase(x, y[:, None]) of a function of one point gives"
-                )
-            yield rows, inside, wanted[inside]
+                row, column = np.ogrid[start : start + len(inside), : len(x)]
+                inside &= (row + column) % 2 == 0
+            wanted = []
+            for phase in phases:
+                block = phase(x, y[rows])
+                if np.shape(block) != inside.shape:
+                    raise LensError(
+                        f"phase of shape {np.shape(block)} for x of {x.shape} and y of "
+                        f"{y[rows].shape}: need {inside.shape}, as "
+                        "phase(x, y[:, None]) of a function of one point gives"
+                    )
+                wanted.append(block[inside])
+            added = np.zeros(len(phases)) if pistons_rad is None else pistons_rad
+            yield rows, inside, np.stack(wanted) + added[:, None]
+
+    def sample(self, phases: Sequence[PhaseOf], count: int = 1500) -> Array:
+        """(channels, sites) wanted phases in rad at evenly picked sites.
+
+        Args:
+            phases: function of position for every channel.
+            count: sites at most.
+        """
+        wanted = np.concatenate([block for *_, block in self.blocks(phases)], axis=1)
+        pick = np.linspace(0, wanted.shape[1] - 1, count).astype(int)
+        return np.asarray(wanted[:, np.unique(pick)])
 
     def map(
         self,

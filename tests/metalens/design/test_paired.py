@@ -209,7 +209,7 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
     assert again.seen("y").seen("x").sensor_distance_um == 37.0
     with pytest.raises(LensError, match="of two sizes"):
         lens.load_plain(tmp_path / "lens.h5")
-    with pytest.raises(LensError, match="no proxy of one diameter"):
+    with pytest.raises(DomainError, match="no proxy of one diameter"):
         again.proxy.phase_rad(np.array([0.2]), WAVELENGTH)
     with pytest.raises(LensError, match="two sizes"):
         dataclasses.replace(again, pairs=None)
