@@ -31,7 +31,9 @@ _COVERED_LEVEL = 0.7  # and the |t| that it needs
 _GAPS = 12  # sizes along each axis at which gaps of oblique pillars are computed
 
 # wanted (channels, sites) phases -> (maps (k, sites), [(phase, |t|) of each channel])
-_Choice = Callable[[Array], tuple[Sequence[Array], Sequence[tuple[Array, Array]]]]
+_Choice = Callable[
+    [Array], tuple[Sequence[Array] | Array, Sequence[tuple[Array, Array]]]
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +231,7 @@ def make(
 
     def choose(wanted: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
         size = proxy.diameter_um(wanted[0], wave, within_um=span, gap=gap)
-        size = np.float32(size)
+        size = size.astype(np.float32)
         return [size], [_response(proxy, size, wave)]
 
     place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
@@ -286,7 +288,8 @@ def assign_multi_wavelength(
     table = make_candidates(np.stack(t), np.array(weights))
 
     def choose(block: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
-        size = np.float32(span[0] + (sizes[1] - sizes[0]) * table.between(block))
+        size = span[0] + (sizes[1] - sizes[0]) * table.between(block)
+        size = size.astype(np.float32)
         return [size], [_response(proxy, size, wave, span) for wave in waves]
 
     place = lattice_sites(cell, aperture_um, grid_nm=limits.grid_nm)
@@ -341,7 +344,7 @@ def assign_polarization_multiplexed(
     row, column = np.nonzero(printed)
     jones = library.t[at, row, column]
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]])
-    sizes = np.float32([library.x_um[row], library.y_um[column]])
+    sizes = np.array([library.x_um[row], library.y_um[column]], np.float32)
     table = make_candidates(t, np.ones(2), common_piston=alike)
     used = np.zeros(t.shape[1], int)
 
@@ -426,7 +429,7 @@ def assign_geometric_phase(
     start, level = _response(proxy, np.array([rotated.size_um]), wave)
 
     def choose(wanted: Array) -> tuple[list[Array], list[tuple[Array, Array]]]:
-        angle = np.float32(np.mod((wanted[0] - start) / step, np.pi))
+        angle = np.mod((wanted[0] - start) / step, np.pi).astype(np.float32)
         made = start + step * angle.astype(float)
         size = np.full(len(angle), np.float32(rotated.size_um))
         return [size, angle], [(made, np.broadcast_to(level, made.shape))]
