@@ -76,15 +76,6 @@ class DetectorGrid:
         y, x = self._centre_um()
         return self._axis(self.rows) + y, self._axis(self.columns) + x
 
-    def ends_um(self) -> tuple[Array, Array]:
-        """(y, x) of the first and last pixels from the chief ray."""
-        ends = [
-            np.array([-1, 1]) * (n - 1) / 2 * self.pixel_um
-            for n in (self.rows, self.columns)
-        ]
-        y, x = self._centre_um()
-        return ends[0] + y, ends[1] + x
-
     def across_um(self, near_um: float) -> float:
         """Side of a square about the chief ray that holds all that is seen; of what is
         farther off than ``near_um``.

@@ -4,17 +4,15 @@ parameter, on coarse nodes.
 
 import copy
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from characterize.model import detector, moments
+from characterize.model import detector
 from characterize.model.glass import BenchGeometry, FilmStack, source_paths
 from characterize.model.kernel import real_of, wrapped_phasors
-from characterize.model.moments import LIT, WHOLE, Cut, LightBases, LightFactor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import (
     ChangeRange,
@@ -63,11 +61,7 @@ _PITCH = PLACE["pixel_percent"]
 # off the chief ray, within which windows need no more directions than those of the
 # middle
 _NEAR_UM = 5.0
-_FEW, _FEWER, _SMOOTHER = (
-    2e-2,
-    0.85,
-    10.0,
-)  # in a quick model: terms left out, samples, what a slope may miss, by ratio
+_FEW, _FEWER = 2e-2, 0.85  # in a quick model: terms left out, and samples
 # pixels around a part of a window: what blur brings from farther off changes little
 _NARROW = 2
 
@@ -102,7 +96,7 @@ class ForwardModel:
             s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
         )
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
-        self.modes, self._missed = np.empty(0), moments.MISSED
+        self.modes = np.empty(0)
         self._lit = EVERY, EVERY
         self._kept: dict[
             tuple[CompressedLens, Callable[[Array, Array, int], Array], int], Array
@@ -218,11 +212,7 @@ class ForwardModel:
             are background alone beside it.
         """
         part, window_um = self.rough(_FEW), None
-        part._missed, part.grid, part._lit = (
-            _SMOOTHER * moments.MISSED,
-            self._sparser(),
-            (rows, columns),
-        )
+        part.grid, part._lit = self._sparser(), (rows, columns)
         narrow = part.grid.part(rows, columns, _NARROW)
         if narrow.rows < self.grid.rows or narrow.columns < self.grid.columns:
             part.grid, window_um = narrow, narrow.across_um(_NEAR_UM)
@@ -383,48 +373,31 @@ class ForwardModel:
             lambda: self._pupil(x, group, bool(names)),
         )
         lit = lens[0] * phasor
-        coarse = operators.coarse(lit, self.cut)
-        field = operators.envelope(coarse)
+        field = operators.envelope(operators.coarse(lit, self.cut))
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
-        by = {
-            "bias": lens[1],
-            **dict(zip(ANSWERING, lens[2], strict=False)),
-            "wave": lens[3],
-        }
-        factors, bases = (
-            dict(self._factors(x, group, names)),
-            LightBases(lit, phasor, by),
-        )
-        out = self._quick(x, (operators, coarse), group, bases, factors)
-        conjugate, power, rough = (
-            field.conj(),
-            np.vdot(lit, lit).real,
-            max(self.cut, _SLOPE_TOLERANCE),
-        )
-        for name in factors.keys() - out.keys():
+        conjugate, power = field.conj(), np.vdot(lit, lit).real
+        rough, out = max(self.cut, _SLOPE_TOLERANCE), dict[str, Array]()
+        for name in names:
+            rate = self._lens_rate(x, group, name, lens, phasor)
+            if rate is None:
+                continue
             # the part of a change that is the light itself needs no sum, nor loses
             # digits
-            changed = bases.changed(factors[name])
-            same = np.vdot(lit, changed) / power
-            changed = changed - same * lit
-            rate = operators.envelope(operators.coarse(changed, rough))
-            if moves := factors[name].moves:
-                beside = (
-                    float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
-                )
-                rate = rate + factors[name].um * operators.rates(
-                    lit, moves, rough, beside=beside
-                )
+            same = np.vdot(lit, rate) / power
+            rate = rate - same * lit
+            seen = operators.envelope(operators.coarse(rate, rough))
+            if name in _WINDOW:
+                moves, um = _WINDOW[name]
+                other = float(np.linalg.norm(rate)) / math.sqrt(power) / um
+                seen = seen + um * operators.rates(lit, moves, rough, beside=other)
             out[name] = (
-                self.grid.sample(2 * (conjugate * rate).real, transfer)
+                self.grid.sample(2 * (conjugate * seen).real, transfer)
                 + 2 * same.real * light
             )
         growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
-        for name in (
-            growth.keys() & out.keys()
-        ):  # the source's image grows or shrinks too
+        for name in growth.keys() & out.keys():  # the source's image grows too
             disc = (
                 np.asarray(blurs["growth"])
                 * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
@@ -434,63 +407,31 @@ class ForwardModel:
             out[name] = self.grid.sample(intensity, blurs[name])
         return light, out
 
-    def _quick(
+    def _lens_rate(
         self,
         x: Array,
-        seen: tuple[WindowOperators, Array],
         group: AngleGroup,
-        bases: LightBases,
-        factors: dict[str, LightFactor],
-    ) -> dict[str, Array]:
-        """Derivatives that are had from those of the field: what smooth factors make of
-        a point, on small pixels.
+        name: str,
+        lens: tuple[Array, Array, Array, Array],
+        phasor: Array,
+    ) -> Array | None:
+        """(frames, q, p) derivative of the light on the nodes by one parameter, the
+        window's own move left out; None where it changes none. ``lens``: of
+        :meth:`_pupil`.
         """
-        (operators, coarse), turned, grid = seen, seen[0].turned, self._sparser()
-        small = bool(factors) and moments.fine_enough(grid, group.reduced.radius_um)
-        blur = (
-            self._transfer(x, group, [], grid)[0]
-            if turned is not None and small
-            else None
-        )
-        if turned is None or not isinstance(blur, detector.SeparableBlur):
-            return {}
-
-        def field(base: str, light: Array) -> Array:
-            return (
-                coarse
-                if base == LIT
-                else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
-            )
-
-        return moments.light_derivatives(
-            turned,
-            grid,
-            blur,
-            group.reduced.seen(),
-            bases,
-            field,
-            factors,
-            self._missed,
-        )
-
-    def _factors(
-        self, x: Array, group: AngleGroup, names: list[str]
-    ) -> Iterator[tuple[str, LightFactor]]:
-        """(name, what one unit does to the light on the nodes) of all parameters that
-        change it.
-        """
-        for name in names:
-            if name in WIDENING:
-                yield name, LightFactor.fixed("bias", group.widening[WIDENING[name]])
-            elif name in ANSWERING:
-                yield name, LightFactor.fixed(name, np.ones_like(group.reduced.u))
-            elif (turning := group.turning(name)) is not None:
-                yield name, LightFactor.fixed(LIT, 1j * turning)
-            elif name in GEOMETRY:
-                moves, um = _WINDOW.get(name, ("", 1.0))
-                added = "wave" if name == "wavelength_nm" else ""
-                slope = functools.partial(self._phase_slope, x, group, name)
-                yield name, LightFactor(LIT, slope, moves, um, added)
+        if name in WIDENING:
+            rate = lens[1] * group.widening[WIDENING[name]] * phasor
+        elif name in ANSWERING:
+            rate = lens[2][ANSWERING[name]] * phasor
+        elif (turning := group.turning(name)) is not None:
+            rate = 1j * turning * lens[0] * phasor
+        elif name in GEOMETRY:
+            rate = self._phase_slope(x, group, name) * (lens[0] * phasor)
+            if name == "wavelength_nm":
+                rate = rate + lens[3] * phasor
+        else:
+            return None
+        return np.asarray(rate.astype(phasor.dtype))
 
     def _pupil(
         self, x: Array, group: AngleGroup, slopes: bool
@@ -523,12 +464,12 @@ class ForwardModel:
             group.reduced.combined(weight, by_wave),
         )
 
-    def _phase(self, x: Array, group: AngleGroup, cut: Cut = WHOLE) -> Array:
-        """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken
+    def _phase(self, x: Array, group: AngleGroup) -> Array:
+        """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken
         off, aberrations; light.
         """
         reduced, index, nominal = group.reduced, group.index, group.reduced.bench
-        here, every = (reduced.x_um[cut], reduced.y_um[cut]), (slice(None), *cut)
+        here = reduced.x_um, reduced.y_um
         wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
         k = 2 * math.pi / wavelength_um
         d = nominal.distance_um + x[PLACE["distance_um"]]
@@ -548,37 +489,27 @@ class ForwardModel:
         )
         out += exit_path
         out *= k
-        out -= reduced.known[cut]
-        out += np.tensordot(
-            [x[PLACE[name]] for name in BENDING], group.bending[every], 1
-        )
+        out -= reduced.known
+        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending, 1)
         uneven = x[[PLACE[name] for name in LIGHT]]
         light = (
-            -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1)
+            -0.5j * np.tensordot(uneven, light_maps(reduced.u, reduced.v), 1)
             if uneven.any()
             else 0.0
         )
         return (
             out
             + light
-            + (
-                np.tensordot(self.modes, group.residual[every], 1)
-                if len(self.modes)
-                else 0.0
-            )
+            + (np.tensordot(self.modes, group.residual, 1) if len(self.modes) else 0.0)
         )
 
-    def _phase_slope(self, x: Array, group: AngleGroup, name: str, cut: Cut) -> Array:
+    def _phase_slope(self, x: Array, group: AngleGroup, name: str) -> Array:
         """Derivative of i times :meth:`_phase` by a geometric parameter: central
         difference of a smooth function.
         """
         step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
         way = step * (np.arange(len(x)) == PLACE[name])
-        return (
-            0.5j
-            / step
-            * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
-        )
+        return 0.5j / step * (self._phase(x + way, group) - self._phase(x - way, group))
 
     def _operators(self, x: Array, group: AngleGroup) -> WindowOperators:
         nominal = group.reduced.bench
@@ -587,7 +518,6 @@ class ForwardModel:
             distance_um=nominal.distance_um + x[PLACE["distance_um"]],
             axes_um=self.grid.axes_um(),
             edge_um=self.grid.margin * self.setting.pixel_um,
-            turned_um=self._sparser().axes_um(),
         )
 
     def _growth(self, x: Array, group: AngleGroup) -> dict[str, Array]:

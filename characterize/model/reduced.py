@@ -37,10 +37,8 @@ from characterize.model.window import (
     MIXED,
     STEP,
     CouplingTerms,
-    DerivativeOperators,
     WindowOperators,
     axis_operators,
-    derivative_operators,
 )
 from metalens.core import legendre, threads
 from metalens.core.arrays import Array
@@ -231,12 +229,6 @@ class CompressedLens:
         """(x, y) of the window on the sensor at the nominal distance."""
         return self.films.chief_um(self.bench.distance_um, self.bench.tangents)
 
-    def seen(self) -> tuple[Array, Array, Array]:
-        """(q, p) direction cosines p and q of the nodes, and which of them meet the
-        lens.
-        """
-        return self.p, self.q, np.hypot(self.u, self.v) < 1
-
     def _gather(
         self, lens: Lens, pillars: PillarResponse, depth_um: float | None = None
     ) -> Array:
@@ -349,24 +341,18 @@ class CompressedLens:
         distance_um: float,
         axes_um: tuple[Array, Array],
         edge_um: float = 0.0,
-        turned_um: tuple[Array, Array] | None = None,
     ) -> WindowOperators:
         """Arrays for an actual wavelength and distance, both exact; ``axes_um`` (y, x)
         of the window's samples.
 
-        turned_um: (y, x) of those where the field's derivatives are wanted, the same
-            without.
         edge_um: width of a rim of the window where a tenfold error is allowed, since
             only its blur is seen.
         The last few are kept: an image is often followed by its derivatives.
         """
-        turned_um = axes_um if turned_um is None else turned_um
-        key = wavelength_um, distance_um, *_named(axes_um), *_named(turned_um)
+        key = wavelength_um, distance_um, *_named(axes_um)
         found = self._operators.get(key)
         if found is None:
-            found = self._operators_of(
-                wavelength_um, distance_um, axes_um, edge_um, turned_um
-            )
+            found = self._operators_of(wavelength_um, distance_um, axes_um, edge_um)
             with self._changing:
                 self._operators[key] = found
                 while len(self._operators) > _KEPT:
@@ -374,12 +360,7 @@ class CompressedLens:
         return found
 
     def _operators_of(
-        self,
-        wavelength_um: float,
-        distance_um: float,
-        axes_um: Axes,
-        edge_um: float,
-        turned_um: Axes,
+        self, wavelength_um: float, distance_um: float, axes_um: Axes, edge_um: float
     ) -> WindowOperators:
         usual_um, films = (
             self.bench.distance_um,
@@ -431,28 +412,12 @@ class CompressedLens:
             step = 2 * STEP * (distance_um if name == "distance" else wavelength_um)
             return self._terms(kernel, ends, (1 / step, -1 / step), (y, x), inner)
 
-        def bent(degree: int) -> tuple[Array, Array]:
-            down, across = (
-                derivative_operators(*one, degree)
-                for one in zip(turned_um, (y, x), bands, strict=True)
-            )
-            return down.astype(real_of(kind)), across.astype(real_of(kind))
-
-        few = len(y) < len(axes_um[0]) and len(x) < len(axes_um[1])
         rest = (
             self._from(nominal, kernel, (y, x), inner)
             if self._near
             else self._terms(kernel, [kernel], (1.0,), (y, x), inner)
         )
-        return WindowOperators(
-            parts[0],
-            parts[1],
-            rest,
-            moved,
-            DerivativeOperators(kernel, (bands[0], bands[1]), functools.cache(bent))
-            if few
-            else None,
-        )
+        return WindowOperators(parts[0], parts[1], rest, moved)
 
     def _from(
         self,

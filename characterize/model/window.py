@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model.kernel import CompressedKernel, real_of
+from characterize.model.kernel import real_of
 from metalens.core import threads
 from metalens.core.arrays import Array
 
@@ -29,7 +29,6 @@ ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
 _COARSEST = 0.2  # tolerance of a small part of a derivative
 _TAPS = range(6, 42, 2)
-_TURNED = 24  # samples that a derivative of the field is taken from
 # of distance and wavelength, for derivatives: paths bend over as much as they are long
 STEP = 1e-3
 
@@ -86,34 +85,17 @@ class CouplingTerms:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class DerivativeOperators:
-    """Coarse samples to derivatives of the field: :func:`derivative_operators` along
-    (y, x) up to a
-    degree, real.
-
-    bands: (y, x) rad/um that directions are counted in; kernel: of which field.
-    """
-
-    kernel: CompressedKernel
-    bands: tuple[float, float]
-    ways: Callable[[int], tuple[Array, Array]]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class WindowOperators:
     """From nodes to window for one wavelength and distance: both axes, and the rest.
 
     moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its
     own.
-    turned: the field's derivatives; None where the window's own samples are the coarse
-    ones.
     """
 
     y: AxisOperators
     x: AxisOperators
     rest: CouplingTerms
     moved: Callable[[str], CouplingTerms]
-    turned: DerivativeOperators | None = None
 
     def field(self, light: Array, tolerance: float = 0.0) -> Array:
         """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or
@@ -271,52 +253,6 @@ def axis_operators(
     return coarse, AxisOperators(
         value, weights, np.exp(1j * k * by(middle, at_um)), moved
     )
-
-
-def derivative_operators(
-    at_um: Array, coarse_um: Array, band: float, degree: int
-) -> Array:
-    """(degree + 1, fine, coarse) from coarse samples to the field of light times powers
-    of its own direction.
-
-    Of the direction from the middle one, over ``band``: between -1 and 1, fields less
-    their carrier. Light from there
-    turns as exp(i band t X) on the window, so that a factor t^a is a derivative of the
-    field: by the weights of least
-    error over the band, as plain interpolation is (``a`` = 0). For odd ``a`` they are
-    imaginary: here less their i.
-    """
-    return _turned(
-        float(at_um[0]),
-        float(at_um[-1]),
-        len(at_um),
-        tuple(coarse_um.tolist()),
-        band,
-        degree,
-    )
-
-
-@functools.lru_cache(maxsize=16)
-def _turned(
-    first: float,
-    last: float,
-    count: int,
-    places: tuple[float, ...],
-    band: float,
-    degree: int,
-) -> Array:
-    at_um, coarse_um = np.linspace(first, last, count), np.array(places)
-    taps = min(_TURNED, len(coarse_um))
-    index, apart = _nearby(at_um, coarse_um, band, taps)
-    t, share = np.polynomial.legendre.leggauss(taps + 40)
-    turn = band * t * (at_um[:, None] - coarse_um[index])[..., None]  # fine, taps, t
-    waves = np.cos(turn), np.sin(turn)
-    seen = np.stack([waves[a % 2] @ (share / 2 * t**a) for a in range(degree + 1)])
-    found = np.linalg.solve(apart, seen.reshape(-1, taps).T).T.reshape(seen.shape)
-    out = np.zeros((degree + 1, len(at_um), len(coarse_um)))
-    for weights, row in zip(found, out, strict=True):
-        np.put_along_axis(row, index, weights, 1)
-    return out
 
 
 def _nearby(
