@@ -14,7 +14,6 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
     Kinds,
-    PairSensitivities,
     Perturbation,
     ResponseError,
     Sensitivity,
@@ -147,41 +146,14 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
 
 def _packed(found: Sensitivity) -> dict[str, Array]:
     """As named arrays."""
-    numbers = np.array([found.center_um, found.error, found.low_um, found.high_um])
-    out = {"coefficients": found.coefficients, "numbers": numbers}
-    if found.solved is not None:
-        table = found.solved
-        out |= {
-            "wavelength": np.array(table.wavelength_um),
-            "diameter": table.diameter_um,
-            "powers": table.powers,
-        }
-    if found.edges is not None:
-        out["edges"] = found.edges
-    if found.pairs is not None:
-        out |= {
-            "width": found.pairs.width_um,
-            "length": found.pairs.length_um,
-            "rates": found.pairs.rates,
-        }
-    return out
+    arrays, numbers = records.flatten_record(found)
+    return arrays | {name: np.array(value) for name, value in numbers.items()}
 
 
 def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
     """From named arrays."""
-    center, error, low, high = arrays["numbers"].tolist()
-    if "rates" in arrays:
-        return Sensitivity.of_pairs(
-            PairSensitivities(arrays["width"], arrays["length"], arrays["rates"], error)
-        )
-    table = None
-    if "powers" in arrays:
-        table = Solved(
-            float(arrays["wavelength"]), arrays["diameter"], arrays["powers"]
-        )
-    return Sensitivity(
-        arrays["coefficients"], center, error, low, high, table, arrays.get("edges")
-    )
+    numbers = {name: each.item() for name, each in arrays.items() if not each.ndim}
+    return records.build_record(Sensitivity, arrays, numbers, where="kept slopes")
 
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:

@@ -21,9 +21,6 @@ PROBES = [
 # that a curve takes: the one that serves most diameters, and what follows it beside a
 # resonance
 MESHES = 3
-# of the tolerance, half of an entry's: with the share of the fit the entry is still
-# within its own
-ENOUGH = 1.2
 Engine = Literal["auto", "rcwa", "modal"]
 
 
@@ -109,10 +106,7 @@ def solvers_at_common_discretization(
     for place, level in enumerate(levels[:-1]):
         if all(_failing(at, probes, allowed) <= allowed for at in level):
             taken = levels[place : place + MESHES] if engine == "modal" else [level]
-            return [
-                _stepped(meshes, ENOUGH * tolerance)
-                for meshes in zip(*taken, strict=True)
-            ]
+            return [_first_converged(meshes) for meshes in zip(*taken, strict=True)]
     return list(levels[-1])
 
 
@@ -144,47 +138,23 @@ def _failing(at: Callable[[float], Response], probes: list[float], allowed: int)
     return failing
 
 
-def _stepped(
-    meshes: Sequence[Callable[[float], Response]], enough: float
+def _first_converged(
+    meshes: Sequence[Callable[[float], Response]],
 ) -> Callable[[float], Response]:
-    """:func:`_met`, remembered; between two diameters that needed a finer mesh, beside
-    a resonance, that one begins.
+    """Response of the first mesh that meets the tolerance at a diameter, else of the
+    best; remembered.
     """
-    needed: dict[float, int] = {}
 
     @functools.cache
     def at(diameter_um: float) -> Response:
-        below = max((known for known in needed if known < diameter_um), default=None)
-        above = min((known for known in needed if known > diameter_um), default=None)
-        begin = (
-            0 if below is None or above is None else min(needed[below], needed[above])
-        )
-        needed[diameter_um], found = _met(meshes, diameter_um, enough, begin)
-        return found
+        tried = []
+        for mesh in meshes:
+            tried.append(mesh(diameter_um))
+            if tried[-1].converged:
+                break
+        return min(tried, key=lambda response: response.t_error)
 
     return at
-
-
-def _met(
-    meshes: Sequence[Callable[[float], Response]],
-    diameter_um: float,
-    enough: float,
-    begin: int = 0,
-) -> tuple[int, Response]:
-    """Of the first mesh from ``begin`` on that meets the tolerance at this diameter,
-    else of the best; its place first.
-
-    The third costs several times as much as both before, and is asked where neither has
-    an error of ``enough`` or less.
-    """
-    tried: list[tuple[int, Response]] = []
-    for place in range(begin, len(meshes)):
-        if place > 1 and any(made.t_error <= enough for _, made in tried):
-            break
-        tried.append((place, meshes[place](diameter_um)))
-        if tried[-1][1].converged:
-            return tried[-1]
-    return min(tried, key=lambda made: made[1].t_error)
 
 
 def _modal_levels(

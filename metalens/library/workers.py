@@ -4,7 +4,7 @@ journal that keeps those done.
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ def run_task(task: Task) -> Result:
     cell = config.loads(task["cell"], Cell, where="task")
     lights = [Incidence(*one) for one in task["lights"]]
     if task["kind"] == "jones":
-        return _both_polarizations(cell, task["size_um"], lights[0], task["harmonics"])
+        return _solve_jones(cell, task["size_um"], lights[0], task["harmonics"])
     about: dict[str, Any] = {"tolerance": task["tolerance"], "engine": task["engine"]}
     if task["kind"] == "points":
         solve = solve_to_tolerance(cell, lights[0], **about)
@@ -92,74 +92,56 @@ def run_task(task: Task) -> Result:
     ):  # every curve begins with them: one after the other they share modes
         for solve in solves:
             solve(diameter)
-    parts: list[Result] = []
-    for (
-        solve
-    ) in solves:  # and later ones take diameters of those before, where these serve
-        known = [d for part in parts for d in part["diameter_um"]]
-        parts.append(
-            _explored(solve, (low, high), FIT_SHARE * task["tolerance"], known)
+    curves: list[Result] = []
+    for solve in solves:  # later ones take diameters of those before, where these serve
+        known = [d for one in curves for d in one["diameter_um"]]
+        nodes = reduced.sample_adaptively(
+            solve,
+            low,
+            high,
+            tolerance=FIT_SHARE * task["tolerance"],
+            cheaper_um=np.array(known),
         )
-    return _joined(parts)
-
-
-def _explored(
-    solve: Callable[[float], Response],
-    span_um: tuple[float, float],
-    tolerance: float,
-    known_um: list[float],
-) -> Result:
-    nodes = reduced.sample_adaptively(
-        solve, *span_um, tolerance=tolerance, cheaper_um=np.array(known_um)
-    )
-    order = nodes.diameter_um.tolist()
-    return _listed(order, [solve(d) for d in order]) | {
-        "converged": [nodes.converged],
-        "reason": [nodes.reason],
-    }
-
-
-def _joined(parts: list[Result]) -> Result:
-    """One listing of several, and how many entries each has."""
-    whole = {name: [one for part in parts for one in part[name]] for name in parts[0]}
-    return whole | {"counts": [len(part["diameter_um"]) for part in parts]}
+        diameters = nodes.diameter_um.tolist()
+        ends = {"converged": nodes.converged, "reason": nodes.reason}
+        curves.append(_listed(diameters, [solve(d) for d in diameters]) | ends)
+    return {"curves": curves}
 
 
 def solve_curves(result: Result, *, tolerance: float) -> list[ResponseCurve]:
-    """The curves of a task of curves, of this tolerance, one a light."""
-    columns = [
-        np.array(result["diameter_um"]),
-        *(np.array(result[name]) @ (1, 1j) for name in ("t", "r")),
-    ]
-    columns += [np.array(result[name]) for name in ("error", "energy")]
+    """The curves t(D) of a finished task of curves, one a light.
+
+    Args:
+        result: of the task.
+        tolerance: that the task had.
+    """
     made = []
-    for place, stop in enumerate(np.cumsum(result["counts"]).tolist()):
-        diameter, t, r, error, energy = (
-            one[stop - result["counts"][place] : stop] for one in columns
+    for one in result["curves"]:
+        t, r = (np.array(one[name]) @ (1, 1j) for name in ("t", "r"))
+        nodes = SolvedNodes(
+            np.array(one["diameter_um"]),
+            np.stack([t, r], 1),
+            np.array(one["error"]),
+            np.array(one["energy"]),
+            one["converged"],
+            one["reason"],
         )
-        end = result["converged"][place], result["reason"][place]
-        nodes = SolvedNodes(diameter, np.stack([t, r], 1), error, energy, *end)
         made.append(reduced.fit_response_curve(nodes, tolerance=FIT_SHARE * tolerance))
     return made
 
 
-def _both_polarizations(
-    cell: Cell, size_um: float, light: Incidence, reach: int
-) -> Result:
+def _solve_jones(cell: Cell, size_um: float, light: Incidence, reach: int) -> Result:
     """Rows xx, xy, yx, yy: the polarisation that leaves, then that comes."""
     from metalens.rcwa import jones
 
     found = jones(cell, size_um, light.wavelength_um, harmonics=reach)
-    rows = zip(
-        found.t.ravel().tolist(), found.r.ravel().tolist(), [0, 1, 0, 1], strict=True
-    )
-    made = [
-        Response(
-            t, r, found.t_error, found.orders, float(found.energy[k]), "rcwa", True, ""
-        )
-        for t, r, k in rows
-    ]
-    return _listed([size_um] * 4, made)
+    return {
+        "diameter_um": [size_um] * 4,
+        "t": _pairs(found.t.ravel()),
+        "r": _pairs(found.r.ravel()),
+        "error": [found.t_error] * 4,
+        "energy": [float(found.energy[k]) for k in (0, 1, 0, 1)],
+    }
 
 
 def run_tasks(
@@ -193,11 +175,15 @@ def _task(
 def _listed(diameters_um: Iterable[float], made: list[Response]) -> Result:
     return {
         "diameter_um": list(diameters_um),
-        "t": [[m.t.real, m.t.imag] for m in made],
-        "r": [[m.r.real, m.r.imag] for m in made],
+        "t": _pairs(m.t for m in made),
+        "r": _pairs(m.r for m in made),
         "error": [m.t_error for m in made],
         "energy": [m.energy for m in made],
     }
+
+
+def _pairs(values: Iterable[complex]) -> list[list[float]]:
+    return [[float(v.real), float(v.imag)] for v in values]
 
 
 def material_files(of: object) -> Iterator[Path]:
@@ -221,17 +207,14 @@ def _entry(line: str) -> tuple[str, Result] | None:
     """
     try:
         task, result = json.loads(line)
-        listed = [
-            np.array(result[name])
-            for name in ("diameter_um", "t", "r", "error", "energy")
-        ]
-    except (ValueError, TypeError, KeyError, RecursionError):
+        for one in result.get("curves", [result]):
+            columns = [np.array(one[name]) for name in ("t", "r")]
+            columns += [np.array(one[name]) for name in ("diameter_um", "error")]
+            if {len(column) for column in columns} != {len(one["energy"])}:
+                return None
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
-    return (
-        (str(task), result)
-        if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,)
-        else None
-    )
+    return str(task), result
 
 
 class SweepJournal:
