@@ -14,13 +14,13 @@ from metalens.library.polynomial import ChebyshevCurve
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
-TABLE = 4096
+TABLE, DENSE = 4096, 16  # entries of the table, and points of the curve for each
 # what is left of the phase: far below the 1e-10 that is promised, above rounding of 100
 # rad
 SOLVED_RAD = 1e-12
-# leave nothing of a double; so does as many of Newton's steps, where a curve is flat at
-# one end
-HALVINGS = 54
+# Newton's steps at most: each halves the error at least, where a curve is flat at one
+# end, and a double has 53 bits
+MOST_STEPS = 54
 TURN = 2 * math.pi
 
 
@@ -119,7 +119,7 @@ def _newton(
     place -= index
     d = table[index]
     d += place * np.diff(table)[index]
-    for _ in range(HALVINGS):
+    for _ in range(MOST_STEPS):
         missed = (
             polynomial.evaluate_horner(p.monomials, polynomial.to_unit_interval(p, d))
             - start
@@ -134,17 +134,12 @@ def _newton(
 
 
 def _table(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
-    """(TABLE,) diameters at even steps of the phase, from the end of least phase, by
-    bisection.
-    """
-    ends = polynomial.evaluate_curve(p, np.array(within))
-    target = np.linspace(ends.min(), ends.max(), TABLE)
-    left, right = (np.full(TABLE, within[i]) for i in np.argsort(ends))
-    for _ in range(HALVINGS):
-        middle = (left + right) / 2
-        below = polynomial.evaluate_curve(p, middle) < target
-        left, right = np.where(below, middle, left), np.where(below, right, middle)
-    return np.asarray((left + right) / 2)
+    """(TABLE,) diameters at even steps of the phase, from the end of least phase."""
+    d = np.linspace(*within, DENSE * TABLE)
+    phase = polynomial.evaluate_curve(p, d)
+    if phase[-1] < phase[0]:
+        d, phase = d[::-1], phase[::-1]
+    return np.interp(np.linspace(phase[0], phase[-1], TABLE), phase, d)
 
 
 def _torch(
