@@ -20,16 +20,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.signal import resample
 
+import layout
 from layout import solids
-from layout.drc import check_plan
-from layout.formats import compare, oasis_read, oasis_write
-from layout.mask import build, fields
-from layout.pec import correct as dose
+from layout.mask import fields
 from layout.process import process
 from layout.study import sensitivity, stitching, tolerance
+from layout.verify.exposure import verify_exposure
 from metalens import design, library
 from metalens.design.profiles import Focus
-from metalens.lens.record import DiameterMap
 
 rules = process.load_process("process.toml")
 focus = Focus(wavelength_um=0.85, sensor_distance_um=600.0, source_distance_um=20_000.0)
@@ -74,12 +72,12 @@ plt.show()
 # report.)
 
 # %%
-made = build.prepare_mask(lens, rules, with_doses=False)
-report = check_plan(made.plan, rules.rules)
+plan = layout.plan(lens, rules)
+report = layout.check(plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())
-oasis_write.write_oasis(made.plan, folder / "mask.oas")
-same = compare.compare(made.plan, oasis_read.read_oasis(folder / "mask.oas"))
+layout.write_oasis(plan, folder / "mask.oas")
+same = layout.compare(plan, layout.read_oasis(folder / "mask.oas"))
 print(
     f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as planned: {same.ok}"
 )
@@ -89,38 +87,28 @@ print(
 #
 # Electrons scatter back over tens of micrometres, so a pillar in the middle of the lens gets more background than one at its rim, and a thin
 # pillar has a weaker edge than a thick one. Each pillar gets the dose at which its own edge is exposed just right, rounded to as few
-# doses as the tolerance allows. The error is measured against the exact sum over discs.
+# doses as the tolerance allows. What a file and its dose table make is found by exposing it again.
 
 # %%
-table_um = np.r_[0, made.cells.diameters_nm] * 1e-3
-written = DiameterMap(table_um[made.cells.classes], lens.diameters.pitch_um)
-result = dose.correct(written, rules)
-print(
-    f"one dose:   worst edge {100 * result.before.worst:5.1f} %, diameter error {result.before.diameter_nm:.2f} nm"
+dosed = layout.correct(plan, rules.exposure)
+layout.write_oasis(dosed, folder / "dosed.oas")
+found = verify_exposure(
+    layout.read_oasis(folder / "dosed.oas"), dosed, dosed.doses, rules
 )
 print(
-    f"{len(result.factors):2d} doses:   worst edge {100 * result.after.worst:5.1f} %, diameter error {result.after.diameter_nm:.2f} nm"
+    f"{len(set(dosed.doses.values()))} doses: worst edge {100 * found.worst_exposure:.1f} %, widths off by up to {found.worst_nm:.2f} nm"
 )
-print(f"error of this calculation: {result.error:.0e}")
+print(f"error of this calculation: {found.error:.0e}")
 
-given = np.where(
-    result.classes < 255,
-    np.append(result.factors, np.full(256 - len(result.factors), np.nan))[
-        result.classes
-    ],
-    np.nan,
-)
+lattice = dosed.lattices[0]
+given = np.array([np.nan, *(made.dose for made in dosed.classes)])[lattice.whole()]
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 side = lens.diameters.radius_um
-shown = axes[0].imshow(given, extent=(-side, side, side, -side), cmap="viridis")
+shown = axes[0].imshow(given, extent=(-side, side, -side, side), cmap="viridis")
 axes[0].set(title="relative dose", xlabel="x / µm", ylabel="y / µm")
 figure.colorbar(shown, ax=axes[0])
-axes[1].bar(
-    result.dose_uC_cm2,
-    np.bincount(result.classes[result.classes < 255], minlength=len(result.factors)),
-    width=6,
-)
-axes[1].set(xlabel="dose / (µC/cm²)", ylabel="pillars", title="dose classes")
+axes[1].hist(given[np.isfinite(given)] * rules.exposure.base_uC_cm2, bins=40)
+axes[1].set(xlabel="dose / (µC/cm²)", ylabel="pillars", title="doses of the lens")
 plt.show()
 
 # %% [markdown]
@@ -131,10 +119,10 @@ plt.show()
 
 # %%
 small = process.Process(write_field=process.WriteField(size_um=100.0))
-plan = fields.split_write_fields(written, small)
-stitched = stitching.simulate_stitching(lens, plan, small)
+split = fields.split_write_fields(lens.diameters, small)
+stitched = stitching.simulate_stitching(lens, split, small)
 print(
-    f"{plan.used} fields of {plan.size_um[0]:.1f} µm; borders left where they were would cut {plan.cut_before} pillars, now none"
+    f"{split.used} fields of {split.size_um[0]:.1f} µm; borders left where they were would cut {split.cut_before} pillars, now none"
 )
 print(
     f"peak of the PSF: {stitched.strehl.mean():.5f} on average, {stitched.strehl.min():.5f} at worst"

@@ -1,3 +1,4 @@
+from .drc.check import check as check
 from .drc.lattice import check_plan as check_plan
 from .formats.compare import compare as compare
 from .formats.dxf import write_dxf as write_dxf
@@ -6,5 +7,6 @@ from .formats.gdsii_write import write_gdsii as write_gdsii
 from .formats.oasis_read import read_oasis as read_oasis
 from .formats.oasis_write import write_oasis as write_oasis
 from .mask.build import plan as plan
+from .pec.dosed import correct as correct
 from .process.process import Process as Process
 from .process.process import load_process as load_process

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.process import Process
+from layout.process.process import Process
 from layout.shapes import region
 from metalens.cell import Cell
 from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop

@@ -51,7 +51,7 @@ def _records():
     from characterize.bench.protocol import BenchProtocol
     from characterize.pupil.record import PupilSpec
     from codesign.commands.evaluate_optics import OpticsSettings as Optics
-    from layout.arrange import Floorplan
+    from layout.arrange.record import Floorplan
     from layout.process.process import Process
     from metalens.library.study import CellStudy
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.process import Process
+from layout.process.process import Process
 from metalens import cli, lens
 from metalens.cell.record import Cell, Index
 from metalens.core import store

@@ -20,7 +20,7 @@ from codesign.budget import links
 from codesign.budget.prepared import BudgetInputs
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import LensError, variance_rad2
-from layout.process import Process
+from layout.process.process import Process
 from layout.study import tolerance
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle

@@ -11,8 +11,8 @@ import numpy as np
 import layout
 from benchmarks import Row, fastest
 from benchmarks.speed.layout import NAN, PITCH, RULES, lens_of, plan
-from layout.drc import check_plan
-from layout.mask.plan import MaskPlan, PillarLattice
+from layout.drc.lattice import check_plan
+from layout.mask.plan import MaskPlan, PillarArray
 
 
 def measured(target: Path) -> list[Row]:
@@ -169,7 +169,7 @@ def _klayout_check(db: object, mask: MaskPlan) -> Row:
     overlap = region.merged(False, 2).count()
     seconds = time.perf_counter() - start
     plan_of_patch = lens_of(
-        PillarLattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0)
+        PillarArray.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0)
     )
     own = check_plan(plan_of_patch, RULES).counts
     wrong = (

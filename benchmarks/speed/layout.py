@@ -20,9 +20,9 @@ import numpy as np
 
 import layout
 from benchmarks import Row, fastest
-from layout.drc import check_plan
+from layout.drc.lattice import check_plan
 from layout.formats import compare, gdsii_write, oasis_write
-from layout.mask.plan import MaskPlan, PillarLattice, pillar_classes
+from layout.mask.plan import MaskPlan, PillarArray, pillar_classes
 from layout.process.process import DesignRules
 from metalens.core import store
 from metalens.core.arrays import Array
@@ -64,7 +64,7 @@ def sites(*, freeform: bool) -> Array:
 def plan(*, freeform: bool = True) -> MaskPlan:
     """The mask of the lens alone."""
     return lens_of(
-        PillarLattice.of(
+        PillarArray.of(
             "LENS",
             sites(freeform=freeform),
             pitch=PITCH,
@@ -74,7 +74,7 @@ def plan(*, freeform: bool = True) -> MaskPlan:
     )
 
 
-def lens_of(lattice: PillarLattice) -> MaskPlan:
+def lens_of(lattice: PillarArray) -> MaskPlan:
     """A mask of one lattice of the bench's sizes."""
     classes = pillar_classes(
         SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round"
@@ -99,7 +99,7 @@ def large(diameter_mm: float) -> MaskPlan:
         return out
 
     half = (count - 1) * PITCH // 2
-    return lens_of(PillarLattice("LENS", count, count, PITCH, -half, half, rows))
+    return lens_of(PillarArray("LENS", count, count, PITCH, -half, half, rows))
 
 
 @contextlib.contextmanager
@@ -284,22 +284,22 @@ def _command_rows(target: Path) -> list[Row]:
 
 def _certificate_rows(target: Path) -> list[Row]:
     """8.7 million pillars with corrected doses, written, read back and exposed again."""
-    from layout.formats import doses
-    from layout.mask import build
+    from layout.formats import handover
     from layout.process.process import ExposureSettings, Process
-    from layout.verify import verify_exposure
+    from layout.verify.exposure import verify_exposure
 
     process = Process(exposure=ExposureSettings(alpha_um=0.012, beta_um=30.0, eta=0.7))
-    made = build.prepare_mask(_lens(1.0, 0.3).diameters, process, furniture="none")
-    layout.write_gdsii(made.plan, target / "c.gds")
-    doses.write_dose_table(made.plan, process, target / "c.csv")
+    bare = layout.plan(_lens(1.0, 0.3).diameters, process, furnished=False)
+    plan = layout.correct(bare, process.exposure)
+    layout.write_gdsii(plan, target / "c.gds")
+    handover.write_dose_table(plan, process, target / "c.csv")
     content, table = (
         layout.read_gdsii(target / "c.gds"),
-        doses.read_dose_table(target / "c.csv"),
+        handover.read_dose_table(target / "c.csv"),
     )
-    found = verify_exposure(content, made.plan, table, process)
+    found = verify_exposure(content, plan, table, process)
     seconds, peak = measured(
-        lambda: verify_exposure(content, made.plan, table, process), repeats=1
+        lambda: verify_exposure(content, plan, table, process), repeats=1
     )
     text = f"worst exposure of {found.pillars:,} pillars less 1; worst diameter {found.worst_nm:.2f} nm"
     return [
@@ -388,20 +388,16 @@ def _foreign_check_rows(target: Path) -> list[Row]:
     A file of every pillar, and the one of an eighth and its copies that ``metalens
     layout`` writes of a round lens.
     """
-    from layout.mask import build
     from layout.process.process import Process
     from metalens import lens as lenses
 
     for diameter_mm in (0.02, 1.0):  # the first compiles what the second runs
-        made = build.prepare_mask(
-            _lens(diameter_mm, 0.3).diameters,
-            Process(),
-            furniture="none",
-            with_doses=False,
+        plan = layout.plan(
+            _lens(diameter_mm, 0.3).diameters, Process(), furnished=False
         )
-        layout.write_oasis(made.plan, target / "check.oas")
+        layout.write_oasis(plan, target / "check.oas")
         code, seconds, peak = _ran(_CHECK, str(target / "check.oas"))
-    text = f"exit status of {int(made.plan.counts()[1:].sum()):,} pillars; CPU s, all memory"
+    text = f"exit status of {int(plan.counts()[1:].sum()):,} pillars; CPU s, all memory"
     whole = Row(
         "1 mm lens",
         "metalens check, OASIS",

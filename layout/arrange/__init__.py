@@ -1,5 +1,1 @@
 """Several lenses and cells on a die, dies on a wafer."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.arrange.joined import PER_UM, PartPlacement
-from layout.arrange.parts import APERTURE, DieComponent
-from layout.drc import Violation
-from layout.formats import CellCopies, Orientation
+from layout.arrange.parts import APERTURE, DieComponent, box_around, box_distance
+from layout.drc.report import Violation
+from layout.formats.library import CellReference, Orientation
 from layout.pec import psf
-from layout.process import Process
+from layout.process.process import Process
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -21,7 +21,7 @@ MOST_PLACED = 4000  # parts on a die
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Standing:
+class StandingPart:
     """One copy of a part: where, and the boxes of its exposures there."""
 
     part: DieComponent
@@ -35,10 +35,8 @@ class _Standing:
 
     def box(self) -> Array:
         """(4,) around all that is exposed."""
-        some = [b for b in self.part.boxes.values() if len(b)]
-        if not some:
-            return np.zeros(4)
-        return _around(self.moved(np.concatenate(some)))
+        every = np.concatenate(list(self.part.boxes.values()) or [np.zeros((0, 4))])
+        return box_around(self.moved(every))
 
     def moved(self, boxes: Array) -> Array:
         """(n, 4) boxes around the turned boxes."""
@@ -85,7 +83,7 @@ def check_separation(
     Raises:
         ProcessError: more than 4000 parts on the die.
     """
-    standing = list(_all(placed))
+    standing = list(standing_parts(placed))
     if len(standing) > MOST_PLACED:
         raise ProcessError(
             f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer"
@@ -95,7 +93,7 @@ def check_separation(
     found: list[Violation] = []
     for n, one in enumerate(standing):
         for m in np.flatnonzero(
-            _apart(around[n + 1 :], around[n]) < max(gap, far)
+            box_distance(around[n + 1 :], around[n]) < max(gap, far)
         ).tolist():
             two = standing[n + 1 + m]
             scattered = far if one.part.corrected or two.part.corrected else 0.0
@@ -110,47 +108,57 @@ def extent_of_copies(
     of what is exposed alone.
     """
     made = []
-    for one in _all(placed):
+    for one in standing_parts(placed):
         made.append(one.box() if exposed else one.moved(one.part.extent[None])[0])
-    return _around(np.array(made))
+    return box_around(np.array(made))
 
 
-def _all(placed: Sequence[PartPlacement]) -> Iterator[_Standing]:
+def standing_parts(placed: Sequence[PartPlacement]) -> Iterator[StandingPart]:
+    """Every copy of every part.
+
+    Args:
+        placed: parts on the die.
+
+    Raises:
+        ProcessError: more than 4000 copies of a part.
+    """
     for placing in placed:
         for copies in placing.copies(placing.part.top):
             yield from _each(placing.part, copies)
 
 
-def _each(part: DieComponent, copies: CellCopies) -> Iterator[_Standing]:
+def _each(part: DieComponent, copies: CellReference) -> Iterator[StandingPart]:
     if copies.count > MOST_PLACED:
         raise ProcessError(
             f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked"
         )
     for x, y in zip(*(v.tolist() for v in copies.places()), strict=True):
-        yield _Standing(part, copies.turn, x, y)
+        yield StandingPart(part, copies.turn, x, y)
 
 
 def _between(
-    one: _Standing, two: _Standing, gap: float, scattered: float, process: Process
+    one: StandingPart, two: StandingPart, gap: float, scattered: float, process: Process
 ) -> Iterator[Violation]:
     """At most one finding for each exposure that both have shapes of."""
     for kind in sorted(one.part.boxes.keys() & two.part.boxes.keys()):
         first, second = one.moved(one.part.boxes[kind]), two.moved(two.part.boxes[kind])
         need = gap if kind == APERTURE else max(gap, scattered)
         first = (
-            first[_apart(first, _around(second)) < need]
+            first[box_distance(first, box_around(second)) < need]
             if len(first) and len(second)
             else first[:0]
         )
         second = (
-            second[_apart(second, _around(first)) < need] if len(first) else second[:0]
+            second[box_distance(second, box_around(first)) < need]
+            if len(first)
+            else second[:0]
         )
         least, box = math.inf, np.zeros(4)
         for each in second if len(first) else ():
-            apart = _apart(first, each)
+            apart = box_distance(first, each)
             n = int(apart.argmin())
             if apart[n] < least:
-                least, box = float(apart[n]), _around(np.stack([first[n], each]))
+                least, box = float(apart[n]), box_around(np.stack([first[n], each]))
         if least >= need:
             continue
         left, bottom, right, top = (int(v) for v in box)
@@ -164,13 +172,3 @@ def _between(
             limit = need * 1e3 / PER_UM
             text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"
         yield Violation("clearance", (left, bottom, right, top), nm, limit, text)
-
-
-def _around(boxes: Array) -> Array:
-    return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
-
-
-def _apart(boxes: Array, box: Array) -> Array:
-    """(n,) distances of boxes (n, 4) from one; 0 where they meet."""
-    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
-    return np.asarray(np.hypot(*across.T))

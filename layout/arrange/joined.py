@@ -2,20 +2,22 @@
 wafer of dies.
 """
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+import csv
+import io
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from layout.arrange.parts import UNIT_NM, DieComponent, compact_arrays, relayer_cell
+import numpy as np
+
+from layout.arrange.parts import UNIT_NM, DieComponent, moved_cell
 from layout.arrange.record import Placement
-from layout.formats import (
-    CellContent,
-    CellCopies,
-    MaskAssembly,
-    Orientation,
-    PillarSites,
-)
-from layout.process import LayerNumber
+from layout.formats import handover
+from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
+from layout.mask.fields import FieldPlan
+from layout.process.process import LayerNumber
+from metalens.core import store
 from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
@@ -31,18 +33,18 @@ class PartPlacement:
     part: DieComponent
     at: tuple[Placement, ...]
 
-    def copies(self, top: str) -> tuple[CellCopies, ...]:
+    def copies(self, top: str) -> tuple[CellReference, ...]:
         """As arrays of its cell ``top``, in database units."""
         return tuple(_copies(top, at) for at in self.at)
 
 
-def _copies(child: str, at: Placement) -> CellCopies:
+def _copies(child: str, at: Placement) -> CellReference:
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
     step = (
         (0, 0) if at.step_um is None else tuple(round(s * PER_UM) for s in at.step_um)
     )
     turn = Orientation(at.turn_deg % 360, at.mirrored)
-    return CellCopies(
+    return CellReference(
         child, x, y, turn, at.columns, at.rows, (step[0], 0), (0, step[1])
     )
 
@@ -59,7 +61,7 @@ class JobLayers:
     doses: dict[LayerNumber, float] = field(default_factory=dict)
     names: dict[LayerNumber, str] = field(default_factory=dict)
 
-    def take(self, part: DieComponent) -> dict[LayerNumber, LayerNumber]:
+    def take(self, part: MaskLibrary) -> dict[LayerNumber, LayerNumber]:
         """New numbers of a part's layers: its own where these are free or mean the same
         dose, else a free datatype.
         """
@@ -88,87 +90,152 @@ class JobLayers:
 
 def die_cell(
     name: str, placed: Sequence[PartPlacement], *, kept: frozenset[LayerNumber]
-) -> MaskAssembly:
-    """All parts in one cell ``name``."""
+) -> MaskLibrary:
+    """All parts in one cell.
+
+    Args:
+        name: of the cell, and of the library.
+        placed: parts and their places.
+        kept: layers that mean something undosed.
+
+    Raises:
+        ProcessError: a part with a cell of that name.
+    """
     layers = JobLayers(kept)
-    cells: dict[str, CellContent] = {}
-    copies: dict[str, tuple[CellCopies, ...]] = {}
-    sites: dict[str, PillarSites] = {}
-    here: list[CellCopies] = []
+    cells: dict[str, MaskCell] = {}
+    here: list[CellReference] = []
     for one in placed:
-        new = _take(one.part, layers, cells, copies, sites)
-        here += one.copies(new[one.part.top])
-    if name in cells:
-        raise ProcessError(
-            f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another"
-        )
-    cells[name] = CellContent(name)
-    copies[name] = tuple(here)
-    return MaskAssembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
-
-
-def _take(
-    part: DieComponent,
-    layers: JobLayers,
-    cells: dict[str, CellContent],
-    copies: dict[str, tuple[CellCopies, ...]],
-    sites: dict[str, PillarSites],
-) -> dict[str, str]:
-    """The cells of a part with numbers and names of their own; {old: new name}."""
-    numbers = layers.take(part)
-    new: dict[str, str] = {}
-    for name in part.cells:
-        new[name] = _free(name, cells, new)
-    for name, cell in part.cells.items():
-        left, found = compact_arrays(relayer_cell(cell, numbers))
-        children = tuple(new[child] for child in left.placed.children)
-        cells[new[name]] = dataclasses.replace(
-            left,
-            name=new[name],
-            placed=dataclasses.replace(left.placed, children=children),
-        )
-        if found:
-            copies[new[name]] = tuple(
-                dataclasses.replace(one, child=new[one.child]) for one in found
-            )
-        if name in part.sites:
-            sites[new[name]] = part.sites[name].renamed(new)
-    return new
-
-
-def _free(name: str, cells: Mapping[str, CellContent], new: Mapping[str, str]) -> str:
-    taken, made, number = {*cells, *new.values()}, name, 1
-    while made in taken:
-        number += 1
-        made = f"{name}_{number}"
-    return made
+        here += _take(one, layers, cells)
+    return _joined(name, cells, here, layers)
 
 
 def wafer_cell(
     name: str,
-    one: MaskAssembly,
-    steps: tuple[CellCopies, ...],
+    one: MaskLibrary,
+    steps: tuple[CellReference, ...],
     marks: PartPlacement | None,
-) -> MaskAssembly:
-    """Dies, and the wafer's marks beside them, in one cell ``name``."""
+) -> MaskLibrary:
+    """Dies, and the wafer's marks, in one cell.
+
+    Args:
+        name: of the cell, and of the library.
+        one: the die.
+        steps: places of the die.
+        marks: alignment marks of the wafer.
+
+    Raises:
+        ProcessError: a part with a cell of that name.
+    """
     layers = JobLayers(frozenset(), dict(one.doses), dict(one.layer_names))
-    cells, copies, sites = dict(one.cells), dict(one.copies), dict(one.sites)
-    here = list(steps)
+    cells, here = dict(one.cells), list(steps)
     if marks is not None:
-        new = _take(marks.part, layers, cells, copies, sites)
-        here += marks.copies(new[marks.part.top])
+        here += _take(marks, layers, cells)
+    return _joined(name, cells, here, layers)
+
+
+def _joined(
+    name: str,
+    cells: dict[str, MaskCell],
+    here: Sequence[CellReference],
+    layers: JobLayers,
+) -> MaskLibrary:
     if name in cells:
         raise ProcessError(
-            f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another"
+            f"a part holds a cell {name!r}, the name of the arrangement; give the "
+            "arrangement another"
         )
-    cells[name] = CellContent(name)
-    copies[name] = tuple(here)
-    return dataclasses.replace(
-        one,
-        name=name,
-        cells=cells,
-        copies=copies,
-        sites=sites,
-        doses=layers.doses,
-        layer_names=layers.names,
-    )
+    top = MaskCell(name, references=tuple(here))
+    return MaskLibrary(name, {**cells, name: top}, UNIT_NM, layers.names, layers.doses)
+
+
+def _take(
+    placed: PartPlacement, layers: JobLayers, cells: dict[str, MaskCell]
+) -> tuple[CellReference, ...]:
+    """Add the cells of a part, with numbers and names of their own; its instances."""
+    part = placed.part
+    numbers = layers.take(part.library)
+    new: dict[str, str] = {}
+    for name in part.library.cells:
+        taken = {*cells, *new.values()}
+        free = (f"{name}_{n}" for n in itertools.count(2))
+        new[name] = (
+            name if name not in taken else next(f for f in free if f not in taken)
+        )
+    for cell in part.library.cells.values():
+        cells[new[cell.name]] = moved_cell(cell, new, numbers)
+    return placed.copies(new[part.top])
+
+
+# write fields
+
+FIELD_HEAD = (*handover.FIELD_HEAD, "part")
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedField:
+    """A write field of a lens on the die: middle and sides, pillars in it."""
+
+    part: str
+    x_um: float
+    y_um: float
+    width_um: float
+    height_um: float
+    pillars: int
+
+
+def place_fields(
+    placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
+) -> Iterator[PlacedField]:
+    """Write fields of all lenses on the die, part by part in their order of writing.
+
+    A field has sides along x and y: copies that are turned by no quarter have none
+    (:func:`without_fields`).
+
+    Args:
+        splits: fields of each lens about its axis, by the name of its part.
+    """
+    for one in placed:
+        if one.part.name not in splits:
+            continue
+        steps = handover.field_sequence(splits[one.part.name])
+        middle = np.array([(step.x_um, step.y_um) for step in steps])
+        for copies in one.copies(one.part.top):
+            if not copies.turn.quarter:
+                continue
+            level = copies.turn.angle_deg % 180 == 0
+            x, y = copies.turn.apply(middle[:, 0], middle[:, 1])
+            for left, up in zip(*(v.tolist() for v in copies.places()), strict=True):
+                for n, step in enumerate(steps):
+                    sides = step.width_um, step.height_um
+                    wide, high = sides if level else sides[::-1]
+                    yield PlacedField(
+                        one.part.name,
+                        float(x[n]) + left / PER_UM,
+                        float(y[n]) + up / PER_UM,
+                        wide,
+                        high,
+                        step.pillars,
+                    )
+
+
+def without_fields(
+    placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
+) -> list[str]:
+    """Lenses with copies whose write fields would not lie along x and y, by name."""
+    return [
+        one.part.name
+        for one in placed
+        if one.part.name in splits
+        and not all(copies.turn.quarter for copies in one.copies(one.part.top))
+    ]
+
+
+def write_fields(fields: Sequence[PlacedField], path: str | Path) -> None:
+    """The fields of a die in their order, as CSV."""
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(FIELD_HEAD)
+    for number, step in enumerate(fields, 1):
+        sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
+        out.writerow([number, *(f"{v:.4f}" for v in sizes), step.pillars, step.part])
+    store.write_text(path, text.getvalue())

@@ -1,33 +1,25 @@
-"""What is placed: the content of a lens's mask or of a file made elsewhere, its doses,
-and boxes around its shapes.
+"""What is placed on a die: the mask of a lens or a cell of a file made elsewhere, its
+doses, and boxes around its shapes.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from layout.formats import (
-    NOTHING,
-    CellContent,
-    CellCopies,
-    MaskContent,
-    PillarSites,
-    doses,
-    find_arrays,
-    flatten,
-)
-from layout.mask import UNDRAWN, MaskPlan, PillarLattice
-from layout.process import LayerNumber, Process
+from layout.formats import handover
+from layout.formats.library import MaskCell, MaskLibrary, flatten_stacks, library_of
+from layout.mask.plan import UNDRAWN, MaskPlan, PillarArray
+from layout.process.process import LayerNumber, Process
 from layout.shapes import polygon, rectilinear, region
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
 UNIT_NM = 1.0
 PILLARS, APERTURE = "pillars", "aperture"  # the two exposures
-_WHOLE = 1e-6
 _TILES = 64  # squares of a lattice, each way
 
 
@@ -35,75 +27,43 @@ _TILES = 64  # squares of a lattice, each way
 class DieComponent:
     """A cell with all below it, in nanometres.
 
-    name: of the part. top: its cell. cells: by name, as they will be written.
-    doses: relative dose of each layer that is exposed. layer_names: shown by viewers.
-    boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a lattice, of
-    some thousand squares of its pillars. extent: (4,) around everything, outline too.
+    name: of the part.
+    top: its cell.
+    library: cells, layer names, and relative dose of each layer that is exposed.
+    boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a lattice,
+        boxes around some thousand squares of its pillars.
+    extent: (4,) around everything, outline too.
     corrected: whether its doses make up for the scattered electrons of its own shapes,
-    and of no others.
-    uncorrected: {layer: shapes} beside pillars whose one dose corrects nothing.
-    texts, empty: texts and shapes without area that are left out: they draw nothing.
-    sites: of cells, beside what their content places.
+        and of no others.
+    uncorrected: {layer: shapes} exposed with the pillars at a dose that corrects
+        nothing.
+    empty: shapes without area that were left out.
     """
 
     name: str
     top: str
-    cells: Mapping[str, CellContent]
-    doses: Mapping[LayerNumber, float]
-    layer_names: Mapping[LayerNumber, str]
+    library: MaskLibrary
     boxes: Mapping[str, Array]
     extent: Array
     corrected: bool = False
     uncorrected: Mapping[LayerNumber, int] = field(default_factory=dict)
-    texts: int = 0
     empty: int = 0
-    sites: Mapping[str, PillarSites] = field(default_factory=dict)
-
-
-def plan_extents(name: str, plan: MaskPlan, process: Process) -> DieComponent:
-    """Where the shapes of a plan lie, without its cells."""
-    boxes, extent = _plan_boxes(plan, process)
-    return DieComponent(name, name, {}, plan.doses, plan.layer_names, boxes, extent)
 
 
 def of_plan(
-    name: str,
-    plan: MaskPlan,
-    content: MaskContent,
-    process: Process,
-    *,
-    corrected: bool,
-    lattices: Mapping[str, PillarLattice] | None = None,
+    name: str, plan: MaskPlan, process: Process, *, corrected: bool
 ) -> DieComponent:
-    """The mask of a plan, as it was read back; its cells are named after the part.
+    """The mask of a plan; its cells are named after the part.
 
-    lattices: of cells of which only the sums were kept, which agree with them.
+    Args:
+        name: of the part.
+        plan: of the lens or frame.
+        process: layer numbers.
+        corrected: whether the plan has corrected doses.
     """
-    new = {
-        cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells
-    }
-    cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
-    classes = tuple(new.get(made.name, "") for made in plan.classes)
-    known = lattices or {}
-    sites = {
-        new[c.name]: PillarSites(known[c.name], classes)
-        for c in content.cells.values()
-        if c.sums is not None
-    }
-    return DieComponent(
-        name,
-        name,
-        cells,
-        plan.doses,
-        plan.layer_names,
-        *_plan_boxes(plan, process),
-        corrected,
-        sites=sites,
-    )
-
-
-def _plan_boxes(plan: MaskPlan, process: Process) -> tuple[dict[str, Array], Array]:
-    """{exposure: (n, 4) boxes}, and (4,) around everything."""
+    library = library_of(plan)
+    new = {c: name if c == plan.name else f"{name}_{c}" for c in library.cells}
+    cells = {new[c.name]: moved_cell(c, new, {}) for c in library.cells.values()}
     boxes = {
         PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)],
         APERTURE: [],
@@ -111,211 +71,193 @@ def _plan_boxes(plan: MaskPlan, process: Process) -> tuple[dict[str, Array], Arr
     every = list(boxes[PILLARS])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
-            some = [
-                box
-                for shape in shapes
-                for box in rectilinear.covering_rectangles(np.asarray(shape, np.int64))
-            ]
+            some = [box for s in shapes for box in rectilinear.covering_rectangles(s)]
             every += some
             if figure.name not in UNDRAWN:
-                boxes[
-                    APERTURE if layer[0] == process.layers.aperture[0] else PILLARS
-                ] += some
-    return {k: _stacked(v) for k, v in boxes.items()}, _around(np.array(every))
+                boxes[_exposure(layer, process)] += some
+    stacked = {kind: _stacked(some) for kind, some in boxes.items()}
+    library = dataclasses.replace(library, cells=cells)
+    extent = box_around(_stacked(every))
+    return DieComponent(name, name, library, stacked, extent, corrected)
 
 
 def of_file(
     name: str,
     path: Path,
-    content: MaskContent,
+    content: MaskLibrary,
     process: Process,
     *,
     cell: str,
     relative_dose: float,
 ) -> DieComponent:
-    """A cell of a file with all below it; shapes without area are left out.
+    """A cell of a file with all below it.
 
     Args:
-        cell: its name; empty: the only top cell. relative_dose: of its layers, where
-            the file has no doses.csv.
+        name: of the part.
+        path: of the file; its doses are read from doses.csv in the same folder.
+        content: of the file.
+        process: layer numbers.
+        cell: its name; empty: the only top cell.
+        relative_dose: of layers without a dose in doses.csv.
 
     Raises:
         MaskFileError: no such cell, several top cells and none named, coordinates that
             are no whole nanometres.
     """
-    top = _chosen(path, content, cell)
-    whole = scale_part(content, UNIT_NM, str(path))
-    wanted = _below(content, top)
-    cells = {key: _drawing(each) for key, each in whole.cells.items() if key in wanted}
-    empty = sum(
-        len(shapes) - len(cells[key].polygons.get(layer, ()))
-        for key in cells
-        for layer, shapes in whole.cells[key].polygons.items()
-    )
-    empty += sum(  # those that the reader left out
-        count
-        for cell in cells.values()
-        for kind, count in cell.skipped.items()
-        if kind.endswith("without area")
-    )
+    if not cell and len(content.tops) != 1:
+        raise MaskFileError(
+            f"{path}: {len(content.tops)} top cells ({', '.join(content.tops[:8])}); "
+            'say which one, as cell = "NAME"'
+        )
+    top = cell or content.tops[0]
+    library = _in_unit(content.below(top), UNIT_NM, str(path))
+    library, empty = _without_empty(library)
     layers = process.layers
-    undrawn = {layers.outline, layers.fields}
     table = path.with_name("doses.csv")
-    known = doses.read_dose_table(table) if table.is_file() else {}
-    used = {
-        layer for each in cells.values() for layer in (*each.polygons, *each.circles)
-    }
-    dosed = {layer: known.get(layer, relative_dose) for layer in sorted(used - undrawn)}
-    found, counts = _file_boxes(dataclasses.replace(whole, cells=cells), top, process)
-    every = np.concatenate(
-        [box for box in found.values() if len(box)] or [np.zeros((1, 4))]
-    )
-    exposed = {key: box for key, box in found.items() if key in (PILLARS, APERTURE)}
-    names = {
-        layer: text for layer, text in content.layer_names.items() if layer in used
-    }
+    known = handover.read_dose_table(table) if table.is_file() else {}
+    used = sorted(library.layers - {layers.outline, layers.fields})
+    doses = {layer: known.get(layer, relative_dose) for layer in used}
+    boxes: dict[str, list[Array]] = {}
+    counts: Counter[LayerNumber] = Counter()
+    for stack in flatten_stacks(library, top):
+        counts[stack.layer] += len(stack.outlines) * len(stack.x)
+        pieces = [
+            rectilinear.covering_rectangles(outline) for outline in stack.outlines
+        ]
+        places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
+        placed = (np.concatenate(pieces)[None] + places[:, None]).reshape(-1, 4)
+        boxes.setdefault(_exposure(stack.layer, process, other=True), []).append(placed)
+    found = {key: np.concatenate(some) for key, some in boxes.items()}
+    every = np.concatenate([*found.values(), *([] if found else [np.zeros((1, 4))])])
     return DieComponent(
         name,
         top,
-        cells,
-        dosed,
-        names,
-        exposed,
-        _around(every),
+        dataclasses.replace(library, doses=doses),
+        {key: box for key, box in found.items() if key in (PILLARS, APERTURE)},
+        box_around(every),
         uncorrected={
-            layer: count
-            for layer, count in sorted(counts.items())
-            if layer in dosed and layer not in known and layer[0] != layers.aperture[0]
+            layer: counts[layer]
+            for layer in used
+            if layer not in known and layer[0] != layers.aperture[0]
         },
-        texts=sum(each.texts for each in cells.values()),
         empty=empty,
     )
 
 
-def _drawing(cell: CellContent) -> CellContent:
-    """A cell without its shapes that have no area, doubled corners taken out."""
-    kept: dict[LayerNumber, list[Array]] = {}
-    for layer, shapes in cell.polygons.items():
-        for shape in shapes:
-            corners = shape[(shape != np.roll(shape, 1, axis=0)).any(1)]
-            if len(corners) > 2 and (
-                polygon.twice_area(corners) or region.union_contours([corners])
-            ):
-                kept.setdefault(layer, []).append(corners)
-    return dataclasses.replace(cell, polygons=kept)
+def _without_empty(library: MaskLibrary) -> tuple[MaskLibrary, int]:
+    """Cells without shapes that enclose no area, and how many of these there were."""
+    count = sum(
+        number
+        for kind, number in library.skipped.items()
+        if kind.endswith("without area")
+    )
+    cells = {}
+    for name, cell in library.cells.items():
+        kept: dict[LayerNumber, list[Array]] = {}
+        for layer, shapes in cell.polygons.items():
+            for shape in shapes:
+                if polygon.twice_area(shape) or region.union_contours([shape]):
+                    kept.setdefault(layer, []).append(shape)
+                else:
+                    count += 1
+        cells[name] = dataclasses.replace(cell, polygons=kept)
+    return dataclasses.replace(library, cells=cells), count
 
 
-def _chosen(path: Path, content: MaskContent, cell: str) -> str:
-    if cell:
-        if cell not in content.cells:
-            raise MaskFileError(
-                f"{path}: no cell {cell!r}; the file holds {', '.join(list(content.cells)[:8])}"
-            )
-        return cell
-    if len(content.tops) != 1:
-        raise MaskFileError(
-            f'{path}: {len(content.tops)} top cells ({", ".join(content.tops[:8])}); say which one, as cell = "NAME"'
-        )
-    return content.tops[0]
+def _exposure(layer: LayerNumber, process: Process, *, other: bool = False) -> str:
+    """Exposure of a layer: pillars or aperture, or its number where it is of neither.
+
+    Args:
+        layer: number and datatype.
+        process: layer numbers.
+        other: whether there are layers of neither.
+    """
+    layers = process.layers
+    if layer[0] == layers.aperture[0]:
+        return APERTURE
+    ours = layers.pillar, layers.marks, layers.labels, layers.dose, layers.witness
+    if other and layer[0] not in {number for number, _ in ours}:
+        return f"layer {layer[0]}"
+    return PILLARS
 
 
-def _below(content: MaskContent, top: str) -> set[str]:
-    """``top`` and all cells that it places, through others too."""
-    found, waiting = {top}, [top]
-    while waiting:
-        for child in content.cells[waiting.pop()].placed.children:
-            if child not in content.cells:
-                raise MaskFileError(
-                    f"cell {child!r} is placed, but the file does not hold it"
-                )
-            if child not in found:
-                found.add(child)
-                waiting.append(child)
-    return found
-
-
-def scale_part(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
+def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
     """The same mask in another database unit.
 
     Raises:
         MaskFileError: a coordinate that is no whole number of new units, or beyond 32
             bits.
     """
-    ratio = content.unit_nm / unit_nm
+    ratio = library.unit_nm / unit_nm
     if abs(ratio - 1) < 1e-9:
-        return content
+        return library
 
-    def made(values: Array, kind: type[np.int64 | np.int32] = np.int64) -> Array:
+    def scaled(values: Array) -> Array:
         new = np.asarray(values, float) * ratio
         whole = np.rint(new)
-        if (
-            np.abs(new - whole).max(initial=0.0) > _WHOLE
-            or np.abs(whole).max(initial=0.0) > 2**31 - 1
-        ):
+        off, far = np.abs(new - whole).max(initial=0), np.abs(whole).max(initial=0)
+        if off > 1e-6 or far > 2**31 - 1:
             raise MaskFileError(
-                f"{where}: its database unit is {content.unit_nm:g} nm, and its coordinates are no whole multiples of "
-                f"{unit_nm:g} nm within 32 bits; bring the file to a unit of {unit_nm:g} nm"
+                f"{where}: its database unit is {library.unit_nm:g} nm, and its "
+                f"coordinates are no whole multiples of {unit_nm:g} nm within 32 bits; "
+                f"bring the file to a unit of {unit_nm:g} nm"
             )
-        return whole.astype(kind)
+        return whole.astype(np.int64)
 
-    def cell(old: CellContent) -> CellContent:
+    def cell(old: MaskCell) -> MaskCell:
         placed = old.kept()
-        moved = dataclasses.replace(
-            placed, x=made(placed.x, np.int32), y=made(placed.y, np.int32)
-        )
-        polygons = {
-            layer: [made(p) for p in shapes] for layer, shapes in old.polygons.items()
-        }
+        x, y = (scaled(v).astype(np.int32) for v in (placed.x, placed.y))
         circles = {
-            layer: [
-                (int(x), int(y), int(r))
-                for x, y, r in made(np.array(some).reshape(-1, 3)).tolist()
-            ]
+            layer: [tuple(row) for row in scaled(np.array(some)).tolist()]
             for layer, some in old.circles.items()
         }
         return dataclasses.replace(
-            old, polygons=polygons, circles=circles, placed=moved
+            old,
+            polygons={k: [scaled(p) for p in some] for k, some in old.polygons.items()},
+            circles=circles,
+            placed=dataclasses.replace(placed, x=x, y=y),
         )
 
-    return dataclasses.replace(
-        content,
-        unit_nm=unit_nm,
-        cells={name: cell(c) for name, c in content.cells.items()},
-    )
+    cells = {name: cell(c) for name, c in library.cells.items()}
+    return dataclasses.replace(library, unit_nm=unit_nm, cells=cells)
 
 
-def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
-    """With other names of cells; placements of which only sums were kept are left out."""
-    placed = cell.placed if cell.sums is None else NOTHING
-    children = tuple(new[child] for child in placed.children)
-    return dataclasses.replace(
-        cell,
-        name=new[cell.name],
-        placed=dataclasses.replace(placed, children=children),
-        sums=None,
-    )
+def moved_cell(
+    cell: MaskCell, names: Mapping[str, str], layers: Mapping[LayerNumber, LayerNumber]
+) -> MaskCell:
+    """A cell with other names and layer numbers.
 
-
-def relayer_cell(
-    cell: CellContent, new: Mapping[LayerNumber, LayerNumber]
-) -> CellContent:
-    """A cell with other layer numbers; two that become one are put together."""
+    Args:
+        cell: with all its placements.
+        names: {old: new} of every cell.
+        layers: {old: new} where they change; two that become one are put together.
+    """
     polygons: dict[LayerNumber, list[Array]] = {}
     circles: dict[LayerNumber, list[tuple[int, int, int]]] = {}
     for layer, shapes in cell.polygons.items():
-        polygons.setdefault(new.get(layer, layer), []).extend(shapes)
+        polygons.setdefault(layers.get(layer, layer), []).extend(shapes)
     for layer, some in cell.circles.items():
-        circles.setdefault(new.get(layer, layer), []).extend(some)
-    return dataclasses.replace(cell, polygons=polygons, circles=circles)
+        circles.setdefault(layers.get(layer, layer), []).extend(some)
+    placed, pillars = cell.kept(), cell.pillars
+    if pillars is not None:
+        children = tuple(names.get(child, "") for child in pillars.children)
+        pillars = dataclasses.replace(pillars, children=children)
+    return dataclasses.replace(
+        cell,
+        name=names[cell.name],
+        polygons=polygons,
+        circles=circles,
+        placed=dataclasses.replace(
+            placed, children=tuple(names[child] for child in placed.children)
+        ),
+        references=tuple(
+            dataclasses.replace(one, child=names[one.child]) for one in cell.references
+        ),
+        pillars=pillars,
+    )
 
 
-def compact_arrays(cell: CellContent) -> tuple[CellContent, tuple[CellCopies, ...]]:
-    """The cell with what its arrays hold taken out, and the arrays."""
-    made, left = find_arrays(cell.kept())
-    return dataclasses.replace(cell, placed=left), made
-
-
-def _lattice_boxes(plan: MaskPlan, lattice: PillarLattice) -> list[Array]:
+def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
     """Boxes around the pillars of squares of sites, at most 64 each way: single pillars
     where there are few.
     """
@@ -326,55 +268,37 @@ def _lattice_boxes(plan: MaskPlan, lattice: PillarLattice) -> list[Array]:
         for left in range(0, lattice.columns, wide):
             held = block[:, left : left + wide] != 0
             if held.any():
-                rows, columns = (
-                    np.flatnonzero(held.any(1)) + first,
-                    np.flatnonzero(held.any(0)) + left,
-                )
-                x = lattice.x0 + columns[[0, -1]] * lattice.pitch
-                y = lattice.y0 - rows[[-1, 0]] * lattice.down
+                rows = np.flatnonzero(held.any(1))[[-1, 0]] + first
+                columns = np.flatnonzero(held.any(0))[[0, -1]] + left
+                x = lattice.x0 + columns * lattice.pitch
+                y = lattice.y0 - rows * lattice.down
+                low, high_corner = (x[0], y[0]), (x[1], y[1])
                 found.append(
-                    np.array([x[0] - reach, y[0] - reach, x[1] + reach, y[1] + reach])
+                    np.add([*low, *high_corner], np.array([-1, -1, 1, 1]) * reach)
                 )
     return found
-
-
-def _file_boxes(
-    content: MaskContent, top: str, process: Process
-) -> tuple[dict[str, Array], dict[LayerNumber, int]]:
-    """Boxes of all shapes below ``top`` by exposure (layers that no exposure of ours
-    knows by their number), and the shapes of each layer.
-    """
-    layers = process.layers
-    ours = {layers.aperture[0]: APERTURE}
-    ours |= {
-        n[0]: PILLARS
-        for n in (
-            layers.pillar,
-            layers.marks,
-            layers.labels,
-            layers.dose,
-            layers.witness,
-        )
-    }
-    found: dict[str, list[Array]] = {}
-    counts: dict[LayerNumber, int] = {}
-    for stack in flatten.flatten_stacks(content, top):
-        number = len(stack.outlines) * len(stack.x)
-        counts[stack.layer] = counts.get(stack.layer, 0) + number
-        pieces = np.concatenate(
-            [rectilinear.covering_rectangles(outline) for outline in stack.outlines]
-        )
-        places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
-        every = (pieces[None] + places[:, None]).reshape(-1, 4)
-        found.setdefault(
-            ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []
-        ).append(every)
-    return {key: np.concatenate(some) for key, some in found.items()}, counts
 
 
 def _stacked(boxes: Sequence[Array]) -> Array:
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 
-def _around(boxes: Array) -> Array:
+def box_around(boxes: Array) -> Array:
+    """(4,) left, bottom, right, top around (n, 4) boxes; zeros for none."""
+    if not len(boxes):
+        return np.zeros(4)
     return np.concatenate([boxes[:, :2].min(0), boxes[:, 2:].max(0)])
+
+
+def box_distance(boxes: Array, box: Array) -> Array:
+    """Distance of boxes from one.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top.
+        box: (4,).
+
+    Returns:
+        (n,) distances; 0 where they meet.
+    """
+    across = np.maximum(np.maximum(boxes[:, :2] - box[2:], box[:2] - boxes[:, 2:]), 0)
+    return np.asarray(np.hypot(*across.T))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from layout.arrange.parts import box_distance
 from layout.arrange.record import MOST_DIES, WaferSettings
-from layout.formats import CellCopies
+from layout.formats.library import CellReference
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -70,7 +71,9 @@ def usable_dies(
     for mark in wafer.marks:
         half = wafer.mark_um / 2 + around_marks_um
         x, y = 1e3 * mark.x_mm, 1e3 * mark.y_mm
-        kept &= _apart(boxes, (x - half, y - half, x + half, y + half)) > 0
+        kept &= (
+            box_distance(boxes, np.array([x - half, y - half, x + half, y + half])) > 0
+        )
     if not kept.any():
         raise ProcessError(
             f"no die of {right - left:.0f} x {top - bottom:.0f} um fits on the wafer; change wafer.offset_um, "
@@ -128,16 +131,9 @@ def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
     return np.asarray(away - radius)
 
 
-def _apart(boxes: Array, box: Box) -> Array:
-    """(n,) distances of boxes (n, 4) from one; 0 where they meet."""
-    low, high = np.array(box[:2]), np.array(box[2:])
-    across = np.maximum(np.maximum(boxes[:, :2] - high, low - boxes[:, 2:]), 0)
-    return np.asarray(np.hypot(*across.T))
-
-
 def step_and_repeat(
     child: str, found: WaferDies, *, units_per_um: float
-) -> tuple[CellCopies, ...]:
+) -> tuple[CellReference, ...]:
     """The dies as arrays: neighbours of a row together, equal rows above each other
     together.
     """
@@ -170,7 +166,7 @@ def step_and_repeat(
             round(v * units_per_um) for v in found.place_um[at[first, low]].tolist()
         )
         copies.append(
-            CellCopies(
+            CellReference(
                 child,
                 x,
                 y,

@@ -10,38 +10,28 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import (
-    Floorplan,
-    Placement,
-    WaferSettings,
-    apart,
-    job_file,
-    joined,
-    parts,
-    wafer,
-)
-from layout.commands import arranged_page, make
-from layout.commands import placed as standing
-from layout.commands.check import read_mask
-from layout.commands.job import Options
-from layout.commands.placed import FloorplanWork
+from layout.arrange import apart, joined, parts, wafer
+from layout.arrange.record import CellPart, Floorplan, Placement, WaferSettings
+from layout.commands import make, page
+from layout.commands.job import FloorplanWork, Options
 from layout.commands.stages import StageTimes
-from layout.drc import write_lyp
-from layout.formats import (
-    MaskAssembly,
-    compare,
-    doses,
-    gdsii_write,
-    handover,
-    oasis_write,
-)
+from layout.drc.klayout import write_lyp
+from layout.drc.lattice import check_plan
+from layout.drc.library import check_library
+from layout.formats import compare, gdsii_write, handover, oasis_write
+from layout.formats.files import placement_limit
+from layout.formats.library import MaskLibrary, library_of
+from layout.formats.reading import read_mask
 from layout.mask import build
-from layout.process import LayerNumber, announce_compilation
+from layout.mask.plan import MaskPlan
 from layout.process import process as processes
-from metalens.core import config, store
-from metalens.core.errors import ProcessError
+from layout.process.jit import announce_compilation
+from layout.process.process import LayerNumber
+from layout.verify.exposure import verify_exposure
+from metalens.core import config, reading, store
+from metalens.core.errors import MaskFileError, ProcessError
 
-_LISTED = 12  # gaps that are told one by one
+_LISTED = 12  # spaces between parts that are listed one by one
 
 
 def run(options: Options) -> int:
@@ -49,69 +39,63 @@ def run(options: Options) -> int:
     not read back as planned.
     """
     record = config.load(options.lens, Floorplan)
-    named = [part.file for part in record.lens] + [part.file for part in record.cell]
+    named = [part.file for part in (*record.lens, *record.cell)]
     process = (
         processes.Process()
         if options.process is None
         else processes.load_process(options.process)
     )
     if not options.dose:
-        process = dataclasses.replace(
-            process, exposure=dataclasses.replace(process.exposure, correct=False)
-        )
+        exposure = dataclasses.replace(process.exposure, correct=False)
+        process = dataclasses.replace(process, exposure=exposure)
     inputs = [options.lens.parent / file for file in named]
     with (
         options.claim_folder(options.output, inputs=inputs) as draft,
         options.shared(),
         announce_compilation(options.console.say),
     ):
-        work = FloorplanWork(
-            options, record, process, draft.path, StageTimes(options.console.say)
-        )
+        stages = StageTimes(options.console.say)
+        work = FloorplanWork(options, record, process, draft.path, stages)
         made = _whole(work)
         _write(work, made)
-        with work.stages("report"):
+        with stages("report"):
             _accompany(work, made)
     return options.console.judged(_values(work, made), _text(work, made), work.failures)
 
 
 def _refuse_negative(work: FloorplanWork) -> None:
     """Raises: ProcessError: gaps are drawn, and something stands on the die that the
-    frame of a lens does not know.
+    frame of a lens does not include.
     """
     record, size = work.record, work.record.wafer
     alone = all(record.furnished(part) for part in record.lens) and not record.cell
     alone &= record.die is None and not (size and size.marks)
     if work.process.tone == "negative" and not alone:
         raise ProcessError(
-            "tone = 'negative' draws the die around each lens: need lenses that are furnished, "
-            "and no [die], [[cell]] or wafer.marks"
+            "tone = 'negative' draws the die around each lens: need lenses that are "
+            "furnished, and no [die], [[cell]] or wafer.marks"
         )
 
 
-def _whole(work: FloorplanWork) -> MaskAssembly:
+def _whole(work: FloorplanWork) -> MaskLibrary:
     """The die of the record, or its wafer."""
-    record = work.record
+    record, layers = work.record, work.process.layers
     _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
-    placed, marks = _parts(work)
+    work.placed, marks = _parts(work)
     with work.stages("room between parts"):
-        work.placed, work.near = placed, apart.check_separation(placed, work.process)
-    told = [
+        work.near = apart.check_separation(work.placed, work.process)
+    spaces = [
         f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
         for v in work.near
     ]
-    work.failures += told[:_LISTED] + (
-        [f"{len(told) - _LISTED} more"] if len(told) > _LISTED else []
-    )
-    layers = work.process.layers
+    more = len(spaces) - _LISTED
+    work.failures += spaces[:_LISTED] + ([f"{more} more"] if more > 0 else [])
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    one = joined.die_cell(name, placed, kept=kept)
-    if record.wafer is None:
-        return one
-    return _stepped(work, record.wafer, one, marks)
+    one = joined.die_cell(name, work.placed, kept=kept)
+    return one if record.wafer is None else _stepped(work, record.wafer, one, marks)
 
 
 def _parts(
@@ -119,110 +103,202 @@ def _parts(
 ) -> tuple[list[joined.PartPlacement], parts.DieComponent | None]:
     """What stands on the die, and the alignment mark of the wafer.
 
-    Everything that is corrected here is drawn first, so that all of it shares one
-    series of doses.
+    All that is corrected here is drawn first, so that it shares one series of doses.
     """
-    record, process = work.record, work.process
-    files = [
-        joined.PartPlacement(standing.cell_part(work, part), part.at)
-        for part in record.cell
-    ]
-    lenses = [standing.draw_lens(work, part) for part in record.lens]
-    made = [drawing.made for drawing in lenses]
+    record, process, size = work.record, work.process, work.record.wafer
+    files = [joined.PartPlacement(_cell_part(work, p), p.at) for p in record.cell]
+    drawings = []
+    for part in record.lens:
+        path = work.options.lens.parent / part.file
+        options = dataclasses.replace(work.options, lens=path, name=part.name)
+        options.console.say(f"{part.name}: {part.file}")
+        furniture: build.Furniture = "die" if record.furnished(part) else "aperture"
+        drawings.append(make.draw_lens(options, furniture=furniture))
+    plans = [drawing.made.plan for drawing in drawings]
     if record.die is not None:
         sketches = [
             joined.PartPlacement(
-                parts.plan_extents(part.name, one.plan, process), part.at
+                parts.of_plan(part.name, plan, process, corrected=False), part.at
             )
-            for part, one in zip(record.lens, made, strict=True)
+            for part, plan in zip(record.lens, plans, strict=True)
         ]
-        made.append(standing.draw_surroundings(work, record.die, sketches + files))
-    has_marks = record.wafer is not None and bool(record.wafer.marks)
-    if record.wafer is not None and has_marks:
-        made.append(standing.draw_wafer_mark(work, record.wafer))
-    with work.stages("dose classes"):
-        made = build.assign_doses(made, process)
-    mark = standing.written_part(work, made.pop()) if has_marks else None
+        box = apart.extent_of_copies([*sketches, *files], exposed=True) / joined.PER_UM
+        plans.append(
+            build.die_surroundings(
+                drawings[0].source,
+                process,
+                name="DIE",
+                size_um=record.die.size_um,
+                clear_um=float(max(-box[0], box[2])) + apart.reach_um(process),
+                label=record.die.label or record.name,
+            ).plan
+        )
+    has_marks = size is not None and bool(size.marks)
+    if size is not None and has_marks:
+        source = drawings[0].source
+        plans.append(
+            build.wafer_mark(
+                source,
+                process,
+                name="WMARK",
+                mark_um=size.mark_um,
+                width_um=size.mark_width_um,
+            ).plan
+        )
+    with work.stages("dose"):
+        solved = make.correct_doses(plans, process, corrected=work.corrected)
+    mark = _frame_part(work, solved.pop()[0]) if has_marks else None
     placed = [
-        joined.PartPlacement(standing.lens_part(work, drawing, one), part.at)
-        for part, drawing, one in zip(record.lens, lenses, made, strict=False)
+        joined.PartPlacement(_lens_part(work, drawing, one), part.at)
+        for part, drawing, one in zip(record.lens, drawings, solved, strict=False)
     ]
     placed += files
     if record.die is not None:
-        around = standing.written_part(work, made[-1])
+        around = _frame_part(work, solved[-1][0])
         placed.append(joined.PartPlacement(around, (Placement(),)))
     return placed, mark
+
+
+def _lens_part(
+    work: FloorplanWork, drawing: make.DrawnLens, solved: make.SolvedPlan
+) -> parts.DieComponent:
+    """A lens, with mask, report and job sheet in a folder of its own."""
+    name = drawing.options.name
+    folder = work.folder / name
+    folder.mkdir()
+    work.options.console.say(f"{name}: mask and report")
+    job = make.make_mask(drawing, folder, solved)
+    work.failures += [f"{name}: {text}" for text in job.failures]
+    work.lenses[name] = make.values_of(job)
+    work.splits[name] = job.fields
+    for stage, seconds in job.seconds.items():
+        work.stages.seconds[f"{name}: {stage}"] = seconds
+    return parts.of_plan(name, job.plan, work.process, corrected=job.dose is not None)
+
+
+def _frame_part(work: FloorplanWork, plan: MaskPlan) -> parts.DieComponent:
+    """What stands around the lenses: checked and verified; read back with the die."""
+    name, process = plan.name, work.process
+    with work.stages(f"{name}: check"):
+        work.judge_rules(name, check_plan(plan, process.rules))
+    if work.corrected and process.exposure.csv is None:
+        with work.stages(f"{name}: verify exposure"):
+            found = verify_exposure(library_of(plan), plan, plan.doses, process)
+        if not found.ok:
+            work.failures.append(
+                f"{name}: exposure off by {100 * found.worst_exposure:.2g} % and "
+                f"{found.worst_nm:.2g} nm"
+            )
+    return parts.of_plan(name, plan, process, corrected=work.corrected)
+
+
+def _cell_part(work: FloorplanWork, part: CellPart) -> parts.DieComponent:
+    """A cell of a file made elsewhere; its rules are those of where it will be."""
+    path = work.options.lens.parent / part.file
+    if not path.is_file():
+        raise MaskFileError(
+            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
+        )
+    limit = placement_limit(path)
+    content = read_mask(path, limit)
+    content.refuse_beyond(limit)
+    made = parts.of_file(
+        part.name,
+        path,
+        content,
+        work.process,
+        cell=part.cell,
+        relative_dose=part.relative_dose,
+    )
+    texts = made.library.skipped["text"]
+    for number, what in ((texts, "texts"), (made.empty, "shapes without area")):
+        if number:
+            work.notes.append(
+                f"{number} {what} of {path.name} are left out: they draw nothing"
+            )
+    if part.checked:
+        layers = work.process.layers
+        skip = {layers.outline[0], layers.fields[0]}
+        drawn = {number for number, _ in made.library.layers}
+        with work.stages(f"{part.name}: check"):
+            chosen = [(number, None) for number in sorted(drawn - skip)]
+            report = check_library(made.library, work.process.rules, layers=chosen)
+        work.judge_rules(part.name, report)
+    else:
+        work.unchecked.append(part.name)
+    if work.corrected and made.uncorrected:
+        names = ", ".join(f"{a}/{b}" for a, b in list(made.uncorrected)[:8])
+        doses = sorted({made.library.doses[layer] for layer in made.uncorrected})
+        work.failures.append(
+            f"{part.name}: {sum(made.uncorrected.values()):,} shapes on {names}"
+            f"{', ...' * (len(made.uncorrected) > 8)} of {part.file} get the relative "
+            f"dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+            "correction; correct the file and lay its doses.csv beside it, or set "
+            "exposure.correct = false"
+        )
+    return made
 
 
 def _stepped(
     work: FloorplanWork,
     size: WaferSettings,
-    one: MaskAssembly,
+    one: MaskLibrary,
     mark: parts.DieComponent | None,
-) -> MaskAssembly:
+) -> MaskLibrary:
     """The wafer: as many whole dies as it holds, and its marks."""
-    placed = work.placed
-    box = apart.extent_of_copies(placed) / joined.PER_UM
     scattered = apart.reach_um(work.process)
-    inner = apart.extent_of_copies(placed, exposed=True) / joined.PER_UM
+    inner = apart.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
     need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(inner[2 + axis] - inner[axis])
         if between < need:
             work.failures.append(
-                f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, need {need:.4g}"
+                f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
+                f"need {need:.4g}"
             )
+    box = apart.extent_of_copies(work.placed) / joined.PER_UM
     left, bottom, right, top = box.tolist()
-    work.dies = wafer.usable_dies(
-        size,
-        (left, bottom, right, top),
-        around_marks_um=max(scattered, joined.MARGIN_UM),
-    )
+    margin = max(scattered, joined.MARGIN_UM)
+    box_um = left, bottom, right, top
+    work.dies = wafer.usable_dies(size, box_um, around_marks_um=margin)
     steps = wafer.step_and_repeat(one.name, work.dies, units_per_um=joined.PER_UM)
     at = tuple(Placement(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
     marks = None if mark is None else joined.PartPlacement(mark, at)
     return joined.wafer_cell(work.record.name, one, steps, marks)
 
 
-def _write(work: FloorplanWork, made: MaskAssembly) -> None:
+def _write(work: FloorplanWork, made: MaskLibrary) -> None:
     """The files that were asked for, each read back."""
-    options = work.options
-    neither = not (options.oasis or options.gds)
-    if options.oasis or neither:
-        _one(work, made, "mask.oas", oasis_write.write_oasis)
-    if options.gds or neither:
-        _one(work, made, "mask.gds", gdsii_write.write_gdsii)
+    writers: dict[str, Callable[[MaskLibrary, Path], None]] = {}
+    if work.options.writes_oasis:
+        writers["mask.oas"] = oasis_write.write_oasis
+    if work.options.writes_gds:
+        writers["mask.gds"] = gdsii_write.write_gdsii
+    for name, write in writers.items():
+        path = work.folder / name
+        with work.stages(f"write {name}"):
+            write(made, path)
+        with work.stages(f"read back {name}"):
+            content = read_mask(path, make.MOST_READ, keep=make.KEPT)
+            found = compare.mask_differences(made, content)
+        work.failures += [
+            f"{name} does not read back as planned: {text}" for text in found
+        ]
+        work.different |= {name} if found else set()
+        work.written[name] = path.stat().st_size
 
 
-def _one(
-    work: FloorplanWork,
-    made: MaskAssembly,
-    name: str,
-    write: Callable[[MaskAssembly, Path], None],
-) -> None:
-    path = work.folder / name
-    with work.stages(f"write {name}"):
-        write(made, path)
-    with work.stages(f"read back {name}"):
-        content = read_mask(path, make.MOST_READ, keep=make.KEPT)
-        found = compare.mask_differences(made, content)
-    work.failures += [f"{name} does not read back as planned: {text}" for text in found]
-    work.unlike |= {name} if found else set()
-    work.written[name] = path.stat().st_size
-
-
-def _accompany(work: FloorplanWork, made: MaskAssembly) -> None:
+def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
-    work.areas_um2 = job_file.areas_um2(made)
-    fields = list(job_file.place_fields(work.placed, work.splits))
-    job_file.write_fields(fields, work.folder / "fields.csv")
-    turned = job_file.without_fields(work.placed, work.splits)
+    work.areas_um2 = made.areas_um2()
+    fields = list(joined.place_fields(work.placed, work.splits))
+    joined.write_fields(fields, work.folder / "fields.csv")
     work.notes += [
         f"{name}: copies that are turned by no quarter have no write fields"
-        for name in turned
+        for name in joined.without_fields(work.placed, work.splits)
     ]
     write_lyp(made, work.folder / "mask.lyp")
-    doses.write_dose_table(made, work.process, work.folder / "doses.csv")
+    handover.write_dose_table(made, work.process, work.folder / "doses.csv")
     most = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]
     held = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
@@ -230,27 +306,26 @@ def _accompany(work: FloorplanWork, made: MaskAssembly) -> None:
         work.failures.append(
             f"{held} doses on the mask, exposure.maximum_classes = {most}"
         )
+    texts = {
+        "process.toml": config.dumps(work.process),
+        "arrangement.toml": config.dumps(work.record),
+        "job.txt": "\n".join(_sheet(work, made, len(fields))) + "\n",
+        "layout.json": json.dumps(_values(work, made), indent=1) + "\n",
+    }
     if work.dies is not None:
-        text = io.StringIO()
-        out = csv.writer(text, lineterminator="\n")
+        table = io.StringIO()
+        out = csv.writer(table, lineterminator="\n")
         out.writerow(("die", "column", "row", "x_um", "y_um"))
-        for n, (index, place) in enumerate(
-            zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True), 1
-        ):
+        pairs = zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True)
+        for n, (index, place) in enumerate(pairs, 1):
             out.writerow([n, *index, *(f"{v:.4f}" for v in place)])
-        store.write_text(work.folder / "dies.csv", text.getvalue())
-    store.write_text(work.folder / "process.toml", config.dumps(work.process))
-    store.write_text(work.folder / "arrangement.toml", config.dumps(work.record))
-    store.write_text(
-        work.folder / "job.txt", "\n".join(_sheet(work, made, len(fields))) + "\n"
-    )
-    store.write_text(
-        work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n"
-    )
-    arranged_page.write_floorplan_page(work, made)
+        texts["dies.csv"] = table.getvalue()
+    for name, text in texts.items():
+        store.write_text(work.folder / name, text)
+    page.write_floorplan_page(work, made)
 
 
-def _values(work: FloorplanWork, made: MaskAssembly) -> dict[str, Any]:
+def _values(work: FloorplanWork, made: MaskLibrary) -> dict[str, Any]:
     return {
         "ok": not work.failures,
         "failures": work.failures,
@@ -266,54 +341,51 @@ def _values(work: FloorplanWork, made: MaskAssembly) -> dict[str, Any]:
     }
 
 
-def _sheet(work: FloorplanWork, made: MaskAssembly, fields: int) -> list[str]:
+def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
     """The job sheet: what stands where, and its doses; what is said of each lens lies
     in its folder.
     """
-    process = work.process
+    process, size = work.process, work.record.wafer
     lines = [
         f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
         work.verdict,
         *work.notes,
         "",
         "Files:",
-        *(
-            f"  {name:<16} {size:>14,} bytes"
-            for name, size in sorted(work.written.items())
-        ),
-        "",
-        "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; +y up):",
     ]
-    every = [(part.name, part.file, part.at) for part in work.record.lens]
-    every += [(part.name, part.file, part.at) for part in work.record.cell]
-    for name, file, places in every:
-        for at in places:
-            many = (
-                f", {at.columns} x {at.rows} copies" if at.columns * at.rows > 1 else ""
-            )
+    lines += [f"  {n:<16} {b:>14,} bytes" for n, b in sorted(work.written.items())]
+    lines += [
+        "",
+        "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; "
+        "+y up):",
+    ]
+    for part in (*work.record.lens, *work.record.cell):
+        for at in part.at:
+            copies = at.columns * at.rows
+            many = f", {at.columns} x {at.rows} copies" if copies > 1 else ""
             turned = f", turned by {at.turn_deg:g}" if at.turn_deg else ""
             mirrored = ", mirrored" if at.mirrored else ""
             lines.append(
-                f"  {name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {file}"
+                f"  {part.name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}"
+                f"{mirrored}; {part.file}"
             )
-    if work.dies is not None and work.record.wafer is not None:
-        size = work.record.wafer
+    many = ""
+    if work.dies is not None and size is not None:
+        dies = len(work.dies.index)
+        many = f" of a die, {dies} dies"
         lines += [
             "",
-            f"Wafer of {size.diameter_mm:g} mm: {len(work.dies.index)} whole dies, {size.edge_exclusion_mm:g} mm from "
-            "its edge; dies.csv",
-            *(
-                f"  alignment mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm"
-                for mark in size.marks
-            ),
+            f"Wafer of {size.diameter_mm:g} mm: {dies} whole dies, "
+            f"{size.edge_exclusion_mm:g} mm from its edge; dies.csv",
+        ]
+        lines += [
+            f"  alignment mark at ({m.x_mm:g}, {m.y_mm:g}) mm" for m in size.marks
         ]
     areas = work.areas_um2
-    charges = handover.charge_uC(areas, made.doses, process)
-    many = "" if work.dies is None else f" of a die, {len(work.dies.index)} dies"
     return [
         *lines,
         "",
-        *handover.charge_lines(charges),
+        *handover.charge_lines(handover.charge_uC(areas, made.doses, process)),
         f"Write fields: {fields}{many}, part by part, in the order of fields.csv",
         "  they cover the pillars of the lenses alone",
         "",
@@ -321,9 +393,9 @@ def _sheet(work: FloorplanWork, made: MaskAssembly, fields: int) -> list[str]:
     ]
 
 
-def _text(work: FloorplanWork, made: MaskAssembly) -> str:
+def _text(work: FloorplanWork, made: MaskLibrary) -> str:
     target = work.options.output
-    lines = [*([] if work.failures and not work.unchecked else [work.verdict])]
+    lines = [] if work.failures and not work.unchecked else [work.verdict]
     lines += work.notes
     lines += [
         f"  {target / name}: {size / 1e6:.3g} MB, read back"
@@ -331,6 +403,7 @@ def _text(work: FloorplanWork, made: MaskAssembly) -> str:
     ]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
     lines.append(
-        f"  {dies}{len(made.cells):,} cells; {target / 'report.html'}; {sum(work.stages.seconds.values()):.1f} s"
+        f"  {dies}{len(made.cells):,} cells; {target / 'report.html'}; "
+        f"{sum(work.stages.seconds.values()):.1f} s"
     )
     return "\n".join(lines)

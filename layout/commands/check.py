@@ -1,7 +1,6 @@
 """Design rules of any mask file (GDSII or OASIS): ``metalens check``."""
 
 import contextlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,32 +9,15 @@ from typing import Any
 import tyro
 
 from layout.commands.validate import validate_mask
-from layout.drc import (
-    DrcReport,
-    LayerChoice,
-    Metric,
-    check_library,
-    format_size,
-    write_lyrdb,
-)
-from layout.formats import (
-    MaskContent,
-    gdsii_read,
-    hierarchy,
-    map_bytes,
-    oasis_read,
-    placement_limit,
-)
-from layout.formats import oasis_records as oasis_bytes
+from layout.drc.klayout import write_lyrdb
+from layout.drc.library import LayerChoice, Metric, check_library
+from layout.drc.report import DrcReport, format_size
+from layout.formats.files import placement_limit
+from layout.formats.library import MaskLibrary
+from layout.formats.reading import read_mask
 from layout.process import process as processes
 from metalens.commands import CommonOptions, MaybeOutput
-from metalens.core import reading
 from metalens.core.errors import MaskFileError
-
-_OTHER_FORMATS = {  # how text formats of other programs begin: their name
-    rb"\s*(0|999)\r?\n|AutoCAD Binary DXF": "a DXF drawing (convert it)",
-    rb"[\t-\r -~]*;": "a CIF file (convert it)",
-}
 
 
 @dataclass(frozen=True)
@@ -118,51 +100,16 @@ def parse_layer(text: str) -> LayerChoice:
     return int(number), int(datatype) if slash else None
 
 
-def _negative_layers(content: MaskContent, process: processes.Process) -> set[int]:
+def _negative_layers(content: MaskLibrary, process: processes.Process) -> set[int]:
     """Layer numbers exposed with a negative tone, whose clear areas remain."""
     if process.tone == "positive":
         return set()
     layers = process.layers
     others = {layers.aperture[0], layers.outline[0], layers.fields[0]}
-    return {number for number, _ in hierarchy.count_shapes(content)} - others
+    return {number for number, _ in content.count_shapes()} - others
 
 
-def read_mask(
-    path: Path, limit: int | None = None, *, keep: int | None = None
-) -> MaskContent:
-    """A GDSII or OASIS mask.
-
-    Args:
-        path: of the file.
-        limit: placements and shapes that are read; None: as its size allows.
-        keep: placements of one cell that are kept, of more only their sums; None: all.
-
-    Raises:
-        MaskFileError: no such file, of another format, more than ``limit`` placements,
-            or a file that cannot be read.
-    """
-    if not path.is_file():
-        raise MaskFileError(
-            f"{path}: {reading.missing_reason(path)}; need a GDSII or OASIS mask"
-        )
-    start = map_bytes(path)[:64].tobytes()
-    other = reading.foreign_format(path) or _text_format(start)
-    if other:
-        raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
-    is_oasis = start.startswith(oasis_bytes.MAGIC)
-    reader = oasis_read.read_oasis if is_oasis else gdsii_read.read_gdsii
-    return reader(
-        path, limit=placement_limit(path) if limit is None else limit, keep=keep
-    )
-
-
-def _text_format(start: bytes) -> str:
-    """Which text format a file that begins so has; empty for none."""
-    named = (name for form, name in _OTHER_FORMATS.items() if re.match(form, start))
-    return next(named, "")
-
-
-def _values(content: MaskContent, report: DrcReport) -> dict[str, Any]:
+def _values(content: MaskLibrary, report: DrcReport) -> dict[str, Any]:
     sizes = {n: v for n, v in report.sizes.items() if "foot" not in n}
     layers = {
         f"{layer}/{datatype}": {"checked": one.checked, "shapes": one.shapes}
@@ -203,7 +150,7 @@ def _failures(
     return failures
 
 
-def _text(path: Path, content: MaskContent, report: DrcReport) -> str:
+def _text(path: Path, content: MaskLibrary, report: DrcReport) -> str:
     verdict = "keeps" if report.ok else "does not keep"
     space = (
         f"minimum space {format_size(report.minimum_space_nm)}"

@@ -5,8 +5,8 @@ of every layer.
 from pathlib import Path
 from typing import Any
 
-from layout.commands.check import format_counts, read_mask
-from layout.formats import hierarchy
+from layout.commands.check import format_counts
+from layout.formats.reading import read_mask
 
 
 def mask_summary(path: Path, top: str | None = None) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def mask_summary(path: Path, top: str | None = None) -> dict[str, Any]:
     content = read_mask(path)
     if top is not None:
         content = content.below(top)
-    counts = hierarchy.count_shapes(content)
+    counts = content.count_shapes()
     layers = {
         f"{layer[0]}/{layer[1]}": {
             "name": content.layer_names.get(layer, ""),

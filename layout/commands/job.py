@@ -3,16 +3,24 @@
 import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import tyro
 
+from layout.arrange import joined, wafer
+from layout.arrange.record import Floorplan
 from layout.commands.stages import StageTimes
-from layout.drc import DrcReport
-from layout.formats import DxfWindow, compare, handover
-from layout.mask import FieldPlan, MaskPlan, build
-from layout.process import LayerNumber
+from layout.drc.report import DrcReport, Violation
+from layout.formats import compare, handover
+from layout.formats.dxf import DxfWindow
+from layout.mask import build
+from layout.mask.fields import FieldPlan
+from layout.mask.plan import MaskPlan
+from layout.pec.correct import DoseSolution
 from layout.process import process as processes
-from layout.verify import ExposureReport, LensRows
+from layout.process.process import LayerNumber
+from layout.verify.as_written import LensRows
+from layout.verify.report import ExposureReport
 from metalens.commands import DistributedOptions, Output
 from metalens.core.errors import ConfigError
 from metalens.lens import Lens
@@ -95,7 +103,8 @@ class LayoutJob:
     options: Options
     source: Lens
     process: processes.Process
-    made: build.MadePlan
+    made: build.DrawnMask
+    dose: DoseSolution | None
     fields: FieldPlan
     plan: MaskPlan
     drc: DrcReport
@@ -143,7 +152,7 @@ class LayoutJob:
         holds enough.
         """
         needed, most = (
-            0 if self.made.dose is None else self.made.dose.needed,
+            0 if self.dose is None else self.dose.needed,
             self.process.exposure.maximum_classes,
         )
         return (
@@ -186,3 +195,75 @@ class LayoutJob:
             if self.failures
             else "The mask passes its own checks."
         )
+
+
+@dataclass(eq=False, slots=True)
+class FloorplanWork:
+    """What is known so far of an arrangement.
+
+    failures: what keeps the mask from the writer.
+    notes: what a person should know.
+    unchecked: parts whose design rules nobody checked here.
+    lenses: {name: values of its layout.json}.
+    written: {file: bytes}.
+    dies: on the wafer.
+    placed: parts on the die.
+    near: parts that stand too near each other.
+    rules: violations of each part that is checked here.
+    splits: write fields of each lens.
+    areas_um2: of each layer, over the whole mask.
+    different: files that do not read back as planned.
+    """
+
+    options: Options
+    record: Floorplan
+    process: processes.Process
+    folder: Path
+    stages: StageTimes
+    failures: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    unchecked: list[str] = field(default_factory=list)
+    lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
+    written: dict[str, int] = field(default_factory=dict)
+    dies: wafer.WaferDies | None = None
+    placed: list[joined.PartPlacement] = field(default_factory=list)
+    near: list[Violation] = field(default_factory=list)
+    rules: dict[str, DrcReport] = field(default_factory=dict)
+    splits: dict[str, FieldPlan] = field(default_factory=dict)
+    areas_um2: dict[LayerNumber, float] = field(default_factory=dict)
+    different: set[str] = field(default_factory=set)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether every shape gets a dose of its own."""
+        return self.process.exposure.corrected
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was not checked, in words."""
+        return [
+            f"NOT CHECKED: the design rules of {name} (checked = false)."
+            for name in self.unchecked
+        ]
+
+    @property
+    def verdict(self) -> str:
+        """First line of everything that is said of the mask."""
+        if self.failures:
+            return " ".join(["FAILS: " + "; ".join(self.failures), *self.warnings])
+        if self.unchecked:
+            passed = "No fault was found by the checks that were made."
+            return " ".join([passed, *self.warnings])
+        return "The mask passes its own checks."
+
+    def judge_rules(self, name: str, report: DrcReport) -> None:
+        """Enter the design-rule check of a part.
+
+        Args:
+            name: of the part.
+            report: of its check.
+        """
+        self.rules[name] = report
+        if not report.ok:
+            violated = report.violated or "no shape to check"
+            self.failures.append(f"{name}: design rules violated: {violated}")

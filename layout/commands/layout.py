@@ -6,7 +6,7 @@ from pathlib import Path
 
 from layout.commands import make
 from layout.commands.job import LayoutJob, Options
-from layout.process import announce_compilation
+from layout.process.jit import announce_compilation
 
 ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 

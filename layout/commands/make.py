@@ -4,7 +4,7 @@ verified, with its companions.
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +15,10 @@ import numpy as np
 from layout.commands import page
 from layout.commands.job import LayoutJob, Options
 from layout.commands.stages import StageTimes
-from layout.drc import check_plan, write_lyp, write_lyrdb
+from layout.drc.klayout import write_lyp, write_lyrdb
+from layout.drc.lattice import check_plan
 from layout.formats import (
-    MaskContent,
     compare,
-    doses,
     dxf,
     gdsii_read,
     gdsii_write,
@@ -27,10 +26,17 @@ from layout.formats import (
     oasis_read,
     oasis_write,
 )
-from layout.mask import MaskPlan, build, fields, with_fields
-from layout.process import LayerNumber
+from layout.formats.library import MaskLibrary
+from layout.mask import build, fields
+from layout.mask.field_figure import with_fields
+from layout.mask.plan import MaskPlan
+from layout.pec import dosed
+from layout.pec.correct import DoseSolution
 from layout.process import process as processes
-from layout.verify import ExposureReport, LensRows, verify_exposure
+from layout.process.process import LayerNumber
+from layout.verify.as_written import LensRows
+from layout.verify.exposure import verify_exposure
+from layout.verify.report import ExposureReport
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
 from metalens.core.arrays import Array
@@ -44,23 +50,31 @@ KEPT = (
     1 << 16
 )  # placements of a cell that are kept when a file is read back; of more only sums are
 MOST_READ = 2**40
+SolvedPlan = tuple[MaskPlan, DoseSolution | None]  # dose None: every dose is 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DrawnLens:
-    """A lens as it is drawn, with the doses that it wants."""
+    """A lens as it is drawn, before any correction."""
 
     options: Options
     source: Lens
     process: processes.Process
-    made: build.MadePlan
+    made: build.DrawnMask
     stages: StageTimes
+
+    @property
+    def corrected(self) -> bool:
+        """Whether every shape gets a dose of its own."""
+        return self.options.dose and self.process.exposure.corrected
 
 
 def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnLens:
-    """The plan of ``options.lens``, before its doses are rounded to those of the job.
+    """The plan of the lens of a command, before any correction.
 
-    furniture: what stands on the die beside the lens.
+    Args:
+        options: of the command.
+        furniture: what stands on the die with the lens.
     """
     stages = StageTimes(options.console.say)
     with stages("read"):
@@ -68,38 +82,52 @@ def draw_lens(options: Options, *, furniture: build.Furniture = "die") -> DrawnL
             options.lens
         )
         if options.study:
-            from layout import study
+            from layout.study.focus import check_study_lens
 
-            study.check_study_lens(source)
+            check_study_lens(source)
         process = (
             processes.Process()
             if options.process is None
             else processes.load_process(options.process)
         )
         transaction.check_room(options.output, _room(options, source))
-    with stages("classes and dose"):
-        made = build.draw_mask(
-            source,
-            process,
-            name=options.name,
-            furniture=furniture,
-            with_doses=options.dose,
-        )
+    with stages("classes"):
+        made = build.draw_mask(source, process, name=options.name, furniture=furniture)
     return DrawnLens(options, source, process, made, stages)
 
 
+def correct_doses(
+    plans: Sequence[MaskPlan], process: processes.Process, *, corrected: bool
+) -> list[SolvedPlan]:
+    """Plans that are written in one job, with their doses.
+
+    Args:
+        plans: of lenses and of what stands around them.
+        process: layers, and the point exposure.
+        corrected: whether every shape gets a dose of its own.
+    """
+    if not (corrected and plans):
+        return [(plan, None) for plan in plans]
+    return list(dosed.correct_plans(plans, process.exposure, process.layers))
+
+
 def make_mask(
-    drawing: DrawnLens, folder: Path, made: build.MadePlan | None = None
+    drawing: DrawnLens, folder: Path, solved: SolvedPlan | None = None
 ) -> LayoutJob:
     """Write the mask of a lens and all that goes with it into a folder.
 
-    made: with the doses of a job of several masks; left out: of this mask alone.
+    Args:
+        drawing: of the lens.
+        folder: that exists.
+        solved: plan with the doses of a job of several masks; None: of this one alone.
     """
-    if made is None:
-        with drawing.stages("dose classes"):
-            (made,) = build.assign_doses([drawing.made], drawing.process)
-    job = _checked(drawing, made)
-    doses.write_dose_table(job.plan, job.process, folder / "doses.csv")
+    if solved is None:
+        with drawing.stages("dose"):
+            (solved,) = correct_doses(
+                [drawing.made.plan], drawing.process, corrected=drawing.corrected
+            )
+    job = _checked(drawing, *solved)
+    handover.write_dose_table(job.plan, job.process, folder / "doses.csv")
     with ThreadPoolExecutor(1, thread_name_prefix="pictures") as pool:
         shots = pool.submit(
             page.draw_pictures, job.stages.rows.unwatched(job.plan), job.drc
@@ -113,15 +141,20 @@ def make_mask(
     return job
 
 
-def _checked(drawing: DrawnLens, made: build.MadePlan) -> LayoutJob:
+def _checked(
+    drawing: DrawnLens, plan: MaskPlan, dose: DoseSolution | None
+) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
     source, rules, stages = drawing.source, drawing.process, drawing.stages
+    made = drawing.made
     with stages("write fields"):
         split = fields.split_write_fields(source.diameters, rules, drawn=made.cells)
-        plan = stages.rows.watched(with_fields(made.plan, split, rules))
+        plan = stages.rows.watched(with_fields(plan, split, rules))
     with stages("check"):
         found = check_plan(plan, rules.rules, foot_nm=_feet(plan, source, rules))
-    return LayoutJob(drawing.options, source, rules, made, split, plan, found, stages)
+    return LayoutJob(
+        drawing.options, source, rules, made, dose, split, plan, found, stages
+    )
 
 
 def _room(options: Options, source: Lens) -> int:
@@ -193,12 +226,14 @@ def _write_solids(job: LayoutJob, target: Path) -> None:
             job.written[path.name] = path.stat().st_size
 
 
-def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskContent]) -> None:
+def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> None:
     with job.stages(f"read back {path.suffix[1:]}"):
         content = read(path, limit=MOST_READ, keep=KEPT)
         job.compared[path.name] = compare.compare(job.plan, content)
-        table = doses.read_dose_table(path.with_name("doses.csv"))
-        job.undosed[path.name] = doses.layers_without_dose(content, table, job.process)
+        table = handover.read_dose_table(path.with_name("doses.csv"))
+        job.undosed[path.name] = handover.layers_without_dose(
+            content, table, job.process
+        )
     if _is_verifiable(job) and job.compared[path.name].ok:
         with job.stages(f"verify exposure {path.suffix[1:]}"):
             job.verified[path.name] = _verified(job, content, table)
@@ -206,13 +241,13 @@ def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskContent]) -> 
 
 
 def _is_verifiable(job: LayoutJob) -> bool:
-    """Whether the simulator knows the point exposure (Gaussians) and the tone."""
+    """Whether the Gaussians of the exposure are known, and pillars are written."""
     exposure = job.process.exposure
     return exposure.known and exposure.csv is None and job.process.tone == "positive"
 
 
 def _verified(
-    job: LayoutJob, content: MaskContent, table: Mapping[LayerNumber, float]
+    job: LayoutJob, content: MaskLibrary, table: Mapping[LayerNumber, float]
 ) -> ExposureReport:
     """What a file makes that holds the plan's places; two files of the same polygons
     make the same.

@@ -3,212 +3,171 @@ it was checked.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from layout.commands import pictures
-from layout.commands.job import LayoutJob
-from layout.drc import DrcReport, format_size
-from layout.formats import DxfWindow, handover
-from layout.mask import MaskPlan
+from layout.commands.job import FloorplanWork, LayoutJob
+from layout.drc.report import DrcReport, format_size
+from layout.formats import handover
+from layout.formats.dxf import DxfWindow
+from layout.formats.library import MaskLibrary, library_of
+from layout.mask.plan import MaskPlan
 from layout.pec.psf import PointExposure
-from layout.process import ExposureSettings
+from layout.process.process import ExposureSettings, Process
 from layout.shapes import polygon
 from metalens.core import report
 from metalens.core.report import Figure, KeyFigure, Section, Table
 from metalens.core.units import nm
 
-_LISTED = 40  # write fields in the report
-_ROWS = 1024  # of the lens that are counted at once
+_LISTED = 50  # rows of a table
 
 
 def draw_pictures(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
-    """{file name: picture} of what will be written."""
+    """{file name: picture} of what will be written.
+
+    Args:
+        plan: of the die.
+        found: its design-rule check.
+    """
+    windows = DxfWindow(0, 0, 8), pictures.edge_window(plan, 8)
     return {
-        "die.png": pictures.whole_die(plan, found),
-        "pillars.png": pictures.plot_pillars(
-            plan, (DxfWindow(0, 0, 8), pictures.edge_window(plan, 8))
-        ),
+        "die.png": pictures.plot_die(plan, found),
+        "pillars.png": pictures.plot_pillars(plan, windows),
         "diameters.png": pictures.plot_diameters(plan),
-        "margins.png": pictures.plot_margins(found),
     }
 
 
 def write_mask_page(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
-    """Write report.html and the pictures (:func:`draw_pictures`) beside it."""
+    """Write report.html of one lens, and its pictures.
+
+    Args:
+        job: of the command.
+        shots: from :func:`draw_pictures`.
+        target: folder.
+    """
     for name, png in shots.items():
         (target / name).write_bytes(png)
     sections = [
-        _overview(job, shots),
-        _rules(job, shots),
+        Section(
+            "Die",
+            "Two lithography steps: the pillar layer (with marks, label, dose-test "
+            "array and witness cells) and the aperture layer, which draws the openings "
+            "of the opaque film. The F stands in the upper left corner. The mask is "
+            "seen from the pillar side, against the light, in the coordinates of the "
+            "lens: +y is up here, so the first row of the diameter map is the lowest.",
+            [
+                Figure(
+                    shots["die.png"],
+                    "The whole die. Colour: share of the area that pillars cover, "
+                    "averaged.",
+                    wide=True,
+                ),
+                Figure(
+                    shots["pillars.png"],
+                    "Polygons as they are written, in the middle and at the rim.",
+                    wide=True,
+                ),
+            ],
+        ),
+        _rules(job.drc),
         _classes(job, shots),
-        _doses(job),
-        _verified(job),
-        _fields(job),
-        _files(job),
+        *_exposure(job),
+        _job_sheet(job),
     ]
     if job.options.study:
         from layout.study import page as study_page
 
         answers = study_page.answers_of(job.source)
         job.answers_error = max(one.error for one in answers.values())
-        sections[-1:-1] = study_page.study_sections(
+        sections += study_page.study_sections(
             job.source, job.process, job.fields, answers
         )
+    read_back = {
+        name: "; ".join(outcome.differences) or "as planned"
+        for name, outcome in job.compared.items()
+    }
+    sections.append(_files(job.written, read_back, job.seconds))
     report.write_report(
         target / "report.html",
         f"Mask {job.plan.name}",
-        [section for section in sections if section is not None],
+        sections,
         lead=_lead(job),
         key_figures=_key_figures(job),
     )
 
 
 def _lead(job: LayoutJob) -> str:
-    source, lattice = job.source, job.plan.lattices[0]
-    own = sum(int(np.count_nonzero(block)) for _, block in lattice.blocks(_ROWS))
-    die = (
-        f" ({job.drc.shapes:,} on the die, with its test arrays)"
-        if job.drc.shapes != own
-        else ""
-    )
+    source, classes = job.source, job.plan.classes
+    own = int(job.plan.lattices[0].counts(len(classes))[1:].sum())
+    die = ""
+    if job.drc.shapes != own:
+        die = f" ({job.drc.shapes:,} on the die, with its test arrays)"
     return (
         f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
-        f"{2 * job.made.radius_um / 1e3:.4g} mm "
-        f"across, as {own:,} pillars{die} in {len(job.plan.classes)} cells; process “{job.process.name}”."
+        f"{2 * job.made.radius_um / 1e3:.4g} mm across, as {own:,} pillars{die} in "
+        f"{len(classes)} cells; process “{job.process.name}”."
     )
 
 
 def _key_figures(job: LayoutJob) -> list[KeyFigure]:
     found = job.drc
-    broken = sum(found.counts.values())
-    same = all(outcome.ok for outcome in job.compared.values())
+    counts, same = found.counts, all(outcome.ok for outcome in job.compared.values())
+    broken, close = sum(counts.values()), counts["space"] + counts["overlap"]
+    gap, width = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
     return [
         KeyFigure("pillars", f"{found.shapes:,}"),
-        KeyFigure(
-            "smallest gap",
-            format_size(found.minimum_space_nm),
-            found.counts["space"] + found.counts["overlap"] == 0,
-        ),
-        KeyFigure(
-            "thinnest pillar",
-            format_size(found.minimum_width_nm),
-            found.counts["width"] == 0,
-        ),
+        KeyFigure("smallest gap", gap, close == 0),
+        KeyFigure("thinnest pillar", width, counts["width"] == 0),
         KeyFigure("violations", f"{broken:,}", broken == 0),
         KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
     ]
 
 
-def _overview(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    text = (
-        "Two lithography steps: the pillar layer (with marks, label, dose-test array and witness cells) and the "
-        "aperture layer, which draws the openings of the opaque film. The F stands in the upper left "
-        "corner. The mask is seen from the pillar side, against the light, in the coordinates of the lens: +y is up "
-        "here, so the first row of the diameter map is the lowest."
-    )
-    items = [
-        Figure(
-            shots["die.png"],
-            "The whole die. Colour: share of the area that pillars cover, averaged.",
-            wide=True,
-        ),
-        Figure(
-            shots["pillars.png"],
-            "Polygons as they are written, in the middle and at the rim.",
-            wide=True,
-        ),
-    ]
-    return Section("Die", text, items)
-
-
-def _rules(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    found = job.drc
-    rows = [
-        [rule, _limit(rule, found.limits[rule]), count]
-        for rule, count in found.counts.items()
-    ]
+def _rules(found: DrcReport) -> Section:
     items: list[Figure | Table] = [
-        Figure(
-            shots["margins.png"],
-            "What was found (bar) beside what is allowed (line).",
-            wide=True,
-        ),
         Table(
             ("rule", "limit", "violations"),
-            rows,
-            "Checked on the drawn polygons, all pillars.",
-        ),
+            [[rule, found.limits[rule], n] for rule, n in found.counts.items()],
+            "Checked on the drawn polygons, all pillars; limits in nm, corners in "
+            "degrees, density as a share.",
+        )
     ]
     if found.worst:
-        tallies = [
-            [e["rule"], e["layer"], e["cell"], e["count"], e["worst"], e["limit"]]
-            for e in found.worst[:50]
-        ]
-        head = ("rule", "layer", "cell", "violations", "worst", "limit")
-        items.append(Table(head, tallies, "Violations by rule, layer and cell."))
+        head = ("rule", "layer", "cell", "count", "worst", "limit")
+        rows = [[entry[key] for key in head] for entry in found.worst[:_LISTED]]
+        items.append(Table(head, rows, "Violations by rule, layer and cell."))
         places = [
-            [
-                v.rule,
-                f"({v.centre[0]:.0f}, {v.centre[1]:.0f})",
-                v.value,
-                v.limit,
-                v.text,
-            ]
-            for v in found.violations[:50]
+            [v.rule, "({:.0f}, {:.0f})".format(*v.centre), v.value, v.limit, v.text]
+            for v in found.violations[:_LISTED]
         ]
-        items.append(
-            Table(
-                ("rule", "(x, y) / nm", "measured", "needed", "where"),
-                places,
-                "The first violations; mask.lyrdb marks up to 500 of each rule.",
-            )
-        )
+        head = ("rule", "(x, y) / nm", "measured", "needed", "where")
+        text = "The first violations; mask.lyrdb marks up to 500 of each rule."
+        items.append(Table(head, places, text))
     return Section("Design rules", found.summary + ".", items)
 
 
-def _limit(rule: str, value: float) -> str:
-    units = {"density": " %", "corner": " degrees"}
-    return f"{100 * value if rule == 'density' else value:g}{units.get(rule, ' nm')}"
-
-
-def _shaped(job: LayoutJob) -> Section:
-    """Of pillars that are not round."""
-    turned = job.source.diameters.angle_rad is not None
-    turns = (
-        f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees"
-        if turned
-        else ""
-    )
-    two = job.source.pairs is not None
-    shape = (
-        f"{job.source.cell.shape.kind} of its own width and length"
-        if two
-        else job.source.cell.shape.name
-    )
-    area = [made.twice_area / 2 for made in job.plan.classes]
-    rows = [
-        ["classes", len(area)],
-        ["least area / nm²", min(area)],
-        ["largest area / nm²", max(area)],
-    ]
-    text = (
-        f"Each is a {shape}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"
-        f"{turns}, its corners on the grid; rounding by the etch is not made up for."
-    )
-    return Section("Pillars", text, [Table(("what", "value"), rows)])
-
-
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
-    if not job.plan.classes[0].round:
-        return _shaped(job)
-    shapes = {made.diameter_units: made for made in job.plan.classes}
-    grid = job.plan.grid
+    rules, classes = job.process.rules, job.plan.classes
+    if not classes[0].round:
+        shape, area = job.source.cell.shape, [made.twice_area / 2 for made in classes]
+        two = job.source.pairs is not None
+        kind = f"{shape.kind} of its own width and length" if two else shape.name
+        turned = job.source.diameters.angle_rad is not None
+        turns = f" and turns in steps of {rules.angle_step_deg:g} degrees" * turned
+        return Section(
+            "Pillars",
+            f"Each is a {kind}, drawn in sizes in steps of {rules.diameter_step_nm} nm"
+            f"{turns}, its corners on the grid; rounding by the etch is not made up "
+            f"for. {len(area)} classes of {min(area):,.0f} to {max(area):,.0f} nm².",
+        )
+    shapes = {made.diameter_units: made for made in classes}
+    grid, unit = job.plan.grid, job.plan.grid * job.plan.unit_nm
     made = [
         polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)
     ]
     picked = np.unique(np.linspace(0, len(made) - 1, 12).round().astype(int))
-    unit = grid * job.plan.unit_nm
     rows = [
         [
             m.diameter * unit,
@@ -222,89 +181,33 @@ def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
     ]
     worst = max(abs(m.area_error) for m in made)
     text = (
-        f"Diameters are drawn in steps of {job.process.rules.diameter_step_nm} nm after the bias was taken off; "
-        f"that rounds each by at most {job.made.cells.rounding_nm:g} nm. Polygons have the area of their circle to "
-        f"{100 * worst:.3f} %."
+        f"Diameters are drawn in steps of {rules.diameter_step_nm} nm after the bias "
+        f"was taken off; that rounds each by at most {job.made.cells.rounding_nm:g} nm. "
+        f"Polygons have the area of their circle to {100 * worst:.3f} %."
     )
-    head = (
-        "diameter / nm",
-        "width / nm",
-        "vertices",
-        "shots",
-        "area error / %",
-        "edge error / nm",
-    )
+    head = ("diameter / nm", "width / nm", "vertices", "shots")
+    head = (*head, "area error / %", "edge error / nm")
     picture = Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True)
-    items: list[Figure | Table] = [picture, Table(head, rows)]
-    return Section("Pillars", text, items)
+    return Section("Pillars", text, [picture, Table(head, rows)])
 
 
-def _doses(job: LayoutJob) -> Section | None:
-    doses = job.made.dose
-    if doses is None:
-        return None
-    count = len(doses.ladder.factors)
-    rows = [
-        [
-            "one dose",
-            100 * doses.before.worst,
-            100 * doses.before.rms,
-            doses.before.diameter_nm,
-        ],
-        [
-            f"{count} doses",
-            100 * doses.after.worst,
-            100 * doses.after.rms,
-            doses.after.diameter_nm,
-        ],
-    ]
-    head = ("", "worst / %", "rms / %", "diameter / nm")
-    used = [made.dose for made in job.plan.classes]
-    table = [
-        [*layer, f"{dose:.4f}", job.plan.layer_names.get(layer, "")]
-        for layer, dose in sorted(job.plan.doses.items())
-    ]
-    text = (
-        f"Proximity correction of lens, dose test, witness cells, marks and label together: relative dose "
-        f"{min(used):.3f} to {max(used):.3f}, a datatype each (doses.csv). Every edge of every shape is exposed within "
-        f"{100 * doses.worst:.2g} % of what it should be; known to {100 * doses.error:.2g} %."
-        f"{_table_said(job.process.exposure, doses.point)}"
-    )
-    sheet = Table(
-        ("layer", "datatype", "relative dose", "name"),
-        table,
-        "The dose table, as in doses.csv.",
-    )
-    return Section(
-        "Dose",
-        text,
-        [
-            Table(
-                head,
-                rows,
-                "Error of the exposure at the pillar edges of the lens, and what it does.",
-            ),
-            sheet,
-        ],
-    )
-
-
-def _table_said(exposure: ExposureSettings, point: PointExposure) -> str:
-    """What the Gaussians leave out of a measured table: energy that the two figures
-    before it do not know of.
-    """
-    if exposure.csv is None:
-        return ""
-    return (
-        f" The point exposure is the table {exposure.csv.name}, as {len(point.weights)} Gaussians: the energy within "
-        f"any radius differs by up to {100 * point.fit_error:.2g} % of the whole from that of the table, besides."
-    )
-
-
-def _verified(job: LayoutJob) -> Section | None:
-    """What the written files and their dose table make."""
+def _exposure(job: LayoutJob) -> list[Section]:
+    """Doses, and what the written files and their dose table make."""
+    solution = job.dose
+    sections = []
+    if solution is not None:
+        used = [made.dose for made in job.plan.classes]
+        text = (
+            "Proximity effect correction of lens, dose test, witness cells, marks and "
+            f"label together: relative dose {min(used):.3f} to {max(used):.3f} in "
+            f"{len(solution.ladder.factors)} steps, a datatype each (doses.csv). Every "
+            f"edge of every shape is exposed within {100 * solution.worst:.2g} % of "
+            f"what it should be; known to {100 * solution.error:.2g} %."
+            f"{_fit_text(job.process.exposure, solution.point)}"
+        )
+        sections.append(Section("Dose", text))
     if not job.verified:
-        return None
+        return sections
     rows = [
         [
             name,
@@ -330,82 +233,202 @@ def _verified(job: LayoutJob) -> Section | None:
     )
     picture = pictures.plot_verification(next(iter(job.verified.values())))
     text = (
-        "The files and doses.csv, read back and exposed again. Shared with the correction: the Gaussians of the process "
-        "file, the threshold (half of what a wide area receives) and the method of the field on nodes. That field is "
-        "compared with direct sums over the exact shapes at sample pillars, which are judged too; edges of marks and "
-        "labels are in closed form. Pillars of lens and witness cells and the edges of marks and "
-        "labels; the dose test is predicted and not judged. made.h5 (up to 16 million sites) is the lens of "
-        "the predicted diameters: give it to metalens psf, or to this command with --study."
+        "The files and doses.csv, read back and exposed again. Shared with the "
+        "correction: the Gaussians of the process file, the threshold (half of what a "
+        "wide area receives) and the field on nodes. That field is compared with "
+        "direct sums over the exact shapes at sample pillars, which are judged too; "
+        "edges of marks and labels are in closed form. The dose test is predicted and "
+        "not judged. made.h5 (up to 16 million sites) is the lens of the predicted "
+        "diameters: give it to metalens psf, or to this command with --study."
     )
-    items: list[Figure | Table] = [
-        Table(head, rows),
-        Figure(picture, "Predicted less drawn diameter.", wide=True),
-    ]
-    return Section("Exposure as written", text, items)
+    shown = Figure(picture, "Predicted less drawn diameter.", wide=True)
+    sections.append(Section("Exposure as written", text, [Table(head, rows), shown]))
+    return sections
 
 
-def _fields(job: LayoutJob) -> Section:
+def _fit_text(exposure: ExposureSettings, point: PointExposure) -> str:
+    """What the Gaussians leave out of a measured table."""
+    if exposure.csv is None:
+        return ""
+    return (
+        f" The point exposure is the table {exposure.csv.name}, as "
+        f"{len(point.weights)} Gaussians: the energy within any radius differs by up "
+        f"to {100 * point.fit_error:.2g} % of the whole from that of the table, besides."
+    )
+
+
+def _job_sheet(job: LayoutJob) -> Section:
     split = job.fields
     text = (
-        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} by {split.size_um[1]:.1f} µm "
-        f"at most; no border cuts a pillar: they keep {split.clearance_um / nm:.0f} nm. A raster centred on the axis "
-        f"would have cut {split.cut_before:,} pillars. fields.csv lists them in the order of writing, row by row and "
-        f"back; job.txt is the sheet for the operator, with currents left open."
+        f"Fields that hold pillars: {split.used} ({split.mode}), {split.size_um[0]:.1f} "
+        f"by {split.size_um[1]:.1f} µm at most; no border cuts a pillar: they keep "
+        f"{split.clearance_um / nm:.0f} nm. A raster centred on the axis would have cut "
+        f"{split.cut_before:,} pillars. fields.csv lists them in the order of writing; "
+        "job.txt is the sheet for the operator, with currents left open."
     )
-    steps = handover.field_sequence(split)
+    areas = library_of(job.plan).areas_um2()
+    charge = handover.charge_uC(areas, job.plan.doses, job.process)
+    return Section("Job sheet", text, [_charge(charge)])
+
+
+def _charge(charges: dict[str, float]) -> Table:
+    rows = [[step, f"{q:.4g}", f"{q / 3.6:.3g}"] for step, q in charges.items()]
+    head = ("step", "charge / µC", "hours at 1 nA")
+    return Table(head, rows, "Without stage and settling times.")
+
+
+def _files(
+    written: dict[str, int], read_back: dict[str, str], seconds: dict[str, float]
+) -> Section:
     rows = [
-        [
-            s.sequence,
-            f"{s.x_um:.3f}",
-            f"{s.y_um:.3f}",
-            f"{s.width_um:.3f}",
-            f"{s.height_um:.3f}",
-            f"{s.pillars:,}",
-        ]
-        for s in steps[:_LISTED]
+        [name, f"{size / 1e6:.3f}", read_back.get(name, "not read back")]
+        for name, size in written.items()
     ]
-    fields = Table(
-        handover.FIELD_HEAD, rows, f"The first {len(rows)} of {len(steps)} fields."
-    )
-    charges = [
-        [step, f"{charge:.4g}", f"{charge * 1e3 / 3600:.3g}"]
-        for step, charge in handover.charge_uC(
-            handover.areas_um2(job.plan), job.plan.doses, job.process
-        ).items()
-    ]
-    charge = Table(
-        ("step", "charge / µC", "hours at 1 nA"),
-        charges,
-        "Without stage and settling times.",
-    )
-    marks = Table(
-        ("x / µm", "y / µm", "width / µm", "height / µm"),
-        handover.marks_um(job.plan),
-        "Marks.",
-        digits=6,
-    )
-    return Section("Job sheet", text, [charge, fields, marks])
-
-
-def _files(job: LayoutJob) -> Section:
-    rows = []
-    for name, size in job.written.items():
-        outcome = job.compared.get(name)
-        verdict = (
-            "not read back"
-            if outcome is None
-            else ("as planned" if outcome.ok else "; ".join(outcome.differences))
-        )
-        rows.append([name, f"{size / 1e6:.3f}", verdict])
-    times = [[stage, seconds] for stage, seconds in job.seconds.items()]
     items = [
         Table(("file", "MB", "read back and compared"), rows),
-        Table(
-            ("stage", "seconds"), times, "On the machine that made the mask.", digits=3
-        ),
+        Table(("stage", "seconds"), list(map(list, seconds.items())), digits=3),
     ]
-    return Section(
-        "Files",
-        "Each mask file was read back: every pillar at its site, every polygon vertex.",
-        items,
+    text = "Each mask file was read back: every cell, polygon vertex and placement."
+    return Section("Files", text, items)
+
+
+# arrangements
+
+
+def write_floorplan_page(work: FloorplanWork, made: MaskLibrary) -> None:
+    """Write report.html of an arrangement, die.png (and wafer.png).
+
+    Args:
+        work: of the command.
+        made: mask that was written.
+    """
+    shots = {"die.png": pictures.plot_floorplan(work.placed, work.near)}
+    notes = " ".join(f"{note}." for note in work.notes)
+    sections = [
+        Section(
+            "Die",
+            f"Seen from the pillar side, +y up. {notes}".strip(),
+            [Figure(shots["die.png"], "Parts on the die.", wide=True), _places(work)],
+        )
+    ]
+    dies = 1
+    if work.dies is not None and work.record.wafer is not None:
+        dies = len(work.dies.index)
+        box = pictures.floorplan_box_um(work.placed)
+        shots["wafer.png"] = pictures.plot_wafer(work.record.wafer, work.dies, box)
+        caption = "Dies within the edge exclusion, and marks."
+        text = f"{dies:,} whole dies; dies.csv lists them."
+        shown = Figure(shots["wafer.png"], caption, wide=True)
+        sections.append(Section("Wafer", text, [shown]))
+    for name, png in shots.items():
+        (work.folder / name).write_bytes(png)
+    read_back = {
+        name: "DIFFERENT" if name in work.different else "as planned"
+        for name in work.written
+    }
+    charges = handover.charge_uC(work.areas_um2, made.doses, work.process)
+    sections += [
+        _checks(work),
+        Section(
+            "Dose",
+            "One dose for each layer and datatype: doses.csv; write fields of the "
+            "lenses: fields.csv.",
+            [_charge(charges), _dose_table(made, work.process)],
+        ),
+        _files(work.written, read_back, work.stages.seconds),
+    ]
+    pillars = sum(
+        values["pillars"] * sum(copies.count for copies in one.copies(one.part.top))
+        for one in work.placed
+        for name, values in work.lenses.items()
+        if name == one.part.name
     )
+    lead = (
+        f"{work.verdict} {len(work.lenses)} lenses with {pillars:,} pillars on a die; "
+        f"process “{work.process.name}”."
+    )
+    report.write_report(
+        work.folder / "report.html",
+        f"Mask {made.name}",
+        sections,
+        lead=lead,
+        key_figures=[
+            KeyFigure("parts", str(len(work.placed))),
+            KeyFigure("dies", f"{dies:,}"),
+            KeyFigure("doses", str(len(made.doses))),
+            KeyFigure("what fails", str(len(work.failures)), not work.failures),
+        ],
+    )
+
+
+def _dose_table(made: MaskLibrary, process: Process) -> Table:
+    base = process.exposure.base_uC_cm2
+    rows = [
+        [*layer, f"{dose:.6f}", dose * base, made.layer_names.get(layer, "")]
+        for layer, dose in sorted(made.doses.items())
+    ]
+    return Table(("layer", "datatype", "relative dose", "µC/cm²", "name"), rows)
+
+
+def _places(work: FloorplanWork) -> Table:
+    files = {p.name: str(p.file) for p in (*work.record.lens, *work.record.cell)}
+    rows = [
+        [
+            one.part.name,
+            files.get(one.part.name, "own"),
+            at.x_um,
+            at.y_um,
+            f"{at.turn_deg:g}{' mirrored' * at.mirrored}",
+            at.columns * at.rows,
+        ]
+        for one in work.placed
+        for at in one.at
+    ]
+    head = ("part", "file", "x / µm", "y / µm", "turn / degrees", "copies")
+    text = f"The first {min(_LISTED, len(rows))} of {len(rows)} places."
+    return Table(head, rows[:_LISTED], text, digits=8)
+
+
+def _checks(work: FloorplanWork) -> Section:
+    """Rules, exposure and read-back of each part, and what stands too near what."""
+    rows = [_lens_row(name, values) for name, values in work.lenses.items()]
+    for name, found in work.rules.items():
+        sizes = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
+        broken = sum(found.counts.values())
+        verdict = "FAILS" if broken else "passes"
+        rows.append([name, f"{found.shapes:,}", *sizes, broken, "", "", verdict])
+    rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
+    head = ("part", "shapes", "least gap", "least feature", "broken rules")
+    head = (*head, "exposure", "read back", "verdict")
+    caption = "Each lens has a report of its own, in the folder of its name."
+    items = [Table(head, rows, caption)]
+    if work.near:
+        near = [[v.text, v.value / 1e3, v.limit / 1e3] for v in work.near[:_LISTED]]
+        head = ("what", "apart / µm", "needed / µm")
+        items.append(Table(head, near, "Parts that stand too near each other."))
+    text = [*work.failures, *work.warnings]
+    if not work.failures:
+        who = "Every part that was checked" if work.unchecked else "Every part"
+        text.append(
+            f"{who} is within the design rules, and all stand far enough from each "
+            "other."
+        )
+    return Section("Checks", "\n\n".join(text), items)
+
+
+def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
+    """Of layout.json of a lens."""
+    exposed = [
+        f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm"
+        for e in values["exposure"].values()
+    ]
+    return [
+        name,
+        f"{values['pillars']:,}",
+        format_size(values["minimum_space_nm"]),
+        format_size(values["minimum_width_nm"]),
+        sum(values["violations"].values()),
+        exposed[0] if exposed else "not verified",
+        "DIFFERENT" if any(values["differences"].values()) else "as planned",
+        "passes" if values["ok"] else "FAILS",
+    ]

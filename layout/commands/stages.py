@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from layout.mask import MaskPlan, PillarLattice
+from layout.mask.plan import MaskPlan, PillarArray
 from metalens.core.arrays import Array
 
 _FIRST_S, _NEXT_S = 2.0, 10.0
@@ -19,7 +19,7 @@ class RowProgress:
 
     def __init__(self) -> None:
         self.end, self.total, self.start = 0, 0, 0.0
-        self._lens: PillarLattice | None = None
+        self._lens: PillarArray | None = None
 
     def watched(self, plan: MaskPlan) -> MaskPlan:
         """``plan``, whose first lattice tells when blocks of its rows are taken."""
@@ -32,7 +32,7 @@ class RowProgress:
             self.end = end
             return lens.source(first, end)
 
-        lattice: PillarLattice = dataclasses.replace(lens, source=source)
+        lattice: PillarArray = dataclasses.replace(lens, source=source)
         return plan.replace(lattices=(lattice, *plan.lattices[1:]))
 
     def unwatched(self, plan: MaskPlan) -> MaskPlan:

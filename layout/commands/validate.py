@@ -4,16 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from layout.formats import (
-    CellContent,
-    MaskContent,
-    gdsii_read,
-    hierarchy,
-    map_bytes,
-    oasis_read,
-)
+from layout.formats import gdsii_read, oasis_read
 from layout.formats import gdsii_records as gdsii_bytes
 from layout.formats import oasis_records as oasis_bytes
+from layout.formats.files import map_bytes
+from layout.formats.library import MaskCell, MaskLibrary
 from layout.formats.oasis_cursor import ByteCursor
 from layout.process import names
 from metalens.core.arrays import Array
@@ -40,7 +35,7 @@ class FormatFinding:
 
 
 def validate_mask(
-    path: str | Path, content: MaskContent | None = None
+    path: str | Path, content: MaskLibrary | None = None
 ) -> list[FormatFinding]:
     """All findings about a GDSII or OASIS file, told apart by its first bytes; an empty
     list is a clean file.
@@ -69,7 +64,7 @@ def _offset(error: MaskFileError) -> int:
     return int(words) if words.isdigit() else -1
 
 
-def _any(content: MaskContent) -> Iterator[FormatFinding]:
+def _any(content: MaskLibrary) -> Iterator[FormatFinding]:
     """What holds for both formats."""
     if len(content.tops) != 1:
         yield FormatFinding(
@@ -89,12 +84,12 @@ def _any(content: MaskContent) -> Iterator[FormatFinding]:
                 )
         yield from _shapes(cell)
     try:
-        hierarchy.topological_order(content)
+        content.topological_order()
     except MaskFileError as error:
         yield FormatFinding(-1, str(error))
 
 
-def _shapes(cell: CellContent) -> Iterator[FormatFinding]:
+def _shapes(cell: MaskCell) -> Iterator[FormatFinding]:
     for layer, polygons in cell.polygons.items():
         for points in polygons:
             if len({(int(x), int(y)) for x, y in points}) != len(points):
@@ -109,7 +104,7 @@ def _shapes(cell: CellContent) -> Iterator[FormatFinding]:
             )
 
 
-def _gdsii(content: MaskContent, data: Array) -> Iterator[FormatFinding]:
+def _gdsii(content: MaskLibrary, data: Array) -> Iterator[FormatFinding]:
     if len(data) % 2:
         yield FormatFinding(len(data), f"{len(data)} bytes, need an even number")
     for cell in content.cells.values():

@@ -7,9 +7,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from layout.commands.check import read_mask
-from layout.formats import MaskContent, doses, flatten, hierarchy, placement_limit
-from layout.process import LayerNumber
+from layout.formats import handover
+from layout.formats.files import placement_limit
+from layout.formats.library import MaskLibrary, PolygonStack, equal_shapes
+from layout.formats.reading import read_mask
+from layout.process.process import LayerNumber
 from layout.shapes import polygon
 from metalens.commands import MASKS
 from metalens.core.errors import MaskFileError
@@ -33,10 +35,10 @@ def mask_panels(path: Path) -> list[Panel]:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
     most = placement_limit(found)
     content = read_mask(found, most)
-    hierarchy.refuse_beyond(content, most)
+    content.refuse_beyond(most)
     table = found.with_name("doses.csv")
-    dose = doses.read_dose_table(table) if table.is_file() else {}
-    groups = flatten.equal_shapes(content, lambda shape: (shape.cell, shape.layer))
+    dose = handover.read_dose_table(table) if table.is_file() else {}
+    groups = equal_shapes(content, lambda shape: (shape.cell, shape.layer))
     outlines = [_outline(content, group, dose) for group in groups.values()]
     if not outlines:
         raise MaskFileError(f"{found} holds no shape to be shown")
@@ -51,13 +53,11 @@ def mask_panels(path: Path) -> list[Panel]:
 
 
 def _outline(
-    content: MaskContent,
-    group: list[flatten.PolygonCopies],
-    dose: dict[LayerNumber, float],
+    content: MaskLibrary, group: list[PolygonStack], dose: dict[LayerNumber, float]
 ) -> OutlinePanel:
     """Copies of one polygon."""
     shape = group[0]
-    size = np.ptp(shape.outline, axis=0) * content.unit_nm
+    size = np.ptp(shape.outlines[0], axis=0) * content.unit_nm
     number = "/".join(map(str, shape.layer))
     notes = {
         "layer": number,
@@ -70,26 +70,22 @@ def _outline(
     places = np.concatenate(
         [np.column_stack([some.x, some.y]) for some in group]
     ).astype(np.int32)
-    return OutlinePanel(_name(content, shape.layer), shape.outline, places, notes)
+    return OutlinePanel(_name(content, shape.layer), shape.outlines[0], places, notes)
 
 
-def _name(content: MaskContent, layer: LayerNumber) -> str:
+def _name(content: MaskLibrary, layer: LayerNumber) -> str:
     """One switch for all doses of a layer."""
     name = content.layer_names.get(layer, "").partition("_dose_")[0]
     return f"{layer[0]} {name.replace('_', ' ')}".strip()
 
 
 def _layers(
-    content: MaskContent, outlines: list[OutlinePanel], dose: dict[LayerNumber, float]
+    content: MaskLibrary, outlines: list[OutlinePanel], dose: dict[LayerNumber, float]
 ) -> TablePanel:
     """Shapes, area and dose of each (layer, datatype)."""
     rows = []
     for layer in sorted(
-        {
-            layer
-            for cell in content.cells.values()
-            for layer in (*cell.polygons, *cell.circles)
-        }
+        {layer for cell in content.cells.values() for layer in cell.layers}
     ):
         number = "/".join(map(str, layer))
         some = [o for o in outlines if o.notes["layer"] == number]

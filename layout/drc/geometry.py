@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from layout.shapes import convex
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError

@@ -4,8 +4,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from layout.drc.report import DrcReport, Violation
-from layout.formats import MaskAssembly
-from layout.mask import MaskPlan
+from layout.formats.library import MaskLibrary
+from layout.mask.plan import MaskPlan
 from metalens.core import store
 
 _COLOURS = (
@@ -22,7 +22,7 @@ _FRAMES = ("aperture", "outline", "fields")
 _HOLLOW, _DOTTED = "I1", "I9"  # KLayout's stipple patterns
 
 
-def write_lyp(plan: MaskPlan | MaskAssembly, path: str | Path) -> None:
+def write_lyp(plan: MaskPlan | MaskLibrary, path: str | Path) -> None:
     """Write layer properties: a name and a colour for each layer that ``plan`` uses."""
     root = ElementTree.Element("layer-properties")
     for n, (layer, datatype) in enumerate(sorted(plan.layers)):

@@ -18,13 +18,21 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.report import MAX_LISTED, DrcReport, Violation
-from layout.mask import EXPOSED, UNDRAWN, MaskPlan, PillarClass, PillarLattice, tone
-from layout.process import DesignRules, KeepOutZone, compile_loop
+from layout.mask import tone
+from layout.mask.plan import (
+    BLOCK_SITES,
+    EXPOSED,
+    UNDRAWN,
+    MaskPlan,
+    PillarArray,
+    PillarClass,
+)
+from layout.process.jit import compile_loop
+from layout.process.process import DesignRules, KeepOutZone
 from layout.shapes import region
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-SITES_PER_BLOCK = 1 << 21  # sites of a lattice held in memory at once
 MAX_OUTLINES = (
     1500  # distinct outlines of a lattice: the table of pairs grows as their square
 )
@@ -81,7 +89,7 @@ class _LatticeCheck:
     """
 
     plan: MaskPlan
-    lattice: PillarLattice
+    lattice: PillarArray
     rules: DesignRules
     counts: Array
     report: DrcReport
@@ -310,7 +318,7 @@ class _LatticeCheck:
 
     def _sites_of(self, class_number: int) -> Iterator[tuple[int, int]]:
         """(x, y) of all sites of a class."""
-        for top, block in self.lattice.blocks(_rows_per_block(self.lattice)):
+        for top, block in self.lattice.blocks():
             for row, column in np.argwhere(block == class_number).tolist():
                 yield self._place(top + row, column)
 
@@ -326,9 +334,8 @@ class _LatticeCheck:
         """
         above = int(vectors[:, 1].max())
         repeated = None
-        for top, block in self.lattice.blocks(
-            max(above, _rows_per_block(self.lattice))
-        ):
+        rows = max(above, BLOCK_SITES // self.lattice.columns, 1)
+        for top, block in self.lattice.blocks(rows):
             whole = block if repeated is None else np.concatenate([repeated, block])
             new = len(whole) - len(block)
             yield whole, new, top - new
@@ -361,7 +368,7 @@ def _distinct_outlines(
     return outlines, kind
 
 
-def lattice_vectors(lattice: PillarLattice, reach: float) -> Array:
+def lattice_vectors(lattice: PillarArray, reach: float) -> Array:
     """(m, 2) columns to the right and rows up to all sites nearer than ``reach``, one
     of each opposite pair.
 
@@ -432,7 +439,7 @@ def locate_pairs(
 
 
 def _check_density(
-    plan: MaskPlan, lattice: PillarLattice, rules: DesignRules, report: DrcReport
+    plan: MaskPlan, lattice: PillarArray, rules: DesignRules, report: DrcReport
 ) -> Array:
     """Sites of each class number; windows denser than the rule are entered into the
     report.
@@ -444,7 +451,7 @@ def _check_density(
     tiles = math.ceil(lattice.rows / down) + 1, math.ceil(lattice.columns / across) + 1
     area = np.array([0.0, *(shape.twice_area / 2 for shape in plan.classes)])
     counts, covered = np.zeros(len(area), np.int64), np.zeros(tiles)
-    for top, block in lattice.blocks(_rows_per_block(lattice)):
+    for top, block in lattice.blocks():
         add_coverage(block, top, area, (down, across), counts, covered)
     report.shapes += int(counts[1:].sum())
     windows = covered[:-1, :-1] + covered[1:, :-1] + covered[:-1, 1:] + covered[1:, 1:]
@@ -507,10 +514,6 @@ def add_coverage(
             number = block[row, column]
             counts[number] += 1
             covered[tile_row, column // tile[1]] += area[number]
-
-
-def _rows_per_block(lattice: PillarLattice) -> int:
-    return max(1, SITES_PER_BLOCK // lattice.columns)
 
 
 # figures, grid, zones
@@ -618,7 +621,7 @@ def _report_off_grid(
 
 
 def _check_zone(
-    plan: MaskPlan, lattice: PillarLattice, zone: KeepOutZone, report: DrcReport
+    plan: MaskPlan, lattice: PillarArray, zone: KeepOutZone, report: DrcReport
 ) -> None:
     """Pillars that share area with an exclusion zone."""
     scale = 1e3 / plan.unit_nm
@@ -649,7 +652,7 @@ def _check_zone(
 
 
 def _sites_near(
-    plan: MaskPlan, lattice: PillarLattice, box: tuple[float, float, float, float]
+    plan: MaskPlan, lattice: PillarArray, box: tuple[float, float, float, float]
 ) -> Iterator[tuple[int, Array]]:
     """(class number, (n, 2) places) of the pillars that can reach into a box."""
     reach = max(int(np.abs(shape.outline).max()) for shape in plan.classes)

@@ -21,8 +21,8 @@ from layout.drc.geometry import (
     measure_separation,
 )
 from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
-from layout.formats import QUARTERS, MaskContent, Orientation, flatten, hierarchy
-from layout.process import DesignRules, LayerNumber
+from layout.formats.library import QUARTERS, MaskLibrary, Orientation, group_equal
+from layout.process.process import DesignRules, LayerNumber
 from layout.shapes import region
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
@@ -35,7 +35,7 @@ LayerChoice = tuple[int, int | None]  # layer number; datatype, None: all togeth
 
 
 def check_library(
-    content: MaskContent,
+    content: MaskLibrary,
     rules: DesignRules,
     *,
     layers: Collection[LayerChoice] | None = None,
@@ -79,7 +79,7 @@ def check_library(
             "the mask has no top cell: its cells reference each other in a circle"
         )
     report = DrcReport.empty(content.unit_nm, rules)
-    shapes = hierarchy.count_shapes(content)
+    shapes = content.count_shapes()
     if layers is None:
         layers = [(number, None) for number in sorted({number for number, _ in shapes})]
     groups = [_select_layers(choice, shapes) for choice in layers]
@@ -155,7 +155,7 @@ class _LayerCheck:
 
     def __init__(
         self,
-        content: MaskContent,
+        content: MaskLibrary,
         layers: set[LayerNumber],
         rules: DesignRules,
         metric: Metric,
@@ -203,54 +203,27 @@ class _LayerCheck:
         """Distinct polygons of a cell from their lowest corners, and (n, 2) places of
         each.
         """
-        held = self.content.cells[cell]
-        drawn = [
-            p
-            for layer, some in held.polygons.items()
-            if layer in self.layers
-            for p in some
-        ]
-        circles = [
-            c
-            for layer, some in held.circles.items()
-            if layer in self.layers
-            for c in some
-        ]
-        drawn += [flatten.circle_polygon(*c) for c in circles]
-        by_corners: dict[int, list[Array]] = {}
-        for points in drawn:
-            by_corners.setdefault(len(points), []).append(points)
+        every = self.content.cells[cell].drawn().items()
+        drawn = [p for layer, some in every if layer in self.layers for p in some]
         found = []
-        for same in by_corners.values():
-            points = np.stack(same).astype(np.int64)
+        for _, same in group_equal(np.array([len(points) for points in drawn], int)):
+            points = np.stack([drawn[n] for n in same.tolist()]).astype(np.int64)
             places = points.min(1)
             outlines = (points - places[:, None]).reshape(len(points), -1)
             distinct, which = np.unique(outlines, axis=0, return_inverse=True)
-            order = np.argsort(which.ravel(), kind="stable")
-            starts = np.cumsum(np.bincount(which.ravel()))[:-1]
-            for outline, members in zip(distinct, np.split(order, starts), strict=True):
-                found.append((outline.reshape(-1, 2), places[members]))
+            for number, members in group_equal(which.ravel()):
+                found.append((distinct[number].reshape(-1, 2), places[members]))
         return found
 
     def _references(self, cell: str) -> list[tuple[str, Orientation, Array]]:
         """(referenced cell, orientation, (n, 2) places) of all references that draw on
         the layer.
         """
-        placed = self.content.cells[cell].kept()
-        key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
-        found = []
-        for kind, members in _group(key):
-            child, turn = divmod(kind, len(placed.turns))
-            name = placed.children[child]
-            if self.bounding_box(name) is not None:
-                found.append(
-                    (
-                        name,
-                        placed.turns[turn],
-                        np.column_stack([placed.x[members], placed.y[members]]),
-                    )
-                )
-        return found
+        return [
+            (child, turn, np.column_stack([x, y]))
+            for child, turn, x, y in self.content.cells[cell].instances()
+            if self.bounding_box(child) is not None
+        ]
 
     def _bounding_box(self, cell: str) -> tuple[int, int, int, int] | None:
         """Box around all that a cell draws on the layer; None for nothing."""
@@ -315,7 +288,7 @@ class _LayerCheck:
         """References replaced by what their cells hold."""
         parts = []
         total = 0
-        for number, members in _group(placed.element):
+        for number, members in group_equal(placed.element):
             element = self.elements[number]
             contents = self._contents(element.cell, element.turn or UPRIGHT)
             places = placed.xy[members]
@@ -389,7 +362,7 @@ class _LayerCheck:
         """Widths and notches of isolated polygons, and the findings of isolated
         references.
         """
-        for number, members in _group(placed.element):
+        for number, members in group_equal(placed.element):
             element, places = self.elements[number], placed.xy[members]
             if element.turn is None:
                 report.shapes += len(members)
@@ -477,7 +450,7 @@ class _LayerCheck:
         if (distance == 0).any():
             placed = self._merge_touching(cell, placed, pairs[distance == 0])
             pairs, distance, projected = self._close_pairs(placed)
-        for number, members in _group(placed.element):
+        for number, members in group_equal(placed.element):
             self._check_polygon(number, placed.xy[members], report)
         unit, limit = self.content.unit_nm, report.limits["space"]
         rounded = np.array([element.rounded for element in self.elements], bool)[
@@ -557,7 +530,7 @@ class _LayerCheck:
         }
         for name in self.content.tops:
             instances[name][UPRIGHT, 0.0, 0.0] = [1, 0, 0]
-        for name in hierarchy.topological_order(self.content):
+        for name in self.content.topological_order():
             for (turn, *phase), (times, x, y) in instances[name].items():
                 for child, own, places in self.references(name):
                     xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
@@ -608,15 +581,6 @@ class _LayerCheck:
                 worst=0.0,
                 examples=shown,
             )
-
-
-def _group(numbers: Array) -> Iterator[tuple[int, Array]]:
-    """Each distinct number, and the indices where it stands."""
-    order = np.argsort(numbers, kind="stable")
-    distinct, starts = np.unique(numbers[order], return_index=True)
-    if len(distinct):
-        parts = np.split(order, starts[1:])
-        yield from zip(distinct.tolist(), parts, strict=True)
 
 
 def _merged_contours(polygons: Sequence[Array]) -> tuple[Array, ...]:

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import Any
 
 from layout.drc.geometry import SHARPEST_CORNER
-from layout.process import DesignRules, LayerNumber
+from layout.process.process import DesignRules, LayerNumber
 
 MAX_LISTED = 500  # violations of one rule with their places
 RULES = (

@@ -1,5 +1,1 @@
-"""Mask files: the mask in memory, one reader and one writer a format, comparison."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Mask files: cells in memory, one reader and one writer a format, comparison."""

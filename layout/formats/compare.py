@@ -1,16 +1,20 @@
-"""Comparison of a file that is read back: cells, shapes, every copy at its place."""
+"""Comparison of a file that is read back: cells, shapes, every instance at its place."""
 
-from collections.abc import Iterator
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.formats import flatten
-from layout.formats.assembly import MaskAssembly, library_of
-from layout.formats.content import QUARTERS, CellContent, MaskContent, Orientation
 from layout.formats.digest import RunningDigest
-from layout.formats.hierarchy import drawn_counts
-from layout.mask import MaskPlan
+from layout.formats.library import (
+    QUARTERS,
+    MaskCell,
+    MaskLibrary,
+    Orientation,
+    library_of,
+)
+from layout.mask.plan import MaskPlan
+from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -35,27 +39,23 @@ class ReadbackComparison:
         return not self.differences
 
 
-def compare(plan: MaskPlan, content: MaskContent) -> ReadbackComparison:
-    """Whether a file holds exactly the plan, stored whole or as an eighth.
+def compare(plan: MaskPlan, content: MaskLibrary) -> ReadbackComparison:
+    """Whether a file holds exactly a plan.
 
     Args:
         plan: that was written.
         content: of the file; of cells with many placements the sums are enough.
     """
-    library = library_of(plan, fold=True)
-    if library.cells.keys() != content.cells.keys():
-        library = library_of(plan)
-    found = mask_differences(library, content)
+    found = mask_differences(library_of(plan), content)
     try:
-        times = drawn_counts(content)
+        times = content.drawn_counts()
     except MaskFileError as error:
         return ReadbackComparison(0, (*found, str(error)))
-    return ReadbackComparison(
-        sum(times.get(c.name, 0) for c in plan.classes), tuple(found)
-    )
+    pillars = sum(times.get(c.name, 0) for c in plan.classes)
+    return ReadbackComparison(pillars, tuple(found))
 
 
-def mask_differences(library: MaskAssembly, content: MaskContent) -> list[str]:
+def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
     """What a file does not hold as it was planned, in words; empty where it holds all.
 
     Circles count as the polygons of 64 corners that GDSII has in their place.
@@ -64,29 +64,28 @@ def mask_differences(library: MaskAssembly, content: MaskContent) -> list[str]:
         library: that was written.
         content: of the file.
     """
-    return list(_differences(library, content))
-
-
-def _differences(library: MaskAssembly, content: MaskContent) -> Iterator[str]:
+    found = []
     if abs(content.unit_nm / library.unit_nm - 1) > 1e-12:
-        yield f"database unit {content.unit_nm} nm, planned {library.unit_nm}"
+        found.append(f"database unit {content.unit_nm} nm, planned {library.unit_nm}")
     missing = sorted(library.cells.keys() - content.cells.keys())
     strange = sorted(content.cells.keys() - library.cells.keys())
     if missing or strange:
         names = ", ".join([*missing, *strange][:5])
-        yield f"{len(missing)} cells are missing, {len(strange)} too many: {names}"
-        return
+        return [
+            *found,
+            f"{len(missing)} cells are missing, {len(strange)} too many: {names}",
+        ]
     for name, cell in library.cells.items():
         read = content.cells[name]
         if _shapes(cell) != _shapes(read):
-            yield f"cell {name}: shapes differ"
+            found.append(f"cell {name}: shapes differ")
         merged = read.sums is not None
-        planned = _sums(library, cell, merged=merged)
-        there = _sums(None, read, merged=merged)
+        planned, there = _sums(cell, merged=merged), _sums(read, merged=merged)
         for who in sorted(planned.keys() | there.keys(), key=str):
-            wanted, found = planned.get(who, (0,) * 5), there.get(who, (0,) * 5)
-            if wanted != found:
-                yield f"cell {name}: {who[0]}: {_difference(wanted, found)}"
+            wanted, got = planned.get(who, (0,) * 5), there.get(who, (0,) * 5)
+            if wanted != got:
+                found.append(f"cell {name}: {who[0]}: {_difference(wanted, got)}")
+    return found
 
 
 def _difference(planned: Sum, found: Sum) -> str:
@@ -102,21 +101,14 @@ def _difference(planned: Sum, found: Sum) -> str:
     return f"{n} copies, not all at their places"
 
 
-def _shapes(cell: CellContent) -> list[tuple[tuple[int, int], list[tuple[int, ...]]]]:
+def _shapes(cell: MaskCell) -> list[tuple[LayerNumber, list[tuple[int, ...]]]]:
     """Polygons by layer in a form that does not depend on their order."""
-    every = {layer: list(shapes) for layer, shapes in cell.polygons.items()}
-    for layer, circles in cell.circles.items():
-        every.setdefault(layer, []).extend(
-            flatten.circle_polygon(*one) for one in circles
-        )
-    return [
-        (layer, sorted(_canonical(points) for points in every[layer]))
-        for layer in sorted(every)
-        if every[layer]
-    ]
+    drawn = cell.drawn().items()
+    every = {layer: sorted(map(canonical_corners, some)) for layer, some in drawn}
+    return sorted((layer, some) for layer, some in every.items() if some)
 
 
-def _canonical(points: Array) -> tuple[int, ...]:
+def canonical_corners(points: Array) -> tuple[int, ...]:
     """Corners from the smallest on, counter-clockwise."""
     p = np.asarray(points, np.int64)
     after = np.roll(p, -1, axis=0)
@@ -126,13 +118,10 @@ def _canonical(points: Array) -> tuple[int, ...]:
     return tuple(np.roll(p, -first, axis=0).ravel().tolist())
 
 
-def _sums(
-    library: MaskAssembly | None, cell: CellContent, *, merged: bool
-) -> dict[Who, Sum]:
-    """Sums over the copies of each child and orientation.
+def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
+    """Sums over the instances of each child and orientation.
 
     Args:
-        library: with arrays of copies and pillars of the cell; None: it has none.
         cell: with placements.
         merged: all orientations together, as a reader sums them.
     """
@@ -140,7 +129,7 @@ def _sums(
         every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
         return {(child, None): tuple(sums) for child, *sums in every}
     digests: dict[Who, RunningDigest] = {}
-    for child, turn, places in _copies(library, cell):
+    for child, turn, *places in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)
         digest = digests.setdefault((child, None if merged else who), RunningDigest())
         zeros = np.zeros(len(places[0]), np.int64)
@@ -152,29 +141,10 @@ def _sums(
         who: tuple(int(value[0]) for value in digest.of(zero))
         for who, digest in digests.items()
     }
-    if library is not None and cell.name in library.sites:
+    if cell.pillars is not None:
         key = None if merged else QUARTERS[0]
-        of_pillars = library.sites[cell.name].sums()
-        sums |= {(child, key): value for child, value in of_pillars.items()}
+        sums |= {(child, key): v for child, v in cell.pillars.sums().items()}
     return sums
-
-
-def _copies(
-    library: MaskAssembly | None, cell: CellContent
-) -> Iterator[tuple[str, Orientation, tuple[Array, Array]]]:
-    """(child, orientation, places) of all copies in a cell but its pillar arrays."""
-    placed = cell.kept()
-    key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
-    order = np.argsort(key, kind="stable")
-    kinds, starts = np.unique(key[order], return_index=True)
-    if len(kinds):
-        groups = np.split(order, starts[1:])
-        for kind, members in zip(kinds.tolist(), groups, strict=True):
-            child, turn = divmod(kind, len(placed.turns))
-            places = placed.x[members], placed.y[members]
-            yield placed.children[child], placed.turns[turn], places
-    for one in () if library is None else library.copies.get(cell.name, ()):
-        yield one.child, one.turn, one.places()
 
 
 def _rounded(turn: Orientation) -> Orientation:

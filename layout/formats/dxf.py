@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask import MaskPlan, PillarLattice
+from layout.formats.compare import canonical_corners
+from layout.mask.plan import MaskPlan, PillarArray
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError, ProcessError
@@ -97,11 +98,15 @@ def dxf_differences(
     )
     scale = plan.unit_nm * 1e-3
     read = Counter(
-        (line.dxf.layer, _key(np.rint(np.array(line.get_points("xy")) / scale)))
+        (
+            line.dxf.layer,
+            canonical_corners(np.rint(np.array(line.get_points("xy")) / scale)),
+        )
         for line in drawing.modelspace().query("LWPOLYLINE")
     )
     planned = Counter(
-        (name, _key(points)) for name, points in _drawn(plan, _sites(plan, window))
+        (name, canonical_corners(points))
+        for name, points in _drawn(plan, _sites(plan, window))
     )
     for text, unlike in (("missing", planned - read), ("not planned", read - planned)):
         for layer, number in sorted(
@@ -143,7 +148,7 @@ def _sites(plan: MaskPlan, window: DxfWindow) -> list[tuple[int, int, int]]:
 
 
 def sites_in(
-    plan: MaskPlan, lattice: PillarLattice, window: DxfWindow
+    plan: MaskPlan, lattice: PillarArray, window: DxfWindow
 ) -> Iterator[tuple[int, int, int]]:
     """(class, x, y) of the pillars whose site lies in the window, database units."""
     scale = 1e3 / plan.unit_nm
@@ -202,15 +207,3 @@ def _names(plan: MaskPlan) -> dict[tuple[int, int], str]:
             name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
         )
     return found
-
-
-def _key(points: Array) -> tuple[tuple[int, int], ...]:
-    """Corners from the smallest on, counter-clockwise."""
-    p = [(int(x), int(y)) for x, y in points]
-    if (
-        sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(p, p[1:] + p[:1], strict=True))
-        < 0
-    ):
-        p.reverse()
-    first = p.index(min(p))
-    return tuple(p[first:] + p[:first])

@@ -10,21 +10,23 @@ import numpy as np
 
 from layout.formats import gdsii_records as gds
 from layout.formats import paths
-from layout.formats.content import (
+from layout.formats.digest import PlacementDigest
+from layout.formats.files import (
     CONTEXT_CELL,
-    NOTHING,
-    QUARTERS,
-    CellContent,
-    CellPlacements,
-    MaskContent,
-    Orientation,
     PlacementSums,
     decode_name,
     has_area,
     map_bytes,
     release_bytes,
 )
-from layout.formats.digest import PlacementDigest
+from layout.formats.library import (
+    NOTHING,
+    QUARTERS,
+    CellPlacements,
+    MaskCell,
+    MaskLibrary,
+    Orientation,
+)
 from layout.formats.read_loops import FARTHEST, sref_run
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
@@ -75,7 +77,7 @@ class _Batch:
 
 def read_gdsii(
     path: str | Path, *, limit: int = LIMIT, keep: int | None = None
-) -> MaskContent:
+) -> MaskLibrary:
     """Read a GDSII file.
 
     Args:
@@ -94,7 +96,7 @@ def read_gdsii(
 
 def parse_gdsii(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
-) -> MaskContent:
+) -> MaskLibrary:
     """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
     in errors.
     """
@@ -147,7 +149,7 @@ class _Reader:
         self.at += length
         return kind, self.data[self.begin + 4 : self.at].tobytes()
 
-    def library(self) -> MaskContent:
+    def library(self) -> MaskLibrary:
         self.next(gds.HEADER)
         self.next(gds.BGNLIB)
         while self.next()[0] != gds.LIBNAME:
@@ -161,7 +163,7 @@ class _Reader:
         user, meters = gds.to_float(data[:8]), gds.to_float(data[8:])
         if not (1e-15 < meters < 1 and user > 0):
             raise self.fail(f"database unit of {meters} m")
-        cells: dict[str, CellContent] = {}
+        cells: dict[str, MaskCell] = {}
         while self.next(gds.BGNSTR, gds.ENDLIB)[0] == gds.BGNSTR:
             cell = self.structure()
             if cell.name in cells:
@@ -170,7 +172,7 @@ class _Reader:
         if self.data[self.at :].any():
             raise self.fail("data after ENDLIB", self.at)
         cells.pop(CONTEXT_CELL, None)
-        return MaskContent("GDSII", meters * 1e9, cells)
+        return MaskLibrary("", cells, meters * 1e9, kind="GDSII")
 
     def name(self, data: bytes) -> str:
         text = decode_name(data)
@@ -178,7 +180,7 @@ class _Reader:
             raise self.fail("a structure or reference without a name")
         return text
 
-    def structure(self) -> CellContent:
+    def structure(self) -> MaskCell:
         name = self.name(self.next(gds.STRNAME)[1])
         batch, skipped = _Batch(PlacementSums(self.keep)), Counter[str]()
         polygons: dict[tuple[int, int], list[Array]] = {}
@@ -187,7 +189,7 @@ class _Reader:
             kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
             if kind == gds.ENDSTR:
                 texts = skipped.pop(gds.NAMES[gds.TEXT], 0)
-                return CellContent(
+                return MaskCell(
                     name, polygons, {}, batch.placed(), texts, batch.sums(), skipped
                 )
             if kind in (gds.SREF, gds.AREF):

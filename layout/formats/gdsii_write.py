@@ -13,12 +13,20 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from layout.formats import flatten
 from layout.formats import gdsii_records as gds
-from layout.formats.assembly import CellCopies, MaskAssembly, PillarSites, library_of
-from layout.formats.content import QUARTERS, CellContent, CellPlacements, Orientation
-from layout.mask import MaskPlan, PillarLattice
-from layout.process import LayerNumber, compile_loop
+from layout.formats.library import (
+    QUARTERS,
+    CellPlacements,
+    CellReference,
+    MaskLibrary,
+    Orientation,
+    PillarSites,
+    group_equal,
+    library_of,
+)
+from layout.mask.plan import MaskPlan, PillarArray
+from layout.process.jit import compile_loop
+from layout.process.process import LayerNumber
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -31,7 +39,7 @@ REFERENCE_BYTES = 28  # of each pillar: a reference to a cell of a four-letter n
 MAX_NUMBER = 32767  # layers, columns and rows are signed 16-bit
 
 
-def write_gdsii(mask: MaskPlan | MaskAssembly, path: str | Path) -> None:
+def write_gdsii(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     """Write a mask as GDSII; the file appears whole or not at all.
 
     Args:
@@ -79,29 +87,24 @@ def _write_all(file: BinaryIO, piece: bytes | memoryview) -> None:
         view = view[file.write(view) :]
 
 
-def _pieces(library: MaskAssembly) -> Iterator[bytes | memoryview]:
+def _pieces(library: MaskLibrary) -> Iterator[bytes | memoryview]:
     yield gds.library_head(library.name, library.unit_nm)
     for name, cell in library.cells.items():
         head = gds.integer_record(gds.BGNSTR, *gds.TIMES) + gds.text_record(
             gds.STRNAME, name
         )
         shapes = [
-            boundary_element(layer, polygon) for layer, polygon in _polygons(cell)
+            boundary_element(layer, points)
+            for layer, polygons in cell.drawn().items()
+            for points in polygons
         ]
-        copies = [_copies(one) for one in library.copies.get(name, ())]
+        copies = [_copies(one) for one in cell.references]
         yield b"".join([head, *shapes, *copies])
         yield from _placements(cell.kept())
-        if name in library.sites:
-            yield from _pillars(library.sites[name])
+        if cell.pillars is not None:
+            yield from _pillars(cell.pillars)
         yield gds.gdsii_record(gds.ENDSTR)
     yield gds.gdsii_record(gds.ENDLIB)
-
-
-def _polygons(cell: CellContent) -> Iterator[tuple[LayerNumber, Array]]:
-    for layer, polygons in cell.polygons.items():
-        yield from ((layer, points) for points in polygons)
-    for layer, circles in cell.circles.items():
-        yield from ((layer, flatten.circle_polygon(*circle)) for circle in circles)
 
 
 def boundary_element(layer: LayerNumber, polygon: Array) -> bytes:
@@ -145,7 +148,7 @@ def _head(name: str, turn: Orientation = QUARTERS[0], *, array: bool = False) ->
     return head
 
 
-def _copies(one: CellCopies) -> bytes:
+def _copies(one: CellReference) -> bytes:
     """A reference, or an array of them."""
     if one.count == 1:
         place = gds.xy_record(np.array([[one.x, one.y]]))
@@ -172,12 +175,8 @@ def _copies(one: CellCopies) -> bytes:
 
 def _placements(placed: CellPlacements) -> Iterator[bytes]:
     """All placements, those of one cell and orientation together."""
-    key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
-    order = np.argsort(key, kind="stable")
-    kinds, starts = np.unique(key[order], return_index=True)
-    groups = np.split(order, starts[1:]) if len(kinds) else []
     tail = np.frombuffer(gds.gdsii_record(gds.ENDEL), np.uint8)
-    for kind, members in zip(kinds.tolist(), groups, strict=True):
+    for kind, members in group_equal(placed.kinds()):
         child, turn = divmod(kind, len(placed.turns))
         start = _head(placed.children[child], placed.turns[turn])
         head = np.frombuffer(start + gds.xy_record(np.zeros((1, 2))), np.uint8)
@@ -197,9 +196,7 @@ def _pillars(some: PillarSites) -> Iterator[memoryview]:
         yield from _references(children, some.numbered(numbers))
 
 
-def _references(
-    children: Sequence[str], lattice: PillarLattice
-) -> Iterator[memoryview]:
+def _references(children: Sequence[str], lattice: PillarArray) -> Iterator[memoryview]:
     """References of a lattice to cells, in two buffers filled in turn."""
     made = [
         _head(name) + gds.xy_record(np.zeros((1, 2))) + gds.gdsii_record(gds.ENDEL)
@@ -211,7 +208,7 @@ def _references(
     buffers = np.empty((2, _BLOCK // (size * dtype.itemsize), size), dtype)
     turn = 0
     xs = _words(lattice.x0 + lattice.pitch * np.arange(lattice.columns), dtype)
-    for first, block in lattice.blocks(max(1, (1 << 20) // max(lattice.columns, 1))):
+    for first, block in lattice.blocks():
         rows = np.arange(first, first + len(block))
         ys = _words(lattice.y0 - lattice.down * rows, dtype)
         row, column = 0, 0

@@ -15,10 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.mask import FieldPlan, MaskPlan
-from layout.process import LayerNumber, Process
+from layout.formats.library import MaskLibrary, library_of
+from layout.mask.fields import FieldPlan
+from layout.mask.plan import MaskPlan
+from layout.process.process import LayerNumber, Process
 from layout.shapes import polygon, region
-from metalens.core import store
+from metalens.core import reading, store
+from metalens.core.errors import MaskFileError
 from metalens.core.units import nm
 
 FIELD_HEAD = ("sequence", "x_um", "y_um", "width_um", "height_um", "pillars")
@@ -63,19 +66,6 @@ def write_fields(split: FieldPlan, path: str | Path) -> None:
         sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
         out.writerow([step.sequence, *(f"{v:.4f}" for v in sizes), step.pillars])
     store.write_text(path, text.getvalue())
-
-
-def areas_um2(plan: MaskPlan) -> dict[LayerNumber, float]:
-    """{layer: area of all that is written on it}."""
-    unit, found = (plan.unit_nm * nm) ** 2, dict.fromkeys(plan.doses, 0.0)
-    for made, count in zip(plan.classes, plan.counts()[1:].tolist(), strict=True):
-        each = sum(abs(polygon.twice_area(shape)) / 2 for shape in made.polygons)
-        found[made.layer] = found.get(made.layer, 0.0) + count * each * unit
-    for figure in plan.figures:
-        for layer, shapes in figure.polygons.items():
-            total = sum(abs(polygon.twice_area(shape)) / 2 for shape in shapes)
-            found[layer] = found.get(layer, 0.0) + total * unit
-    return found
 
 
 def charge_uC(
@@ -179,7 +169,7 @@ def _lines(
     yield f"  top cell {plan.name}, {plan.unit_nm:g} nm; coordinates in um below: lens axis at (0, 0), +y up"
     yield ""
     yield f"Writer {_OPEN}   resist {_OPEN}   base dose {process.exposure.base_uC_cm2:g} uC/cm2"
-    areas = areas_um2(plan)
+    areas = library_of(plan).areas_um2()
     yield from charge_lines(charge_uC(areas, plan.doses, process))
     yield ""
     yield from dose_lines(areas, plan.doses, plan.layer_names, process)
@@ -203,3 +193,74 @@ def _lines(
             f"  bars that meet n to the left of the middle one (downwards for y): the aperture lies n x "
             f"{die.vernier_step_nm:g} nm to the right of the pillars (above them)"
         )
+
+
+# doses
+
+DOSE_HEAD = ("layer", "datatype", "relative_dose", "dose_uC_cm2", "step", "name")
+
+
+DosedMask = MaskPlan | MaskLibrary
+
+
+def write_dose_table(plan: DosedMask, process: Process, path: str | Path) -> None:
+    """Write the table, one line for each (layer, datatype) that is exposed, rising."""
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(DOSE_HEAD)
+    for layer, dose in sorted(plan.doses.items()):
+        step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
+        name = plan.layer_names.get(layer, "")
+        out.writerow(
+            [
+                *layer,
+                f"{dose:.6f}",
+                f"{dose * process.exposure.base_uC_cm2:.3f}",
+                step,
+                name,
+            ]
+        )
+    store.write_text(path, text.getvalue())
+
+
+def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
+    """{(layer, datatype): relative dose} of a table.
+
+    Raises:
+        MaskFileError: missing file, missing columns, a line that is no dose or comes
+            twice (line named).
+    """
+    path = Path(path)
+    try:
+        rows = list(csv.DictReader(reading.read_text(path).splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MaskFileError(
+            f"{path}: cannot be read as a dose table ({error})"
+        ) from None
+    found: dict[LayerNumber, float] = {}
+    for number, row in enumerate(rows, 2):
+        try:
+            layer, dose = (
+                (int(row["layer"]), int(row["datatype"])),
+                float(row["relative_dose"]),
+            )
+        except (KeyError, TypeError, ValueError):
+            raise MaskFileError(
+                f"{path}, line {number}: need columns {', '.join(DOSE_HEAD[:3])} of numbers"
+            ) from None
+        if layer in found or not 0 < dose < 1e6:
+            raise MaskFileError(
+                f"{path}, line {number}: layer {layer} with dose {dose}: twice, or no dose above 0"
+            )
+        found[layer] = dose
+    return found
+
+
+def layers_without_dose(
+    content: MaskLibrary, doses: Mapping[LayerNumber, float], process: Process
+) -> tuple[LayerNumber, ...]:
+    """Layers of a file that hold shapes to be exposed and have no dose; outline and
+    write fields are not exposed.
+    """
+    layers = process.layers
+    return tuple(sorted(content.layers - {layers.outline, layers.fields} - set(doses)))

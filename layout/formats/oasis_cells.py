@@ -12,14 +12,13 @@ import numpy as np
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_trapezoids as trapezoids
 from layout.formats import paths
-from layout.formats.content import (
+from layout.formats.files import PlacementSums, has_area
+from layout.formats.library import (
     NOTHING,
     QUARTERS,
-    CellContent,
     CellPlacements,
+    MaskCell,
     Orientation,
-    PlacementSums,
-    has_area,
 )
 from layout.formats.oasis_cursor import ByteCursor, RepetitionOffsets
 from layout.formats.read_loops import scan_placements
@@ -91,11 +90,11 @@ class OpenCell:
     texts: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
 
-    def close(self, name: str, table: dict[int, str]) -> CellContent:
+    def close(self, name: str, table: dict[int, str]) -> MaskCell:
         """The finished cell; KeyError names a reference number without a name."""
         digest = self.held.digest
         sums = None if digest is None else digest.of(digest.children)
-        return CellContent(
+        return MaskCell(
             name,
             self.polygons,
             self.circles,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.formats.content import decode_name
+from layout.formats.files import decode_name
 from layout.formats.read_loops import FARTHEST, sum_deltas
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError

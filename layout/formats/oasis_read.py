@@ -9,13 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from layout.formats import oasis_records as oasis
-from layout.formats.content import (
-    CONTEXT_CELL,
-    CellContent,
-    MaskContent,
-    PlacementSums,
-    map_bytes,
-)
+from layout.formats.files import CONTEXT_CELL, PlacementSums, map_bytes
+from layout.formats.library import MaskCell, MaskLibrary
 from layout.formats.oasis_cells import CellReader, Child, OpenCell, ReadBudget
 from layout.formats.oasis_cursor import ByteCursor
 from metalens.core.arrays import Array
@@ -33,7 +28,7 @@ _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 def read_oasis(
     path: str | Path, *, limit: int = LIMIT, keep: int | None = None
-) -> MaskContent:
+) -> MaskLibrary:
     """Read an OASIS file.
 
     Args:
@@ -53,7 +48,7 @@ def read_oasis(
 
 def parse_oasis(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
-) -> MaskContent:
+) -> MaskLibrary:
     """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
     in errors.
     """
@@ -72,7 +67,7 @@ class _Reader:
         self.layer_names: dict[tuple[int, int], str] = {}
         self.end_at: int | None = None
 
-    def whole_file(self) -> MaskContent:
+    def whole_file(self) -> MaskLibrary:
         """Everything, from the magic bytes to the checksum."""
         c = self.file
         if c.left < len(oasis.MAGIC) or c.take(len(oasis.MAGIC)) != oasis.MAGIC:
@@ -82,7 +77,8 @@ class _Reader:
         if self.end_at is None:
             raise c.fail("the file ends without END; it is cut")
         self._check_end(offsets_here)
-        return MaskContent("OASIS", unit_nm, self._contents(), self.layer_names)
+        cells, names = self._contents(), self.layer_names
+        return MaskLibrary("", cells, unit_nm, names, kind="OASIS")
 
     def _start(self) -> tuple[float, bool]:
         c = self.file
@@ -260,8 +256,8 @@ class _Reader:
                     f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged"
                 )
 
-    def _contents(self) -> dict[str, CellContent]:
-        made: dict[str, CellContent] = {}
+    def _contents(self) -> dict[str, MaskCell]:
+        made: dict[str, MaskCell] = {}
         for cell in self.cells:
             try:
                 name = cell.key if isinstance(cell.key, str) else self.names[cell.key]

@@ -5,7 +5,7 @@ looks back on, and a lens
 repeats itself from row to row. That halves the file against whole rows.
 """
 
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
 
 TILE_COLUMNS, TILE_ROWS = 96, 512

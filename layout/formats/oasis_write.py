@@ -17,10 +17,17 @@ import numpy as np
 
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_tiles as tiles
-from layout.formats.assembly import CellCopies, MaskAssembly, library_of
-from layout.formats.content import QUARTERS, CellContent, CellPlacements, Orientation
-from layout.mask import MaskPlan, PillarLattice
-from layout.process import LayerNumber
+from layout.formats.library import (
+    QUARTERS,
+    CellPlacements,
+    CellReference,
+    MaskCell,
+    MaskLibrary,
+    Orientation,
+    library_of,
+)
+from layout.mask.plan import MaskPlan, PillarArray
+from layout.process.process import LayerNumber
 from metalens.core import store
 from metalens.core.arrays import Array
 
@@ -31,20 +38,17 @@ _REPEATED = 8  # bit of a placement that says that a repetition follows
 _THREADS = 2
 
 
-def write_oasis(
-    mask: MaskPlan | MaskAssembly, path: str | Path, *, fold: bool = True
-) -> None:
+def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     """Write a mask as OASIS; the file appears whole or not at all.
 
     Args:
         mask: plan of a die, or cells.
         path: of the file.
-        fold: store a lens of a plan that is symmetric under the square as an eighth.
 
     Raises:
         OSError: the target cannot be written; what was there before stays.
     """
-    library = library_of(mask, fold=fold) if isinstance(mask, MaskPlan) else mask
+    library = library_of(mask) if isinstance(mask, MaskPlan) else mask
     number = {name: k for k, name in enumerate(library.cells)}
     head = oasis.start_record(library.unit_nm)
     layers = b"".join(
@@ -80,7 +84,7 @@ def layer_name(layer: LayerNumber, name: str) -> bytes:
     return bytes([oasis.LAYERNAME]) + oasis.oasis_string(name) + numbers
 
 
-def _cells(library: MaskAssembly, number: dict[str, int]) -> Iterator[bytes]:
+def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
     for name, cell in library.cells.items():
         yield bytes([oasis.CELL_REF]) + oasis.unsigned_integer(number[name])
         for layer, polygons in cell.polygons.items():
@@ -88,11 +92,10 @@ def _cells(library: MaskAssembly, number: dict[str, int]) -> Iterator[bytes]:
             yield oasis.compressed_block(shapes, _LEVEL)
         for layer, circles in cell.circles.items():
             yield b"".join(_circle(layer, *one) for one in circles)
-        copies = library.copies.get(name, ())
-        yield b"".join(_copies(one, number[one.child]) for one in copies)
+        yield b"".join(_copies(one, number[one.child]) for one in cell.references)
         yield from _placements(cell, number)
-        if name in library.sites:
-            yield from _pillars(library.sites[name].numbered(number))
+        if cell.pillars is not None:
+            yield from _pillars(cell.pillars.numbered(number))
 
 
 def polygon_element(layer: LayerNumber, points: Array) -> bytes:
@@ -125,7 +128,7 @@ def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
     return bytes([oasis.CIRCLE, 0b00111011]) + numbers + place
 
 
-def _copies(one: CellCopies, number: int) -> bytes:
+def _copies(one: CellReference, number: int) -> bytes:
     """A placement, repeated where it stands for an array."""
     repeated = one.count > 1
     placed = _placement(number, one.turn, one.x, one.y, repeated=repeated)
@@ -162,7 +165,7 @@ def _placement(
     return head + oasis.unsigned_integer(number) + size + place
 
 
-def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
+def _placements(cell: MaskCell, number: dict[str, int]) -> Iterator[bytes]:
     """Placements of a cell: those of quarter turns relative to each other."""
     placed = cell.kept()
     own = np.array([number[name] for name in placed.children], np.int64)
@@ -193,7 +196,7 @@ def _listed(
         yield oasis.compressed_block(out[:used].tobytes(), _LEVEL)
 
 
-def _pillars(lattice: PillarLattice) -> Iterator[bytes]:
+def _pillars(lattice: PillarArray) -> Iterator[bytes]:
     """Placements, tile by tile, of the cells that a lattice numbers from 1 on."""
 
     def jobs() -> Iterator[Callable[[], bytes]]:

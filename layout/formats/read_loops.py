@@ -4,7 +4,7 @@ bytes they are given.
 
 import numpy as np
 
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
 
 FARTHEST = 2**31 - 1

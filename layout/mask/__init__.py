@@ -1,5 +1,1 @@
-"""Diameter map -> classes, sites, die, write fields = MaskPlan."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Diameter map to classes, lattices, die and write fields: the plan of a mask."""

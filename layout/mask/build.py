@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from layout.mask import cells, die, dosed, shaped, tone
-from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
-from layout.pec import DoseSolution, dose_ladder
-from layout.process import LayerNumber, Process, names
+from layout.mask import cells, die, shaped, tone
+from layout.mask.plan import MaskPlan, PillarArray, PillarClass, pillar_classes
+from layout.process import names
+from layout.process.process import LayerNumber, LayerTable, Process
 from metalens.cell.shapes import Circle
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -23,18 +22,17 @@ Furniture = Literal[
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class MadePlan:
-    """A plan and what was found while it was made.
+class DrawnMask:
+    """The plan of a lens before any correction.
 
-    wanted: its doses before they are rounded to classes; None where no correction was
-    asked for. dose: the rounded ones; None before :func:`assign_doses`.
+    plan: of the die.
+    cells: quantised pillars of the lens.
+    radius_um: of its aperture.
     """
 
     plan: MaskPlan
     cells: cells.DrawnClasses
     radius_um: float
-    wanted: dosed.WantedPlan | None = None
-    dose: DoseSolution | None = None
 
 
 def plan(
@@ -44,63 +42,22 @@ def plan(
     name: str = "METALENS",
     furnished: bool = True,
 ) -> MaskPlan:
-    """The mask of a lens.
+    """The mask of a lens, every dose 1.
 
     Args:
         source: a lens, or its diameters alone.
+        process: rules, bias, tone, layers and die.
         name: of the top cell.
         furnished: with aperture, marks, label, dose-test array and witness cells.
 
     Raises:
         ProcessError: a pitch off the grid, pillars that the process cannot draw (row
-            and column named), too many
-            classes, a die that is too small, coordinates beyond 32 bits, an illegal
-            name.
+            and column named), too many classes, a die that is too small, coordinates
+            beyond 32 bits, an illegal name.
         LensError: invalid diameters.
     """
-    return prepare_mask(
-        source,
-        process,
-        name=name,
-        furniture="die" if furnished else "none",
-        with_doses=False,
-    ).plan
-
-
-def prepare_mask(
-    source: Lens | DiameterMap,
-    process: Process,
-    *,
-    name: str = "METALENS",
-    furniture: Furniture = "die",
-    with_doses: bool = True,
-) -> MadePlan:
-    """As :func:`plan`, with everything that a report needs; ``with_doses``: with the
-    correction of the process.
-    """
-    made = draw_mask(
-        source, process, name=name, furniture=furniture, with_doses=with_doses
-    )
-    return assign_doses([made], process)[0]
-
-
-def assign_doses(made: Sequence[MadePlan], process: Process) -> list[MadePlan]:
-    """Plans that are written in one job, each dose rounded to the nearest of one
-    geometric series for all.
-
-    Raises:
-        ProcessError: datatypes of the doses that are layers of something else.
-    """
-    ranges = [one.wanted.doses.range for one in made if one.wanted is not None]
-    found = []
-    steps = dose_ladder(ranges, process.exposure) if ranges else None
-    for one in made:
-        if one.wanted is not None and steps is not None:
-            plan, dose = dosed.apply_dose_classes(one.wanted, process, *steps)
-            one = dataclasses.replace(one, plan=plan, dose=dose)
-        _check_layers(one.plan, process)
-        found.append(one)
-    return found
+    furniture: Furniture = "die" if furnished else "none"
+    return draw_mask(source, process, name=name, furniture=furniture).plan
 
 
 def draw_mask(
@@ -109,22 +66,33 @@ def draw_mask(
     *,
     name: str = "METALENS",
     furniture: Furniture = "die",
-    with_doses: bool = True,
-) -> MadePlan:
-    """As :func:`prepare_mask`, before the doses are rounded to classes."""
+) -> DrawnMask:
+    """As :func:`plan`, with the quantised pillars that a report needs.
+
+    Args:
+        source: a lens, or its diameters alone.
+        process: rules, bias, tone, layers and die.
+        name: of the top cell.
+        furniture: what stands around the lens.
+    """
     names.check_cell_name(name)
     diameters = source.diameters if isinstance(source, Lens) else source
-    steps = (
-        pitch_units(diameters.steps_um[0], process),
-        pitch_units(diameters.steps_um[1], process),
-    )
+    across, down = (pitch_units(step, process) for step in diameters.steps_um)
     found, classes = _drawn(source, process)
-    x0, y0, axis = _origin(found.sites.shape, steps, process.rules.grid_nm)
-    lattice = found.sites.lattice(
-        "LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True
-    )
-    lattice = dataclasses.replace(
-        lattice, row_pitch=steps[1], centred=diameters.lattice.centred
+    rows, columns = found.sites.shape
+    x0, y0, axis = _origin((rows, columns), (across, down), process.rules.grid_nm)
+    sites = found.sites.upside_down()
+    lattice = PillarArray(
+        "LENS",
+        rows,
+        columns,
+        across,
+        x0,
+        y0,
+        sites.source,
+        sites.array,
+        down,
+        diameters.lattice.centred,
     )
     bare = MaskPlan(
         name=name,
@@ -138,17 +106,14 @@ def draw_mask(
     )
     radius_um = diameters.radius_um + diameters.pitch_um / 2
     if furniture == "die":
-        bare = die.add_die_frame(
-            bare, process, radius_um=radius_um, label=_label(source, radius_um)
-        )
+        label = _label(source, radius_um)
+        bare = die.add_die_frame(bare, process, radius_um=radius_um, label=label)
     elif furniture == "aperture":
         bare = die.open_aperture(bare, process, radius_um=radius_um)
     if process.tone == "negative":
         bare = tone.reverse_tone(bare, process)
-    wanted = None
-    if with_doses and process.exposure.corrected:
-        wanted = dosed.solve_wanted_doses(bare, process)
-    return MadePlan(bare, found, radius_um, wanted)
+    check_layers(bare, process.layers)
+    return DrawnMask(bare, found, radius_um)
 
 
 def _word(source: Lens | DiameterMap) -> str:
@@ -166,7 +131,7 @@ def die_surroundings(
     size_um: tuple[float, float],
     clear_um: float,
     label: str,
-) -> MadePlan:
+) -> DrawnMask:
     """Marks, label, dose test and witness cells of the pillars of ``source`` around a
     die of other things.
 
@@ -178,7 +143,7 @@ def die_surroundings(
     own = dataclasses.replace(
         process, die=dataclasses.replace(process.die, size_um=size_um, label=label)
     )
-    made = draw_mask(source, own, name=name, furniture="none", with_doses=False)
+    made = draw_mask(source, own, name=name, furniture="none")
     whole = die.add_die_frame(
         made.plan, own, radius_um=clear_um, label=label, around=True
     )
@@ -191,7 +156,7 @@ def die_surroundings(
         lattices=whole.lattices[:0:-1],
         figures=(dataclasses.replace(aperture, polygons=openings), *figures),
     )
-    return _wanting(bare, made, own)
+    return dataclasses.replace(made, plan=bare)
 
 
 def wafer_mark(
@@ -201,23 +166,15 @@ def wafer_mark(
     name: str,
     mark_um: float,
     width_um: float,
-) -> MadePlan:
+) -> DrawnMask:
     """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
 
     Raises:
         ProcessError: as :func:`plan`.
     """
-    made = draw_mask(source, process, name=name, furniture="none", with_doses=False)
+    made = draw_mask(source, process, name=name, furniture="none")
     bare = die.wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
-    return _wanting(bare, made, process)
-
-
-def _wanting(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
-    """A plan without its lens, with the doses that it wants where the process asks."""
-    wanted = (
-        dosed.solve_wanted_doses(bare, process) if process.exposure.corrected else None
-    )
-    return MadePlan(bare, made.cells, made.radius_um, wanted)
+    return dataclasses.replace(made, plan=bare)
 
 
 def _drawn(
@@ -272,9 +229,16 @@ def _plain_classes(diameters: Array, process: Process) -> tuple[PillarClass, ...
     )
 
 
-def _check_layers(plan: MaskPlan, process: Process) -> None:
-    """Refuse datatypes of the doses that are layers of something else."""
-    layers = process.layers
+def check_layers(plan: MaskPlan, layers: LayerTable) -> None:
+    """Refuse datatypes of the doses that are layers of something else.
+
+    Args:
+        plan: with its doses.
+        layers: of the process.
+
+    Raises:
+        ProcessError: such a datatype.
+    """
     fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
     kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
     seen: dict[LayerNumber, str] = {}

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.held import ScratchArray, hold_on_disk
-from layout.mask.plan import MOST_CLASSES
-from layout.process import Process, isolation
+from layout.mask.plan import BLOCK_SITES, MOST_CLASSES
+from layout.process import isolation
+from layout.process.process import Process
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError, ProcessError
 from metalens.core.units import nm
 from metalens.lens import DiameterMap
 
 _FINE = 16  # table entries for one nanometre of designed diameter
-_BLOCK_SITES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,7 +37,7 @@ class DrawnClasses:
     @property
     def classes(self) -> Array:
         """All class numbers (y, x)."""
-        return self.sites.whole()
+        return self.sites.source(0, self.sites.shape[0])
 
 
 def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses:
@@ -69,9 +69,7 @@ def quantise_diameters(diameters: DiameterMap, process: Process) -> DrawnClasses
         )
     lookup = np.zeros(len(counts), np.uint8 if len(used) <= 255 else np.uint16)
     lookup[used] = np.arange(1, len(used) + 1)
-    blocks = (
-        (first, lookup.take(block)) for first, block in drawn.blocks(_BLOCK_SITES)
-    )
+    blocks = ((first, lookup.take(block)) for first, block in drawn.blocks())
     step = process.rules.diameter_step_nm
     return DrawnClasses(
         hold_on_disk(drawn.shape, lookup.dtype, blocks),
@@ -95,7 +93,7 @@ def drawn_blocks(
     straight = np.rint(process.written_diameter_nm(table) / step)
     straight[0] = 0
     lookup = np.clip(straight, 0, 65535).astype(np.uint16)
-    for first, block, alone in with_isolation(diameters, process, _BLOCK_SITES):
+    for first, block, alone in with_isolation(diameters, process):
         drawn = lookup.take(
             np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32)
         )
@@ -106,7 +104,7 @@ def drawn_blocks(
 
 
 def with_isolation(
-    diameters: DiameterMap, process: Process, sites: int
+    diameters: DiameterMap, process: Process
 ) -> Iterator[tuple[int, Array, Array | None]]:
     """(first row, designed sizes, how alone each pillar stands) of blocks of rows of
     some ``sites``.
@@ -119,7 +117,7 @@ def with_isolation(
         if bias.isolated_nm
         else 0
     )
-    size = max(1, sites // max(1, design.shape[1]), 4 * reach)
+    size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * reach)
     for first in range(0, design.shape[0], size):
         end, begin = min(first + size, design.shape[0]), max(0, first - reach)
         around = np.asarray(design[begin : end + reach])

@@ -15,8 +15,9 @@ import numpy as np
 
 from layout.mask import font, marks
 from layout.mask.marks import CLEAR_UM, DatabaseUnits, MarkBox
-from layout.mask.plan import FigureCell, MaskPlan, PillarClass, PillarLattice, Role
-from layout.process import Process
+from layout.mask.plan import FigureCell, MaskPlan, PillarArray, PillarClass, Role
+from layout.process.process import Process
+from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
@@ -73,7 +74,7 @@ def add_die_frame(
         unit,
         die,
     )
-    openings = [disc_polygon(radius_um * unit.per_um, plan.axis, plan.grid)]
+    openings = [aperture_polygon(radius_um * unit.per_um, plan.axis, plan.grid)]
     openings += [
         unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)
     ]
@@ -108,7 +109,7 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
     layer, unit = process.layers.aperture, DatabaseUnits(plan)
     figure = FigureCell(
         "APERTURE",
-        {layer: (disc_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
+        {layer: (aperture_polygon(radius_um * unit.per_um, plan.axis, plan.grid),)},
     )
     return plan.replace(
         figures=(*plan.figures, figure),
@@ -159,15 +160,12 @@ def wafer_mark(
     )
 
 
-def disc_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
+def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
     """Polygon of the area of a circle whose edges stay within half a grid step of it,
     at most 8000 vertices.
     """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
-    angle = (np.arange(count) + 0.5) * 2 * math.pi / count
-    reach = radius * math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
-    points = np.column_stack([np.cos(angle), np.sin(angle)]) * reach + centre
-    return np.asarray(np.rint(points / grid) * grid, np.int64)
+    return polygon.disc_polygon(radius, centre, count, grid)
 
 
 def _outline(process: Process, unit: DatabaseUnits, radius_um: float) -> MarkBox:
@@ -183,7 +181,7 @@ def _tests(
     unit: DatabaseUnits,
     radius_um: float,
     die: MarkBox,
-) -> tuple[list[PillarClass], list[PillarLattice], list[MarkBox]]:
+) -> tuple[list[PillarClass], list[PillarArray], list[MarkBox]]:
     """Dose array left of the lens, witness cells right of it: classes, lattices,
     openings.
     """
@@ -312,7 +310,7 @@ def _spread(sizes: Sequence[PillarClass], count: int) -> list[PillarClass]:
     return [sizes[i] for i in picked]
 
 
-def _blocks(numbers: Array, side: int, lattice: PillarLattice) -> Array:
+def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
     """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with
     spaces between, on a lattice.
     """
@@ -330,17 +328,17 @@ def _blocks(numbers: Array, side: int, lattice: PillarLattice) -> Array:
     return sites
 
 
-def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarLattice:
+def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
     """Sites about (x, 0), as far apart as those of the lens."""
     (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
     left, top = x - (columns - 1) * like.pitch // 2, (rows - 1) * like.down // 2
-    made = PillarLattice.of(
+    made = PillarArray.of(
         name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid
     )
     return dataclasses.replace(made, row_pitch=like.row_pitch, centred=like.centred)
 
 
-def _extent(lattice: PillarLattice) -> MarkBox:
+def _extent(lattice: PillarArray) -> MarkBox:
     right, bottom = (
         (lattice.columns - 1) * lattice.pitch,
         (lattice.rows - 1) * lattice.down,

@@ -6,7 +6,7 @@ import numpy as np
 
 from layout.mask.fields import FieldPlan
 from layout.mask.plan import FigureCell, MaskPlan
-from layout.process import Process
+from layout.process.process import Process
 
 
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:

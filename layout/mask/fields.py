@@ -13,13 +13,12 @@ from typing import Literal
 import numpy as np
 
 from layout.mask.cells import DrawnClasses, quantise_diameters
-from layout.process import Process, WriteField
+from layout.mask.plan import BLOCK_SITES
+from layout.process.process import Process, WriteField
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.core.units import nm
 from metalens.lens import DiameterMap
-
-_BLOCK_SITES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,7 +145,7 @@ class _Seen:
         found = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
         near_x, near_y = _near(diameters.x_um, size_um), _near(diameters.y_um, size_um)
         columns = np.flatnonzero(near_x < np.inf)
-        for first, block in made.sites.blocks(_BLOCK_SITES):
+        for first, block in made.sites.blocks():
             found.rows[first : first + len(block)] = block.any(1)
             found.columns |= block.any(0)
             rows = np.flatnonzero(near_y[first : first + len(block)] < np.inf)
@@ -164,7 +163,7 @@ def _counted(made: DrawnClasses, rows: Array, columns: Array) -> Array:
         np.clip(rows, 0, made.sites.shape[0]).tolist(),
         np.clip(columns, 0, made.sites.shape[1]).tolist(),
     )
-    step = max(1, _BLOCK_SITES // max(1, made.sites.shape[1]))
+    step = max(1, BLOCK_SITES // max(1, made.sites.shape[1]))
     found = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
     for i, (first, end) in enumerate(itertools.pairwise(down)):
         held = np.zeros(made.sites.shape[1], np.int64)

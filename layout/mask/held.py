@@ -1,8 +1,6 @@
-"""Class numbers of a lattice between the stages: in memory, or in a scratch file where
-they would fill it.
-"""
+"""Class numbers of a lattice between the stages, in memory or in a scratch file."""
 
-import os
+import dataclasses
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -10,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.mask.plan import PillarLattice, RowSource
+from layout.mask.plan import BLOCK_SITES, PillarArray, RowSource
 from metalens.core.arrays import Array
 
 MOST_BYTES = 1 << 27  # kept in memory
@@ -18,50 +16,51 @@ MOST_BYTES = 1 << 27  # kept in memory
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ScratchArray:
-    """(rows, columns) class numbers; ``source`` gives blocks of rows, ``array`` all,
-    where they are in memory.
+    """Class numbers.
+
+    shape: rows and columns.
+    source: (first row, end row) to a block of rows.
+    array: all of them, where they are in memory.
     """
 
     shape: tuple[int, int]
     source: RowSource
     array: Array | None
 
-    def whole(self) -> Array:
-        """All of them, read from the scratch file where they are there."""
-        return self.source(0, self.shape[0]) if self.array is None else self.array
-
-    def blocks(self, sites: int) -> Iterator[tuple[int, Array]]:
-        """(first row, class numbers) in blocks of rows of some ``sites``."""
-        size = max(1, sites // max(1, self.shape[1]))
+    def blocks(self) -> Iterator[tuple[int, Array]]:
+        """(first row, class numbers) in blocks of about a million sites."""
+        size = max(1, BLOCK_SITES // max(1, self.shape[1]))
         for first in range(0, self.shape[0], size):
             yield first, self.source(first, min(first + size, self.shape[0]))
 
-    def lattice(
-        self, name: str, *, pitch: int, x0: int, y0: int, upside_down: bool = False
-    ) -> PillarLattice:
-        """As a lattice of the mask; ``upside_down``: the last row on top."""
-        rows, columns = self.shape
-        if self.array is not None:
-            array = (
-                np.ascontiguousarray(self.array[::-1]) if upside_down else self.array
-            )
-            return PillarLattice.of(name, array, pitch=pitch, x0=x0, y0=y0)
+    def within(self, lattice: PillarArray) -> PillarArray:
+        """A lattice with these class numbers.
+
+        Args:
+            lattice: name and places.
+        """
+        return dataclasses.replace(lattice, source=self.source, array=self.array)
+
+    def upside_down(self) -> "ScratchArray":
+        """The last row first."""
+        rows = self.shape[0]
 
         def turned(first: int, end: int) -> Array:
             return np.ascontiguousarray(self.source(rows - end, rows - first)[::-1])
 
-        return PillarLattice(
-            name, rows, columns, pitch, x0, y0, turned if upside_down else self.source
-        )
+        array = None if self.array is None else turned(0, rows)
+        return dataclasses.replace(self, source=turned, array=array)
 
 
 def hold_on_disk(
     shape: tuple[int, ...], dtype: "np.dtype[Any]", blocks: Iterable[tuple[int, Array]]
 ) -> ScratchArray:
-    """Keep blocks of rows (first row, class numbers), which together are all of them.
+    """Keep class numbers; beyond 128 MB in a nameless file of the temporary folder.
 
-    Beyond 128 MB they go to a nameless file in the folder for temporary files
-    (``TMPDIR``), gone with the last use.
+    Args:
+        shape: rows and columns.
+        dtype: of the class numbers.
+        blocks: (first row, class numbers) of consecutive rows, all of them.
     """
     rows, columns = shape[0], shape[1]
     if rows * columns * dtype.itemsize <= MOST_BYTES:
@@ -69,29 +68,13 @@ def hold_on_disk(
         for first, block in blocks:
             array[first : first + len(block)] = block
         return ScratchArray((rows, columns), lambda first, end: array[first:end], array)
-    scratch, line = tempfile.TemporaryFile(), columns * dtype.itemsize  # noqa: SIM115 - closed with its last reader
-    for first, block in blocks:
-        _write_at(scratch.fileno(), np.ascontiguousarray(block, dtype), first * line)
+    scratch = tempfile.TemporaryFile()  # noqa: SIM115 - closed with its last reader
+    for _, block in blocks:
+        scratch.write(np.ascontiguousarray(block, dtype).data)
+    scratch.flush()
 
     def read(first: int, end: int) -> Array:
-        out = np.empty((end - first, columns), dtype)
-        _read_at(scratch.fileno(), out, first * line)
-        return out
+        start, size = first * columns * dtype.itemsize, (end - first, columns)
+        return np.array(np.memmap(scratch, dtype, "r", start, size))
 
     return ScratchArray((rows, columns), read, None)
-
-
-def _write_at(file: int, block: Array, at: int) -> None:
-    view = memoryview(block.data).cast("B")
-    while len(view):
-        done = os.pwrite(file, view, at)
-        view, at = view[done:], at + done
-
-
-def _read_at(file: int, out: Array, at: int) -> None:
-    view = memoryview(out.data).cast("B")
-    while len(view):
-        done = os.preadv(file, [view], at)
-        if not done:
-            raise OSError("the scratch file of a mask was cut while it was in use")
-        view, at = view[done:], at + done

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.mask.plan import MaskPlan
-from layout.process import Process
+from layout.process.process import Process
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 

@@ -20,7 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from layout.process import LayerNumber, names
+from layout.process import names
+from layout.process.process import LayerNumber
 from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -28,6 +29,7 @@ from metalens.core.errors import ProcessError
 MOST_CLASSES = 65535
 Role = Literal["pillar", "dose", "witness"]
 FARTHEST = 2**31 - 1
+BLOCK_SITES = 1 << 20  # sites of a lattice that are worked on at once
 UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
 EXPOSED = (
     "MARKS",
@@ -86,17 +88,20 @@ class PillarClass:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class PillarLattice:
+class PillarArray:
     """Pillars on a lattice, written as one cell.
 
-    rows, columns: of sites. source: gives any block of rows as class numbers (0: none);
-    array: all of them, where
-    they are in memory.
+    name: of the cell.
+    rows, columns: of sites.
+    pitch: from column to column, database units.
     x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row *
-    down.
-    row_pitch: from row to row, 0 for that of the columns. centred: every other site
-    stays empty (a hexagonal lattice:
-    the pitch is half its constant).
+        down.
+    source: (first row, end row) to (rows, columns) class numbers, 0 for no pillar.
+    array: all class numbers, where they are in memory.
+    row_pitch: from row to row, 0 for that of the columns.
+    centred: every other site stays empty (a hexagonal lattice: the pitch is half its
+        constant).
+    unit_um: database unit.
     """
 
     name: str
@@ -109,67 +114,134 @@ class PillarLattice:
     array: Array | None = None
     row_pitch: int = 0
     centred: bool = False
+    unit_um: float = 1e-3
 
     def __post_init__(self) -> None:
         names.check_cell_name(self.name)
-        corners = (
-            self.x0,
-            self.y0,
-            self.x0 + self.columns * self.pitch,
-            self.y0 - self.rows * self.down,
-        )
-        if max(map(abs, corners)) > FARTHEST:
+        right = self.x0 + self.columns * self.pitch
+        bottom = self.y0 - self.rows * self.down
+        farthest = max(map(abs, (self.x0, self.y0, right, bottom)))
+        if farthest > FARTHEST:
             raise ProcessError(
-                f"lattice {self.name} reaches {max(map(abs, corners))} database units from the origin, beyond 32 bits "
-                f"({FARTHEST}); take a smaller aperture or a coarser unit"
+                f"lattice {self.name} reaches {farthest} database units from the "
+                f"origin, beyond 32 bits ({FARTHEST}); take a smaller aperture or a "
+                "coarser unit"
             )
-
-    @property
-    def down(self) -> int:
-        """From row to row."""
-        return self.row_pitch or self.pitch
-
-    @property
-    def square(self) -> bool:
-        """Whether rows and columns are as far apart, and every site is one of the
-        lattice.
-        """
-        return self.down == self.pitch and not self.centred
-
-    @property
-    def constant(self) -> int:
-        """From a pillar to the next one of its row."""
-        return self.pitch * (2 if self.centred else 1)
 
     @classmethod
     def of(
         cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int
-    ) -> "PillarLattice":
-        """A square lattice held in memory: (rows, columns) uint8 or uint16."""
+    ) -> "PillarArray":
+        """A square lattice held in memory.
+
+        Args:
+            name: of its cell.
+            classes: (rows, columns) class numbers, uint8 or uint16.
+            pitch: database units.
+            x0: of the first column.
+            y0: of the first row.
+
+        Raises:
+            ProcessError: class numbers of another type.
+        """
         if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
             raise ProcessError(
-                f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 (rows, columns)"
+                f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 "
+                "(rows, columns)"
             )
-        rows, columns = classes.shape
-        return cls(
-            name,
-            rows,
-            columns,
-            pitch,
-            x0,
-            y0,
-            lambda first, end: classes[first:end],
-            classes,
-        )
 
-    def blocks(self, size: int) -> Iterator[tuple[int, Array]]:
-        """(first row, class numbers) in blocks of ``size`` rows."""
+        def source(first: int, end: int) -> Array:
+            return classes[first:end]
+
+        return cls(name, *classes.shape, pitch, x0, y0, source, classes)
+
+    @property
+    def down(self) -> int:
+        """From row to row, database units."""
+        return self.row_pitch or self.pitch
+
+    @property
+    def constant(self) -> int:
+        """From a pillar to the next one of its row, database units."""
+        return self.pitch * (2 if self.centred else 1)
+
+    def blocks(self, rows: int | None = None) -> Iterator[tuple[int, Array]]:
+        """(first row, class numbers) of blocks of rows.
+
+        Args:
+            rows: in a block; None: about a million sites.
+        """
+        size = rows or max(1, BLOCK_SITES // max(1, self.columns))
         for first in range(0, self.rows, size):
-            yield first, self.source(first, min(first + size, self.rows))
+            block = self.source(first, min(first + size, self.rows))
+            yield first, np.ascontiguousarray(block)
 
     def whole(self) -> Array:
         """All class numbers (rows, columns)."""
         return self.source(0, self.rows) if self.array is None else self.array
+
+    def counts(self, classes: int) -> Array:
+        """(classes + 1,) sites of each class number.
+
+        Args:
+            classes: their number.
+        """
+        total = np.zeros(classes + 1, np.int64)
+        for _, block in self.blocks():
+            total += np.bincount(block.ravel(), minlength=len(total))
+        return total
+
+    @property
+    def pitch_um(self) -> float:
+        """From column to column."""
+        return self.pitch * self.unit_um
+
+    @property
+    def down_um(self) -> float:
+        """From row to row."""
+        return self.down * self.unit_um
+
+    @property
+    def steps_um(self) -> Array:
+        """(n, 2) from a site to its nearest neighbours on all sides."""
+        x, y = self.pitch_um, self.down_um
+        straight = [(x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)]
+        if not self.centred:
+            return np.array(straight)
+        return np.array(
+            [(2 * i, 2 * j) for i, j in straight]
+            + [(i, j) for i in (x, -x) for j in (y, -y)]
+        )
+
+    @property
+    def nearest_um(self) -> float:
+        """From a site to the nearest."""
+        return float(np.hypot(*self.steps_um.T).min())
+
+    @property
+    def columns_um(self) -> Array:
+        """(columns,) x of the sites."""
+        return (self.x0 + np.arange(self.columns) * self.pitch) * self.unit_um
+
+    def rows_um(self, first: int, count: int) -> Array:
+        """(count,) y of rows.
+
+        Args:
+            first: number of the first.
+            count: of rows.
+        """
+        rows = np.arange(first, first + count)
+        return (self.y0 - rows * self.down) * self.unit_um
+
+    @property
+    def box_um(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right, top of the sites."""
+        right = self.x0 + (self.columns - 1) * self.pitch
+        bottom = self.y0 - (self.rows - 1) * self.down
+        left, bottom, right, top = (
+            v * self.unit_um for v in (self.x0, bottom, right, self.y0)
+        )
+        return left, bottom, right, top
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,7 +282,7 @@ class MaskPlan:
 
     name: str
     classes: tuple[PillarClass, ...]
-    lattices: tuple[PillarLattice, ...]
+    lattices: tuple[PillarArray, ...]
     figures: tuple[FigureCell, ...] = ()
     unit_nm: float = 1.0
     grid: int = 1
@@ -247,13 +319,8 @@ class MaskPlan:
 
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
-        total = np.zeros(len(self.classes) + 1, np.int64)
-        for lattice in self.lattices:
-            for _, block in lattice.blocks(
-                max(1, (1 << 20) // max(1, lattice.columns))
-            ):
-                total += np.bincount(block.ravel(), minlength=len(total))
-        return total
+        none = np.zeros(len(self.classes) + 1, np.int64)
+        return sum((l.counts(len(self.classes)) for l in self.lattices), none)
 
     def replace(self, **changes: object) -> "MaskPlan":
         """A copy with other values."""

@@ -19,7 +19,7 @@ import numpy as np
 from layout.mask.cells import DrawnClasses, with_isolation
 from layout.mask.held import hold_on_disk
 from layout.mask.plan import MOST_CLASSES, PillarClass
-from layout.process import Process
+from layout.process.process import Process
 from layout.shapes import polygon, region
 from metalens.cell import Cell
 from metalens.cell.shapes import EllipseArc, Outline, PolygonLoop, rotate_corners
@@ -29,8 +29,6 @@ from metalens.core.units import nm
 from metalens.lens import DiameterMap, Lens
 from metalens.library.axes import cell_of_sizes
 
-_BLOCK_SITES = 1 << 20
-_FLAT = 1e-9
 _LENGTHS = 1 << 20  # above any drawn size in nm
 _TABLED = 1 << 20  # keys below are counted and numbered by a table, others by sorting
 
@@ -92,7 +90,7 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
     alone, are not of one design.
     """
     lone = process.bias.isolated_nm
-    for first, block, alone in with_isolation(d, process, _BLOCK_SITES):
+    for first, block, alone in with_isolation(d, process):
         rows = slice(first, first + len(block))
         design, beside = np.asarray(block, float) / nm, 0.0 if alone is None else alone
         drawn = _steps(design, design, process, beside)

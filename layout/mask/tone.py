@@ -18,14 +18,13 @@ import dataclasses
 
 import numpy as np
 
-from layout.mask.plan import UNDRAWN, FigureCell, MaskPlan, PillarClass, PillarLattice
-from layout.process import LayerNumber, Process
+from layout.mask.plan import UNDRAWN, FigureCell, MaskPlan, PillarArray, PillarClass
+from layout.process.process import LayerNumber, Process
 from layout.shapes import rectilinear, region
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 _WINDOW_UM = 5.0  # around marks and labels, on their own layer
-_BLOCK_SITES = 1 << 20
 
 
 def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
@@ -63,7 +62,7 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
 
 
-def lattice_box(lattice: PillarLattice, grid: int) -> Array:
+def lattice_box(lattice: PillarArray, grid: int) -> Array:
     """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
     the ends of every other row).
     """
@@ -83,7 +82,7 @@ def _unexposed(process: Process) -> set[LayerNumber]:
     return {process.layers.aperture, process.layers.outline, process.layers.fields}
 
 
-def _square(lattice: PillarLattice, grid: int) -> tuple[int, int, int, int]:
+def _square(lattice: PillarArray, grid: int) -> tuple[int, int, int, int]:
     """Left, bottom, right, top of the lattice square about a site, on the grid; squares
     of neighbours abut.
     """
@@ -111,7 +110,7 @@ def _around(
     )
 
 
-def _empty(lattice: PillarLattice, left_of: int, top_of: int) -> list[Array]:
+def _empty(lattice: PillarArray, left_of: int, top_of: int) -> list[Array]:
     """Rectangles over what no pillar's square covers: equal runs of neighbouring rows
     together.
 
@@ -130,7 +129,7 @@ def _empty(lattice: PillarLattice, left_of: int, top_of: int) -> list[Array]:
         return rectilinear.box_corners(np.array([left, bottom, right, top]))
 
     wide = 2 if lattice.centred else 1
-    for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
+    for first, block in lattice.blocks():
         free = np.ones((len(block), lattice.columns + wide - 1), bool)
         for part in range(wide):
             free[:, part : part + lattice.columns] &= block == 0

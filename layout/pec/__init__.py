@@ -1,5 +1,1 @@
-"""Proximity correction."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Proximity effect correction: exposure of a die, dose of every shape."""

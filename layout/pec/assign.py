@@ -7,17 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.pec.bodies import (
-    NONE,
-    ExposedRectangles,
-    ExposureTable,
-    PillarArray,
-    ScatterRanges,
-)
+from layout.mask.plan import PillarArray
+from layout.pec.bodies import NONE, ExposedRectangles, ExposureTable, ScatterRanges
 from layout.pec.nodes import NodeGrid, RadialConvolution, interpolate_from_nodes
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.pec.uniformity import DoseUniformity, ErrorTally
-from layout.process import ExposureSettings, compile_loop
+from layout.process.jit import compile_loop
+from layout.process.process import ExposureSettings
 from metalens.core.arrays import Array
 
 _NOTHING = np.zeros((0, 0), np.float32)

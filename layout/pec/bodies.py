@@ -2,103 +2,21 @@
 what each pillar exposes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from layout.mask.plan import PillarArray
 from layout.pec.drawn import DrawnKinds
 from layout.pec.psf import PointExposure
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
 NONE = 255  # dose class of a site without pillar
-_BLOCK_SITES = 1 << 20
 _FAINT = 0.02  # least exposure of its own edge at which a pillar can be corrected
 _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
 COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PillarArray:
-    """A lattice of pillars.
-
-    source: (first row, end row) -> (rows, columns) entries of the table, 0 for none.
-    x_um: of the first column; y_um: of the first row; rows run towards -y.
-    row_um: from row to row, 0 for the pitch of the columns. centred: every other site
-    stays empty (a hexagonal
-    lattice).
-    """
-
-    rows: int
-    columns: int
-    pitch_um: float
-    x_um: float
-    y_um: float
-    source: Callable[[int, int], Array]
-    row_um: float = 0.0
-    centred: bool = False
-
-    @classmethod
-    def of(cls, index: Array, pitch_um: float) -> "PillarArray":
-        """A lattice in memory, its first site at (0, 0)."""
-        return cls(
-            index.shape[0],
-            index.shape[1],
-            pitch_um,
-            0.0,
-            0.0,
-            lambda first, end: index[first:end],
-        )
-
-    def blocks(self) -> Iterator[tuple[int, Array]]:
-        """(first row, entries) of blocks of rows."""
-        size = max(1, _BLOCK_SITES // max(1, self.columns))
-        for first in range(0, self.rows, size):
-            yield (
-                first,
-                np.ascontiguousarray(self.source(first, min(first + size, self.rows))),
-            )
-
-    @property
-    def down_um(self) -> float:
-        """From row to row."""
-        return self.row_um or self.pitch_um
-
-    @property
-    def steps_um(self) -> Array:
-        """(n, 2) from a site to its neighbours."""
-        x, y = self.pitch_um, self.down_um
-        straight = [(x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)]
-        if not self.centred:
-            return np.array(straight)
-        return np.array(
-            [(2 * i, 2 * j) for i, j in straight]
-            + [(i, j) for i in (x, -x) for j in (y, -y)]
-        )
-
-    @property
-    def apart_um(self) -> float:
-        """From a site to the nearest."""
-        return float(np.hypot(*self.steps_um.T).min())
-
-    @property
-    def columns_um(self) -> Array:
-        """(columns,) x of the sites."""
-        return self.x_um + np.arange(self.columns) * self.pitch_um
-
-    def rows_um(self, first: int, count: int) -> Array:
-        """(count,) y of rows from ``first`` on."""
-        return self.y_um - np.arange(first, first + count) * self.down_um
-
-    @property
-    def box_um(self) -> tuple[float, float, float, float]:
-        """Left, bottom, right, top."""
-        right, bottom = (
-            self.x_um + (self.columns - 1) * self.pitch_um,
-            self.y_um - (self.rows - 1) * self.down_um,
-        )
-        return self.x_um, bottom, right, self.y_um
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -172,10 +90,8 @@ class ScatterRanges:
 
 def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
     """(entries,) pillars of each entry in all bodies."""
-    total = np.zeros(entries, np.int64)
-    for body in bodies:
-        for _, block in body.blocks():
-            total += np.bincount(block.ravel(), minlength=entries)
+    none = np.zeros(entries, np.int64)
+    total = sum((body.counts(entries - 1) for body in bodies), none)
     total[0] = 0
     return total
 
@@ -190,9 +106,9 @@ def split_ranges(
     reach = np.array(
         [_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um]
     )
-    far = point.widths_um >= COARSE * body.apart_um
+    far = point.widths_um >= COARSE * body.nearest_um
     middle = ~far & (
-        (reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.apart_um)
+        (reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.nearest_um)
     )
 
     def some(chosen: Array, wider: float) -> PointExposure:

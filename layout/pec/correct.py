@@ -19,16 +19,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from layout.mask.plan import PillarArray
 from layout.pec import assign, bodies, psf, rects
 from layout.pec.assign import DoseLadder
-from layout.pec.bodies import (
-    NONE,
-    ExposedRectangles,
-    ExposureTable,
-    PillarArray,
-    ScatterRanges,
-)
-from layout.pec.drawn import DrawnDiscs, DrawnKinds
+from layout.pec.bodies import NONE, ExposedRectangles, ExposureTable, ScatterRanges
+from layout.pec.drawn import DrawnKinds
 from layout.pec.fracture import fracture_boxes
 from layout.pec.nodes import (
     NodeGrid,
@@ -40,46 +35,18 @@ from layout.pec.nodes import (
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.pec.sampled import ExposedLattices, exact_edges
 from layout.pec.uniformity import DoseUniformity
-from layout.process import ExposureSettings, Process
+from layout.process.process import ExposureSettings
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
-from metalens.lens import DiameterMap
 
-_UNIT_UM = 1e-4  # resolution of the diameters in the table
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
 _SPOTS = 10  # of a piece on the nodes, along the same
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class DoseResult:
-    """Doses of a mask.
-
-    factors: (classes,) relative dose of each class, rising; dose_uC_cm2: (classes,) the
-    doses.
-    classes: (y, x) uint8 class of each pillar, 255 where there is none.
-    needed: classes that meet the tolerance; met: whether ``after`` keeps it (the writer
-    may hold fewer).
-    before, after: uniformity with the best single dose, and with these classes.
-    error: largest difference of the relative exposure from the exact sum, at sample
-    pillars.
-    point: the point-exposure function that was used.
-    """
-
-    factors: Array
-    dose_uC_cm2: Array
-    classes: Array
-    needed: int
-    met: bool
-    before: DoseUniformity
-    after: DoseUniformity
-    error: float
-    point: PointExposure
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class DoseSolution:
-    """Doses of everything on a die; ``before`` and ``after`` as in DoseResult, over the
-    pillars of the first body.
+    """Doses of everything on a die; ``before`` and ``after`` uniformity with the best
+    single dose and with these, over the pillars of the first body.
 
     ladder: the doses. pairs: (entries, doses) pillars of each, over all bodies. rects:
     pieces, and ``rect_class`` (n,)
@@ -135,11 +102,12 @@ def solve_doses(
             (:func:`fracture_boxes`).
 
     Raises:
-        ProcessError: as :func:`correct`.
+        ProcessError: no pillar; no or an unreadable point exposure; pillars finer than
+            its core; a lens too large for a middle range of the point exposure.
     """
     point = psf.point_exposure(settings)
     number = bodies.count_pillars(parts, len(goal))
-    densest = min(parts, key=lambda body: body.apart_um)
+    densest = min(parts, key=lambda body: body.nearest_um)
     ranges = bodies.split_ranges(point, kinds, number, densest)
     drawn = bodies.exposure_table(
         kinds, goal, number, point=point, ranges=ranges, body=densest
@@ -207,77 +175,6 @@ def _sampled_error(
         fast = scene.dose_of(0, row, block)[0, column] * table.own[entry] + near
         worst = max(worst, abs(fast - edge) / (THRESHOLD * table.goal[entry]))
     return float(worst)
-
-
-def correct(written: DiameterMap, process: Process, *, samples: int = 8) -> DoseResult:
-    """Dose classes for drawn pillars (``written``: the drawn diameters, bias taken
-    off).
-
-    Accuracy:
-        the background is interpolated to some 1e-4 of itself; neighbours count as
-        Gaussians of matched second
-        moment. ``error`` of the result is measured at ``samples`` pillars against exact
-        discs.
-
-    Raises:
-        ProcessError: tone ``negative``; no pillar; no or an unreadable point exposure;
-            pillars finer than its core;
-            a lens too large for a middle range of the point exposure.
-    """
-    index = np.empty(
-        written.diameter_um.shape, np.uint16 if written.pitch_um < 6 else np.uint32
-    )
-    for band in np.array_split(np.arange(len(index)), max(1, len(index) // 64)):
-        rows = slice(band[0], band[-1] + 1)
-        index[rows] = np.rint(written.diameter_um[rows] * (1 / _UNIT_UM))
-    diameter_um = np.arange(int(index.max()) + 1) * _UNIT_UM
-    return correct_table(index, diameter_um, written.pitch_um, process, samples=samples)
-
-
-def correct_table(
-    index: Array,
-    diameter_um: Array,
-    pitch_um: float,
-    process: Process,
-    *,
-    samples: int = 8,
-) -> DoseResult:
-    """As :func:`correct`, for pillars given as (y, x) ``index`` into a table of
-    diameters, entry 0 for none.
-    """
-    refuse_negative(process)
-    body = PillarArray.of(index, pitch_um)
-    wanted = solve_doses(
-        [body], DrawnDiscs(diameter_um), np.ones(len(diameter_um)), process.exposure
-    )
-    ladder, needed = assign.dose_ladder([wanted.range], process.exposure)
-    found = round_doses(wanted, ladder, needed, samples=samples)
-    classes = np.empty(index.shape, np.uint8)
-    for first, block in body.blocks():
-        classes[first : first + len(block)] = found.classes(0, first, block)
-    factors = found.ladder.factors
-    return DoseResult(
-        factors=factors,
-        dose_uC_cm2=factors * process.exposure.base_uC_cm2,
-        classes=classes,
-        needed=found.needed,
-        met=found.after.worst <= process.exposure.tolerance,
-        before=found.before,
-        after=found.after,
-        error=found.error,
-        point=found.point,
-    )
-
-
-def refuse_negative(process: Process) -> None:
-    """Raises: ProcessError: a dose for each pillar is asked for where the gaps are
-    drawn.
-    """
-    if process.tone == "negative":
-        raise ProcessError(
-            "a dose per pillar needs drawn pillars, but tone is 'negative' (the gaps are drawn); "
-            "draw the pillars, or set exposure.correct = false"
-        )
 
 
 def fracture_by_surroundings(

@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from layout.pec.psf import PointExposure, disc_exposure, rim_of_own_disc, slope_at_rim
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from layout.shapes.moments import (
     Contours,
     perimeter,

@@ -13,7 +13,7 @@ import numpy as np
 
 from layout.pec.psf import THRESHOLD, PointExposure
 from layout.pec.rects import CORNER, pairs_near, sums_of_boxes
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 

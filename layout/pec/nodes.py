@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.pec.psf import PointExposure
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import ExposureSettings
+from layout.process.process import ExposureSettings
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 from metalens.fabrication import read_csv

@@ -8,7 +8,7 @@ import numpy as np
 
 from layout.pec.bodies import ExposedRectangles
 from layout.pec.psf import PointExposure
-from layout.process import compile_loop
+from layout.process.jit import compile_loop
 from metalens.core import threads
 from metalens.core.arrays import Array
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.pec.bodies import COARSE, PillarArray, ScatterRanges
+from layout.mask.plan import PillarArray
+from layout.pec.bodies import COARSE, ScatterRanges
 from layout.pec.drawn import DrawnKinds
 from layout.pec.psf import PointExposure
 from metalens.core.arrays import Array
@@ -164,7 +165,7 @@ def _close(
     for width, weight in zip(
         point.widths_um.tolist(), point.weights.tolist(), strict=True
     ):
-        if width >= COARSE * body.apart_um:
+        if width >= COARSE * body.nearest_um:
             wider = (2 * drawn.wider_um2[mine] + drawn.wider_um2[entry]) / 3
             square = width**2 + wider  # of discs R^2 of the edge, R^2 / 2 of the area
             bell = np.exp(-(away**2) / square) / (np.pi * square)

@@ -1,5 +1,1 @@
-"""Polygons, no process."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Polygons on the grid of a mask."""

@@ -208,6 +208,27 @@ def eightfold_images(eighth: Array) -> Array:
     return np.ascontiguousarray(points[_turn(points) != 0])
 
 
+def disc_polygon(
+    radius: float, centre: tuple[float, float], corners: int, grid: int = 1
+) -> Array:
+    """Regular polygon of the area of a circle, rounded to a grid.
+
+    Args:
+        radius: of the circle.
+        centre: of the circle.
+        corners: their number; the first lies half a step above the x axis.
+        grid: step of the coordinates.
+
+    Returns:
+        (corners, 2) points, counter-clockwise.
+    """
+    step = 2 * math.pi / corners
+    angle = (np.arange(corners) + 0.5) * step
+    reach = radius * math.sqrt(step / math.sin(step))
+    points = np.column_stack([np.cos(angle), np.sin(angle)]) * reach + centre
+    return np.asarray(np.rint(points / grid) * grid, np.int64)
+
+
 def _turn(points: Array) -> Array:
     before = points - np.roll(points, 1, axis=0)
     after = np.roll(points, -1, axis=0) - points

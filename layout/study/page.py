@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from layout.mask import FieldPlan
-from layout.process import Process
+from layout.mask.fields import FieldPlan
+from layout.process.process import Process
 from layout.study import stitching, tolerance
 from layout.study.sensitivity import LogSensitivities, compute_sensitivities
 from layout.study.stitching import StitchReport

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask import FieldPlan
-from layout.process import Process
+from layout.mask.fields import FieldPlan
+from layout.process.process import Process
 from layout.study.focus import (
     FocusSums,
     FocusWindow,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import Process
+from layout.process.process import Process
 from layout.study.focus import (
     FocusWindow,
     focus_window,

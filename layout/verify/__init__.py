@@ -1,5 +1,1 @@
-"""Exposure and etch of the written files, by files and dose table alone."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""Exposure and etch of the written files, from files and dose table alone."""

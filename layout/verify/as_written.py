@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from layout.mask import MaskPlan
+from layout.mask.plan import MaskPlan
 from layout.verify.exposure import ExposedRows
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError

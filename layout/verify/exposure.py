@@ -14,20 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.formats import NOTHING, MaskContent, flatten
-from layout.mask import MaskPlan, PillarLattice
-from layout.pec import (
-    DrawnDiscs,
-    DrawnKinds,
-    DrawnOutlines,
-    PillarArray,
-    bodies,
-    correct,
-    nodes,
-    sampled,
-)
+from layout.formats.library import NOTHING, MaskLibrary, PolygonStack, flatten_stacks
+from layout.mask.plan import MaskPlan, PillarArray
+from layout.pec import bodies, correct, nodes, sampled
+from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
-from layout.process import LayerNumber, Process, isolation
+from layout.process import isolation
+from layout.process.process import LayerNumber, Process
 from layout.shapes import polygon, region
 from layout.verify import polygon_edges
 from layout.verify.polygon_edges import ExposedPolygons
@@ -77,7 +70,7 @@ class ExposedRows:
 
 
 def verify_exposure(
-    content: MaskContent,
+    content: MaskLibrary,
     plan: MaskPlan,
     doses: Mapping[LayerNumber, float],
     process: Process,
@@ -135,7 +128,7 @@ def verify_exposure(
 
 
 def read_scene(
-    content: MaskContent,
+    content: MaskLibrary,
     plan: MaskPlan,
     doses: Mapping[LayerNumber, float],
     process: Process,
@@ -149,8 +142,8 @@ def read_scene(
     skipped = {layers.aperture[0], layers.outline[0], layers.fields[0]}
     undosed: set[LayerNumber] = set()
 
-    def exposed(cell: str) -> Iterator[flatten.PolygonStack]:
-        for stack in flatten.flatten_stacks(content, cell):
+    def exposed(cell: str) -> Iterator[PolygonStack]:
+        for stack in flatten_stacks(content, cell):
             if stack.layer[0] not in skipped:
                 if stack.layer in doses:
                     yield stack
@@ -176,7 +169,9 @@ def read_scene(
         size = kinds.diameter_um
         kinds = DrawnDiscs(size)
     empty = {
-        l.name: dataclasses.replace(content.cells[l.name], placed=NOTHING, sums=None)
+        l.name: dataclasses.replace(
+            content.cells[l.name], placed=NOTHING, sums=None, pillars=None
+        )
         for l in plan.lattices
     }
     content = dataclasses.replace(content, cells={**content.cells, **empty})
@@ -189,7 +184,7 @@ def read_scene(
         others += [(doses[stack.layer], stack.layer[0])] * len(shapes)
     table = np.array(others, float).reshape(-1, 2)
     return WrittenMask(
-        [_body(lattice, unit) for lattice in plan.lattices],
+        [dataclasses.replace(l, unit_um=unit) for l in plan.lattices],
         kinds,
         dose,
         layer.astype(np.int64),
@@ -199,7 +194,7 @@ def read_scene(
     )
 
 
-def _one_outline(name: str, stacks: Sequence[flatten.PolygonStack]) -> list[Array]:
+def _one_outline(name: str, stacks: Sequence[PolygonStack]) -> list[Array]:
     """Contours of what a class of pillars draws, in database units."""
     drawn = [
         outline + np.array(place)
@@ -214,20 +209,6 @@ def _one_outline(name: str, stacks: Sequence[flatten.PolygonStack]) -> list[Arra
             f"class {name} of pillars draws {outer} outlines; it is not verified as one"
         )
     return [np.asarray(c, float) for c in found]
-
-
-def _body(lattice: PillarLattice, unit_um: float) -> PillarArray:
-    """Sites in um."""
-    return PillarArray(
-        lattice.rows,
-        lattice.columns,
-        lattice.pitch * unit_um,
-        lattice.x0 * unit_um,
-        lattice.y0 * unit_um,
-        lattice.source,
-        lattice.row_pitch * unit_um,
-        lattice.centred,
-    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -254,7 +235,7 @@ class _Field:
     def of(cls, scene: WrittenMask, point: PointExposure) -> "_Field":
         """The field of the doses of a scene."""
         number = bodies.count_pillars(scene.bodies, len(scene.dose)) * (scene.dose > 0)
-        densest = min(scene.bodies, key=lambda body: body.apart_um)
+        densest = min(scene.bodies, key=lambda body: body.nearest_um)
         ranges = bodies.split_ranges(point, scene.kinds, number, densest)
         own, slope = _of_themselves(scene, number > 0, point)
         far = ranges.far
@@ -280,7 +261,7 @@ class _Field:
         close = [
             (float(a), float(w))
             for a, w in zip(point.widths_um, point.weights, strict=True)
-            if a < bodies.COARSE * densest.apart_um
+            if a < bodies.COARSE * densest.nearest_um
         ]
         points = np.column_stack([x, y])
         return cls(

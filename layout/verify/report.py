@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.process import LayerNumber, compile_loop
+from layout.process.jit import compile_loop
+from layout.process.process import LayerNumber
 from metalens.core.arrays import Array
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top

@@ -295,7 +295,6 @@ def _mask() -> ChainStage:
             ("mask/die.png", "The whole die."),
             ("mask/pillars.png", "Single pillars as polygons of the mask."),
             ("mask/diameters.png", "How many pillars of each diameter."),
-            ("mask/margins.png", "Distance to the design rules."),
         ),
     )
 

@@ -38,7 +38,9 @@ def _load(kind, path):
     record = TEXTS[kind][1]
     if kind == "run":
         return runs.load_run_settings(path)
-    return processes.load(path) if kind == "process" else config.load(path, record)
+    return (
+        processes.load_process(path) if kind == "process" else config.load(path, record)
+    )
 
 
 @pytest.mark.parametrize("kind", sorted(TEXTS))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.mask.plan import FigureCell, MaskPlan, PillarLattice, pillar_classes
+from layout.mask.plan import FigureCell, MaskPlan, PillarArray, pillar_classes
 
 
 def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=100):
@@ -29,7 +29,7 @@ def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=
     return MaskPlan(
         name="TOP",
         classes=made,
-        lattices=(PillarLattice.of("LENS", classes, pitch=pitch, x0=-6000, y0=4400),),
+        lattices=(PillarArray.of("LENS", classes, pitch=pitch, x0=-6000, y0=4400),),
         figures=(FigureCell("MARKS", {(3, 0): (corner,)}),) if figures else (),
         layer_names={(1, 0): "pillar", (3, 0): "marks"},
     )

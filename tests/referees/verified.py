@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from layout.verify import verify_exposure
+from layout.verify.exposure import verify_exposure
 from metalens.core.units import nm
 
 

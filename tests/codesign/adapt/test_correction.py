@@ -66,12 +66,15 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
 def test_the_layout_draws_what_the_table_means(tmp_path):
     plan = _plan(bias_nm=5.0, height_nm=-8.0)
     correction.write_correction(tmp_path, plan)
-    made = processes.load(tmp_path / "bias.toml")
+    made = processes.load_process(tmp_path / "bias.toml")
     assert np.allclose(
         made.bias.drawn_nm(plan.designed_um * 1e3), plan.drawn_nm, atol=2e-3
     )  # 3 decimals in the file
     (tmp_path / "other.toml").write_text('[bias]\ncsv = "bias.csv"\n')
-    assert processes.load(tmp_path / "other.toml").bias.table_nm == made.bias.table_nm
+    assert (
+        processes.load_process(tmp_path / "other.toml").bias.table_nm
+        == made.bias.table_nm
+    )
 
 
 @pytest.mark.parametrize(
@@ -83,7 +86,7 @@ def test_the_present_bias_is_read_as_the_layout_reads_it(tmp_path, text):
     drawn = np.linspace(60, 400, 50)
     assert np.allclose(
         correction.present_bias(tmp_path / "p.toml").at(drawn),
-        processes.load(tmp_path / "p.toml").bias.at(drawn),
+        processes.load_process(tmp_path / "p.toml").bias.at(drawn),
     )
 
 

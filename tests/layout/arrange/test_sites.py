@@ -2,23 +2,19 @@
 apart where they differ.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 import layout
-from layout.formats import (
+from layout.formats import compare, gdsii_write, oasis_write
+from layout.formats.library import (
     QUARTERS,
-    CellContent,
-    CellCopies,
-    MaskAssembly,
+    CellReference,
+    MaskCell,
+    MaskLibrary,
     PillarSites,
-    compare,
-    gdsii_write,
-    oasis_write,
 )
-from layout.mask import PillarLattice
+from layout.mask.plan import PillarArray
 
 NAMES = (
     "THIN",
@@ -28,31 +24,21 @@ NAMES = (
 )  # of unequal length; the second class has no cell and does not occur
 
 
-def assembly(block):
+def assembly(block, turn=5):
     cells = {
-        name: CellContent(name, {(1, 0): [np.array([[0, 0], [90 + n, 0], [0, 80]])]})
+        name: MaskCell(name, {(1, 0): [np.array([[0, 0], [90 + n, 0], [0, 80]])]})
         for n, name in enumerate(NAMES)
         if name
     }
-    cells |= {"LENS": CellContent("LENS"), "TOP": CellContent("TOP")}
     sites = PillarSites(
-        PillarLattice.of("OWN", block, pitch=410, x0=-7001, y0=9003), NAMES
+        PillarArray.of("OWN", block, pitch=410, x0=-7001, y0=9003), NAMES
     )
-    copies = {
-        "TOP": (
-            CellCopies(
-                "LENS",
-                500,
-                -300,
-                QUARTERS[5],
-                columns=3,
-                rows=2,
-                across=(20_000, 0),
-                up=(0, 30_000),
-            ),
-        )
-    }
-    return MaskAssembly("LIB", cells, copies, sites={"LENS": sites})
+    lenses = CellReference(
+        "LENS", 500, -300, QUARTERS[turn], 3, 2, (20_000, 0), (0, 30_000)
+    )
+    cells["LENS"] = MaskCell("LENS", pillars=sites)
+    cells["TOP"] = MaskCell("TOP", references=(lenses,))
+    return MaskLibrary("LIB", cells)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +60,7 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
     assert compare.mask_differences(made, content) == []
     if keep is None:
         row, column = np.nonzero(block == 3)
-        x, y = content.sites("LENS")["WIDER_ONE"]
+        x, y = content.places("LENS")["WIDER_ONE"]
         wanted = {
             (-7001 + 410 * c, 9003 - 410 * r)
             for r, c in zip(row.tolist(), column.tolist(), strict=True)
@@ -87,8 +73,4 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
         assert not np.array_equal(other, block)
         found = compare.mask_differences(assembly(other), content)
         assert any(text.startswith("cell LENS: ") for text in found), found
-    moved = dataclasses.replace(
-        made,
-        copies={"TOP": (dataclasses.replace(made.copies["TOP"][0], turn=QUARTERS[4]),)},
-    )
-    assert compare.mask_differences(moved, content)
+    assert compare.mask_differences(assembly(block, turn=4), content)

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from layout.arrange import WaferSettings, wafer
+from layout.arrange import wafer
+from layout.arrange.record import WaferSettings
 
 
 def notch_outline(radius, depth, bottom=0.9):

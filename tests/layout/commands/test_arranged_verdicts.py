@@ -9,7 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from layout.formats import CellContent, MaskAssembly, gdsii_write
+from layout.formats import gdsii_write
+from layout.formats.library import MaskCell, MaskLibrary
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -59,16 +60,16 @@ def folder(tmp_path_factory):
             "hyperbolic",
         )
         lens.save(target / f"{name}.h5", made)
-    pads = CellContent("PADS", {(1, 0): [square(0, 0, 5000), square(9000, 0, 4000)]})
+    pads = MaskCell("PADS", {(1, 0): [square(0, 0, 5000), square(9000, 0, 4000)]})
     flat = np.array([[0, 0], [700, 0], [1400, 0]])
     there_and_back = np.array([[0, 0], [700, 0], [700, 300], [700, 0]])
-    thin = CellContent(
+    thin = MaskCell(
         "THIN",
         {(1, 0): [square(0, 0, 5000)], (20, 3): [flat], (21, 0): [there_and_back]},
     )
     for cell in (pads, thin):
         file = target / f"{cell.name.lower()}.gds"
-        gdsii_write.write_gdsii(MaskAssembly(cell.name, {cell.name: cell}, {}), file)
+        gdsii_write.write_gdsii(MaskLibrary(cell.name, {cell.name: cell}), file)
     (target / "pec.toml").write_text(PEC)
     (target / "plain.toml").write_text(PLAIN)
     return target

@@ -12,7 +12,8 @@ import pytest
 
 import layout
 from layout.commands import make, page
-from layout.drc import check_plan, write_lyp, write_lyrdb
+from layout.drc.klayout import write_lyp, write_lyrdb
+from layout.drc.lattice import check_plan
 from layout.formats import dxf
 from layout.pec.psf import point_exposure
 from layout.process.process import DesignRules, ExposureSettings
@@ -91,7 +92,6 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
         "die.png",
         "pillars.png",
         "diameters.png",
-        "margins.png",
         "process.toml",
         "layout.json",
     } <= names
@@ -102,7 +102,7 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
         layout.read_oasis(target / "mask.oas"),
         layout.read_gdsii(target / "mask.gds"),
     ):
-        assert sum(content.counts("LENS").values()) == planned
+        assert sum(len(x) for x, _ in content.places("LENS").values()) == planned
     page = (target / "report.html").read_text()
     assert "violations" in page
     assert f"as {planned:,} pillars ({values['pillars']:,} on the die" in page
@@ -115,7 +115,7 @@ def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(
 ):
     behind = replace(lens.load(lens_file), layers=Layers(stop=Stop(9.0, 4.0)))
     lens.save(tmp_path / "behind.h5", behind)
-    monkeypatch.setattr(make.build, "prepare_mask", None)
+    monkeypatch.setattr(make.build, "draw_mask", None)
     assert run(tmp_path / "behind.h5", "-o", tmp_path / "mask", "--study") == 2
     assert "study the same lens designed without layers.stop" in capsys.readouterr().err
     assert not (tmp_path / "mask").exists()
@@ -161,11 +161,11 @@ def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(
     measured = ExposureSettings(csv=tmp_path / "point.csv")
     point = point_exposure(measured)
     assert 1e-3 < point.fit_error < 0.05
-    told = page._table_said(measured, point)
+    told = page._fit_text(measured, point)
     assert f"the table point.csv, as {len(point.weights)} Gaussians" in told
     assert f"by up to {100 * point.fit_error:.2g} % of the whole" in told
     assert (
-        page._table_said(ExposureSettings(alpha_um=0.01, beta_um=40.0, eta=0.7), point)
+        page._fit_text(ExposureSettings(alpha_um=0.01, beta_um=40.0, eta=0.7), point)
         == ""
     )
 

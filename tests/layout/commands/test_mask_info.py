@@ -6,14 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from layout.formats import (
-    QUARTERS,
-    CellContent,
-    CellCopies,
-    MaskAssembly,
-    gdsii_write,
-    oasis_write,
-)
+from layout.formats import gdsii_write, oasis_write
+from layout.formats.library import QUARTERS, CellReference, MaskCell, MaskLibrary
 from metalens.cli import BAD_INPUT, SUCCESS, main
 
 klayout = pytest.importorskip("klayout.db")
@@ -82,28 +76,28 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
     """
     box = np.array([[0, 0], [130, 0], [130, 70]])
     dot, bar = (
-        CellContent(name, {(7, n): [box] * (n + 1)})
+        MaskCell(name, {(7, n): [box] * (n + 1)})
         for n, name in enumerate(("DOT", "BAR"))
     )
-    lens, die, wafer = (CellContent(name) for name in ("LENS", "DIE", "WAFER"))
     steps = {"across": (300, 0), "up": (0, 310)}
     copies = {
         "LENS": (
-            CellCopies("DOT", 0, 0, columns=600, rows=700, **steps),
-            CellCopies("BAR", 5, 9, QUARTERS[3]),
+            CellReference("DOT", 0, 0, columns=600, rows=700, **steps),
+            CellReference("BAR", 5, 9, QUARTERS[3]),
         ),
         "DIE": (
-            CellCopies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
-            CellCopies("BAR", 0, 0, rows=3, up=(0, 9)),
+            CellReference("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
+            CellReference("BAR", 0, 0, rows=3, up=(0, 9)),
         ),
         "WAFER": (
-            CellCopies("DIE", -7, 0, columns=210, rows=330, **steps),
-            CellCopies("LENS", 0, 0),
+            CellReference("DIE", -7, 0, columns=210, rows=330, **steps),
+            CellReference("LENS", 0, 0),
         ),
     }
-    cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
+    cells = {"DOT": dot, "BAR": bar}
+    cells |= {name: MaskCell(name, references=r) for name, r in copies.items()}
     write = oasis_write.write_oasis if ending == "oas" else gdsii_write.write_gdsii
-    write(MaskAssembly("WAFER", cells, copies), tmp_path / f"w.{ending}")
+    write(MaskLibrary("WAFER", cells), tmp_path / f"w.{ending}")
     assert main(["info", str(tmp_path / f"w.{ending}"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
     lenses = 210 * 330 * 40 * 50 + 1
@@ -117,19 +111,17 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
     but those that are drawn.
     """
     box = np.array([[0, 0], [130, 0], [130, 70]])
-    cells = [
-        CellContent("A", {(7, 0): [box]}),
-        CellContent("EMPTY"),
-        CellContent("ONE"),
-        CellContent("TWO"),
-    ]
+    cells = [MaskCell("A", {(7, 0): [box]}), MaskCell("EMPTY")]
     copies = {
-        "ONE": (CellCopies("A", 0, 0), CellCopies("EMPTY", 0, 0, rows=9, up=(0, 5))),
-        "TWO": (CellCopies("A", 3, 4),) * 3,
+        "ONE": (
+            CellReference("A", 0, 0),
+            CellReference("EMPTY", 0, 0, rows=9, up=(0, 5)),
+        ),
+        "TWO": (CellReference("A", 3, 4),) * 3,
     }
+    cells += [MaskCell(name, references=r) for name, r in copies.items()]
     gdsii_write.write_gdsii(
-        MaskAssembly("L", {cell.name: cell for cell in cells}, copies),
-        tmp_path / "w.gds",
+        MaskLibrary("L", {cell.name: cell for cell in cells}), tmp_path / "w.gds"
     )
     assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from layout.commands.check import read_mask
-from layout.drc import check_library
+from layout.drc.library import check_library
+from layout.formats.reading import read_mask
 from layout.process.process import DesignRules
 from metalens import cli
 

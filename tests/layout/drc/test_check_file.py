@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands.check import read_mask
-from layout.drc import check_library, check_plan
-from layout.formats import CellContent, MaskContent
-from layout.mask import build
+from layout.drc.lattice import check_plan
+from layout.drc.library import check_library
+from layout.formats.library import MaskCell, MaskLibrary
+from layout.formats.reading import read_mask
 from layout.process import process as processes
 from layout.process.process import DesignRules
 from metalens import cli
@@ -299,8 +299,8 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
     process.write_text(
         'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 20\n'
     )
-    rules = processes.load(process)
-    plan = build.prepare_mask(DiameterMap(size, 0.3), rules, furniture="none").plan
+    rules = processes.load_process(process)
+    plan = layout.plan(DiameterMap(size, 0.3), rules, furnished=False)
     layout.write_oasis(plan, tmp_path / "m.oas")
     planned = check_plan(plan, rules.rules)
     assert (
@@ -325,8 +325,8 @@ def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
     process.write_text(
         'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n'
     )
-    rules = processes.load(process)
-    plan = build.prepare_mask(DiameterMap(size, 0.33), rules, furniture="none").plan
+    rules = processes.load_process(process)
+    plan = layout.plan(DiameterMap(size, 0.33), rules, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
     assert check_plan(plan, rules.rules).ok
     assert (
@@ -393,7 +393,7 @@ def test_a_polygon_without_area_draws_nothing(flat):
     """
     box = np.array([[0, 0], [500, 0], [500, 400], [0, 400]])
     for drawn in ([box], []):
-        cell = CellContent("T", {(1, 0): [*drawn, np.array(flat)]})
-        report = check_library(MaskContent("GDSII", 1.0, {"T": cell}), DesignRules())
+        cell = MaskCell("T", {(1, 0): [*drawn, np.array(flat)]})
+        report = check_library(MaskLibrary("", {"T": cell}), DesignRules())
         assert report.ok == bool(drawn)  # nothing checked is not passed
         assert report.minimum_width_nm == (400 if drawn else math.inf)

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.drc import check_plan
+from layout.drc.lattice import check_plan
 from layout.drc.report import Violation
-from layout.mask.plan import MaskPlan, PillarClass, PillarLattice
-from layout.process import DesignRules
+from layout.mask.plan import MaskPlan, PillarArray, PillarClass
+from layout.process.process import DesignRules
 
 UNIT_NM = 0.5
 LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
@@ -28,7 +28,7 @@ def plan_of(
     *made, classes=((1, 2), (0, 0)), pitch=300, down=500, x0=-700, y0=900, grid=1
 ):
     """Rows lie ``down`` apart, from y0 downwards."""
-    lattice = PillarLattice.of(
+    lattice = PillarArray.of(
         "L", np.array(classes, np.uint8), pitch=pitch, x0=x0, y0=y0
     )
     return MaskPlan(

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from layout.drc import check_plan
+from layout.drc.lattice import check_plan
 from layout.drc.report import DrcReport
 from layout.mask.plan import (
     FigureCell,
     MaskPlan,
+    PillarArray,
     PillarClass,
-    PillarLattice,
     pillar_classes,
 )
 from layout.process.process import DesignRules, KeepOutZone
@@ -34,7 +34,7 @@ def plan_of(diameters, classes, *, pitch=400, vertices=16):
         vertices=vertices,
         shape="round",
     )
-    lattice = PillarLattice.of(
+    lattice = PillarArray.of(
         "LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000
     )
     return MaskPlan("TOP", made, (lattice,))
@@ -157,7 +157,7 @@ def test_overlap_and_touch_are_found_with_their_place():
     touching = MaskPlan(
         "T",
         (PillarClass("A", 450.0, 450, (1, 0), square),),
-        (PillarLattice.of("L", np.ones((1, 2), np.uint8), pitch=400, x0=0, y0=0),),
+        (PillarArray.of("L", np.ones((1, 2), np.uint8), pitch=400, x0=0, y0=0),),
     )
     assert check_plan(touching, LOOSE).minimum_space_nm == 0
     assert not check_plan(touching, LOOSE).ok
@@ -241,7 +241,7 @@ def test_exclusion_zones_agree_with_klayout(x, y, w, h):
 def test_structures_that_meet_are_found(make_plan):
     plan = make_plan()
     again = plan.lattices[0]
-    other = PillarLattice.of(
+    other = PillarArray.of(
         "OTHER", np.ones((2, 2), np.uint8), pitch=400, x0=again.x0 + 300, y0=again.y0
     )
     found = check_plan(plan.replace(lattices=(again, other)), LOOSE)

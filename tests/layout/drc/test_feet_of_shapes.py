@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import layout
-from layout.mask import MaskPlan, PillarClass, PillarLattice
-from layout.process import DesignRules
+from layout.mask.plan import MaskPlan, PillarArray, PillarClass
+from layout.process.process import DesignRules
 
 WIDE, LONG, PITCH, ROWS, COLUMNS = 324, 210, 400, 5, 7
 
@@ -22,7 +22,7 @@ def test_every_pair_of_feet_that_is_too_near_is_counted(lean_nm, least):
     )
     sites = np.ones((ROWS, COLUMNS), np.uint8)
     sites[2, 3] = 0
-    lens = PillarLattice.of("LENS", sites, pitch=PITCH, x0=0, y0=0)
+    lens = PillarArray.of("LENS", sites, pitch=PITCH, x0=0, y0=0)
     plan = MaskPlan("TOP", (made,), (lens,))
     rules = DesignRules(minimum_foot_gap_nm=50)
     found = layout.check_plan(plan, rules, foot_nm=np.array([WIDE + lean_nm]))

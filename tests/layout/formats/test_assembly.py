@@ -4,21 +4,15 @@ them, read by KLayout too.
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from layout.formats import (
+from layout.formats import gdsii_read, gdsii_write, oasis_read, oasis_write
+from layout.formats.library import (
     QUARTERS,
-    CellContent,
-    CellCopies,
     CellPlacements,
-    MaskAssembly,
+    CellReference,
+    MaskCell,
+    MaskLibrary,
     Orientation,
-    find_arrays,
-    gdsii_read,
-    gdsii_write,
-    oasis_read,
-    oasis_write,
 )
 from metalens.core.errors import ProcessError
 
@@ -80,9 +74,9 @@ def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
     """
     write, read = WRITERS[suffix]
     placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
-    cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in placed.children}
+    cells = {name: MaskCell(name, {(1, 0): [BAR]}) for name in placed.children}
     write(
-        MaskAssembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}),
+        MaskLibrary("TOP", cells | {"TOP": MaskCell("TOP", placed=placed)}),
         tmp_path / f"a{suffix}",
     )
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
@@ -103,11 +97,8 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
         np.arange(308, dtype=np.int32),
         turns,
     )
-    cells = {
-        "A": CellContent("A", {(1, 0): [BAR]}),
-        "TOP": CellContent("TOP", placed=placed),
-    }
-    write(MaskAssembly("TOP", cells, {}), tmp_path / f"a{suffix}")
+    cells = {"A": MaskCell("A", {(1, 0): [BAR]}), "TOP": MaskCell("TOP", placed=placed)}
+    write(MaskLibrary("TOP", cells), tmp_path / f"a{suffix}")
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
     for got, want in zip(
         sorted(listed(found), key=sort_key),
@@ -117,42 +108,6 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
         assert got[2:] == want[2:]
         assert got[1].mirrored == want[1].mirrored
         assert got[1].angle_deg == pytest.approx(want[1].angle_deg, abs=1e-9)
-
-
-@given(
-    seed=st.integers(0, 10_000),
-    shape=st.tuples(st.integers(1, 6), st.integers(1, 5)),
-    loose=st.integers(0, 30),
-)
-def test_arrays_and_what_is_left_are_all_copies_and_none_twice(seed, shape, loose):
-    rng = np.random.default_rng(seed)
-    i, j = (v.ravel() for v in np.meshgrid(np.arange(shape[0]), np.arange(shape[1])))
-    x, y = (
-        np.r_[3 + 31 * i, rng.integers(-60, 60, loose)],
-        np.r_[-7 + 43 * j, rng.integers(-9, 9, loose)],
-    )
-    child, turn = (np.r_[np.full(len(i), k), rng.integers(0, 2, loose)] for k in (1, 0))
-    order = rng.permutation(len(x))
-    placed = placements(child[order], x[order], y[order], turn[order])
-    made, left = find_arrays(placed)
-    assert sorted(expanded(made) + listed(left), key=sort_key) == sorted(
-        listed(placed), key=sort_key
-    )
-    assert all(one.count >= 4 for one in made)
-
-
-def test_a_raster_becomes_one_array_however_it_was_listed():
-    i, j = (v.ravel() for v in np.meshgrid(np.arange(7), np.arange(5)))
-    order = np.random.default_rng(2).permutation(35)
-    made, left = find_arrays(
-        placements(
-            np.ones(35), (11 - 31 * i)[order], (5 + 43 * j)[order], np.full(35, 6)
-        )
-    )
-    assert made == (
-        CellCopies("B", 11 - 31 * 6, 5, QUARTERS[6], 7, 5, (31, 0), (0, 43)),
-    )
-    assert not len(left.child)
 
 
 def assembly():
@@ -166,16 +121,16 @@ def assembly():
         turns,
     )
     cells = {
-        "A": CellContent("A", {(1, 0): [BAR], (1, 7): [ELL - 3]}),
-        "B": CellContent("B", {(2, 3): [ELL]}, {(4, 0): [(1, -2, 3000)]}),
-        "TOP": CellContent("TOP", placed=loose),
+        "A": MaskCell("A", {(1, 0): [BAR], (1, 7): [ELL - 3]}),
+        "B": MaskCell("B", {(2, 3): [ELL]}, {(4, 0): [(1, -2, 3000)]}),
     }
     copies = (
-        CellCopies("A", 5, -6, QUARTERS[5], 3, 4, (0, 1000), (-700, 30)),
-        CellCopies("B", 60_000, -8, Orientation(17.0), 1, 9, (0, 0), (0, -4100)),
-        CellCopies("B", -60_000, 1),
+        CellReference("A", 5, -6, QUARTERS[5], 3, 4, (0, 1000), (-700, 30)),
+        CellReference("B", 60_000, -8, Orientation(17.0), 1, 9, (0, 0), (0, -4100)),
+        CellReference("B", -60_000, 1),
     )
-    return MaskAssembly("TOP", cells, {"TOP": copies}, layer_names={(1, 0): "pillar"})
+    cells["TOP"] = MaskCell("TOP", placed=loose, references=copies)
+    return MaskLibrary("TOP", cells, layer_names={(1, 0): "pillar"})
 
 
 @pytest.mark.parametrize("end", [".gds", ".oas"])
@@ -184,7 +139,7 @@ def test_every_copy_comes_back(tmp_path, end):
     write(made, tmp_path / f"m{end}")
     content = read(tmp_path / f"m{end}")
     assert content.tops == ["TOP"]
-    planned = expanded(made.copies["TOP"]) + listed(made.cells["TOP"].placed)
+    planned = expanded(made.cells["TOP"].references) + listed(made.cells["TOP"].placed)
     there = listed(content.cells["TOP"].placed)
     assert sorted(there, key=sort_key) == sorted(planned, key=sort_key)
     for name in ("A", "B"):
@@ -205,7 +160,7 @@ def test_an_independent_reader_finds_every_shape(tmp_path, end):
     there = db.Layout()
     there.read(str(tmp_path / f"m{end}"))
     top = there.top_cell()
-    planned = expanded(made.copies["TOP"]) + listed(made.cells["TOP"].placed)
+    planned = expanded(made.cells["TOP"].references) + listed(made.cells["TOP"].placed)
     for layer, child, shape in (((1, 0), "A", BAR), ((2, 3), "B", ELL)):
         found = db.Region(top.begin_shapes_rec(there.layer(*layer)))
         found.merged_semantics = False
@@ -230,25 +185,27 @@ def test_an_independent_reader_finds_every_shape(tmp_path, end):
 
 
 def test_files_do_not_grow_with_copies(tmp_path):
-    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
+    dot = MaskCell("A", {(1, 0): [BAR]})
     for end, (write, _) in WRITERS.items():
         sizes = []
         for side in (3, 300):
-            many = CellCopies(
+            many = CellReference(
                 "A", 7, -3, QUARTERS[2], side, side + 1, (100, 0), (0, 130)
             )
             write(
-                MaskAssembly("TOP", cells, {"TOP": (many,)}), tmp_path / f"{side}{end}"
+                MaskLibrary(
+                    "TOP", {"A": dot, "TOP": MaskCell("TOP", references=(many,))}
+                ),
+                tmp_path / f"{side}{end}",
             )
             sizes.append((tmp_path / f"{side}{end}").stat().st_size)
         assert sizes[1] - sizes[0] <= 4  # a few digits of two numbers
 
 
 def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
-    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
-    long = MaskAssembly(
-        "TOP", cells, {"TOP": (CellCopies("A", 0, 0, columns=32768, across=(30, 0)),)}
-    )
+    dot = MaskCell("A", {(1, 0): [BAR]})
+    row = CellReference("A", 0, 0, columns=32768, across=(30, 0))
+    long = MaskLibrary("TOP", {"A": dot, "TOP": MaskCell("TOP", references=(row,))})
     with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
         gdsii_write.write_gdsii(long, tmp_path / "m.gds")
     oasis_write.write_oasis(long, tmp_path / "m.oas")

@@ -1,7 +1,7 @@
 """Options of ezdxf belong to the whole process: a mask leaves them as they were."""
 
 import layout
-from layout.formats import DxfWindow
+from layout.formats.dxf import DxfWindow
 
 
 def test_options_of_ezdxf_are_as_before_and_files_are_alike(plan, tmp_path):

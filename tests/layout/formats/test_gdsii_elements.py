@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import layout
-from layout.commands.check import read_mask
-from layout.formats import flatten
+from layout.formats.library import flatten_stacks
+from layout.formats.reading import read_mask
 from metalens import cli
 
 SQUARE = [(0, 0), (500, 0), (500, 300), (0, 300), (0, 0)]
@@ -72,12 +72,11 @@ def reference(name, x, y, *transform):
 def region_of(db, file):
     own = db.Region()
     content = layout.read_gdsii(file)
-    for shape in (
-        s for top in content.tops for s in flatten.flatten_shapes(content, top)
-    ):
+    for shape in (s for top in content.tops for s in flatten_stacks(content, top)):
         for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True):
-            corners = [db.Point(int(a) + x, int(b) + y) for a, b in shape.outline]
-            own.insert(db.Polygon(corners))
+            for outline in shape.outlines.tolist():
+                corners = [db.Point(a + x, b + y) for a, b in outline]
+                own.insert(db.Polygon(corners))
     return own, content
 
 

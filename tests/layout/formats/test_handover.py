@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import doses, handover
+from layout.formats import handover
+from layout.formats.library import library_of
 from layout.mask import fields
 from layout.process.process import DieSettings, ExposureSettings, Process, WriteField
 from metalens.lens.record import DiameterMap
@@ -62,7 +63,7 @@ def test_areas_of_both_tones_are_the_die():
     total = []
     for tone in ("positive", "negative"):
         plan = layout.plan(lens_map(), dataclasses.replace(PROCESS, tone=tone))
-        areas = handover.areas_um2(plan)
+        areas = library_of(plan).areas_um2()
         total.append(
             sum(area for layer, area in areas.items() if layer[0] in (1, 3, 4, 5, 6))
         )
@@ -86,7 +87,7 @@ def test_areas_of_both_tones_are_the_die():
 
 def test_the_charge_is_dose_times_area(made):
     plan = made[0]
-    areas = handover.areas_um2(plan)
+    areas = library_of(plan).areas_um2()
     want = (
         sum(areas[layer] * dose for layer, dose in plan.doses.items() if layer[0] != 2)
         * 1e-8
@@ -109,9 +110,9 @@ def test_marks_stand_in_the_corners_whatever_the_tone_and_the_doses(change):
     process = dataclasses.replace(
         PROCESS, die=DieSettings(mark_um=80.0, mark_width_um=4.0), **change
     )
-    from layout.mask import build
-
-    plan = build.prepare_mask(lens_map(), process).plan
+    plan = layout.plan(lens_map(), process)
+    if process.exposure.corrected:
+        plan = layout.correct(plan, process.exposure)
     marks = handover.marks_um(plan)
     crosses = [m for m in marks if m[2:] == (80.0, 80.0)]
     assert len(marks) == 9  # four crosses, coarse and fine, and the F
@@ -156,4 +157,4 @@ def test_a_dose_table_that_an_editor_saved_is_read(tmp_path):
     path.write_text(
         "layer,datatype,relative_dose\n7,3,1.375\n2,0,0.9\n", encoding="utf-8-sig"
     )
-    assert doses.read_dose_table(path) == {(7, 3): 1.375, (2, 0): 0.9}
+    assert handover.read_dose_table(path) == {(7, 3): 1.375, (2, 0): 0.9}

@@ -9,11 +9,11 @@ import zlib
 import numpy as np
 import pytest
 
-from layout.drc import check_library
-from layout.formats import gdsii_read, hierarchy, oasis_read
+from layout.drc.library import check_library
+from layout.formats import gdsii_read, oasis_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
-from layout.process import DesignRules
+from layout.process.process import DesignRules
 from metalens import cli
 from metalens.core.errors import MaskFileError
 
@@ -198,10 +198,10 @@ def test_the_number_of_shapes_is_the_product_of_the_arrays():
             np.uint8,
         )
     )
-    assert dict(hierarchy.count_shapes(content)) == {(9, 3): 9 * 8 * 7 * 3}
-    hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3)
+    assert dict(content.count_shapes()) == {(9, 3): 9 * 8 * 7 * 3}
+    content.refuse_beyond(9 * 8 * 7 * 3)
     with pytest.raises(MaskFileError, match=r"1,512 shapes.*at most 1,511"):
-        hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
+        content.refuse_beyond(9 * 8 * 7 * 3 - 1)
 
 
 def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
@@ -217,7 +217,7 @@ def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
             np.uint8,
         )
     )
-    assert hierarchy.count_shapes(content)[9, 3] == 2 * (5 + 7) + 1
+    assert content.count_shapes()[9, 3] == 2 * (5 + 7) + 1
 
 
 def test_shapes_on_each_other_are_refused_before_they_are_paired():

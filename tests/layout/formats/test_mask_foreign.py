@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import flatten, gdsii_read
+from layout.formats import gdsii_read
 from layout.formats import gdsii_records as gds
 from layout.formats import oasis_records as oasis
+from layout.formats.library import flatten_stacks
 from metalens.core.errors import MaskFileError
 
 db = pytest.importorskip("klayout.db")
@@ -19,14 +20,12 @@ db = pytest.importorskip("klayout.db")
 def region_of(content, layer):
     """Everything on a layer, flat, as a region of KLayout."""
     found = db.Region()
-    for shape in flatten.flatten_shapes(content, content.tops[0]):
+    for shape in flatten_stacks(content, content.tops[0]):
         if shape.layer == layer:
             for x, y in zip(shape.x.tolist(), shape.y.tolist(), strict=True):
-                found.insert(
-                    db.Polygon(
-                        [db.Point(int(px) + x, int(py) + y) for px, py in shape.outline]
-                    )
-                )
+                for outline in shape.outlines.tolist():
+                    corners = [db.Point(px + x, py + y) for px, py in outline]
+                    found.insert(db.Polygon(corners))
     return found
 
 
@@ -159,13 +158,13 @@ def aref(columns, rows, *corners):
 
 
 def test_arrays_off_the_grid_stand_next_to_their_places():
-    x, _ = gdsii_read.parse_gdsii(gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))).sites(
-        "TOP"
-    )["A"]
+    x, _ = gdsii_read.parse_gdsii(
+        gdsii(aref(3, 1, (0, 0), (1000, 0), (0, 100)))
+    ).places("TOP")["A"]
     assert x.tolist() == [0, 333, 667]
     x, y = gdsii_read.parse_gdsii(
         gdsii(aref(2, 3, (7, 9), (7 + 41, 9 - 13), (7 + 20, 9 + 100)))
-    ).sites("TOP")["A"]
+    ).places("TOP")["A"]
     exact = {
         (7 + 20.5 * i + 20 / 3 * j, 9 - 6.5 * i + 100 / 3 * j)
         for i in range(2)
@@ -176,9 +175,9 @@ def test_arrays_off_the_grid_stand_next_to_their_places():
     assert all(
         min(max(abs(u - p), abs(v - q)) for p, q in found) <= 0.5 for u, v in exact
     )
-    x, _ = gdsii_read.parse_gdsii(gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))).sites(
-        "TOP"
-    )["A"]
+    x, _ = gdsii_read.parse_gdsii(
+        gdsii(aref(3, 1, (5, 0), (1004, 0), (5, 100)))
+    ).places("TOP")["A"]
     assert x.tolist() == [5, 338, 671]
 
 
@@ -199,9 +198,9 @@ def test_places_that_leave_32_bits_are_refused_and_not_wrapped():
         ),
     )
     with pytest.raises(MaskFileError, match="32 bits"):
-        content.sites("OUTER")
+        content.places("OUTER")
     with pytest.raises(MaskFileError, match="32 bits"):
-        list(flatten.flatten_shapes(content, "OUTER"))
+        list(flatten_stacks(content, "OUTER"))
 
 
 def oasis_file(*records):

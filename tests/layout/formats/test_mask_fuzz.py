@@ -10,15 +10,16 @@ import pytest
 
 import layout
 from layout.commands.validate import validate_mask
-from layout.formats import CellContent, MaskAssembly, gdsii_read, oasis_read
+from layout.formats import gdsii_read, oasis_read
 from layout.formats import gdsii_write as assemble
+from layout.formats.library import MaskCell, MaskLibrary
 from metalens import cli
 from metalens.core.errors import MaskFileError
 
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
 READ = {"gds": gdsii_read.read_gdsii, "oas": oasis_read.read_oasis}
 PARSE = {"gds": gdsii_read.parse_gdsii, "oas": oasis_read.parse_oasis}
-FORMS = [("gds", {}), ("oas", {}), ("oas", {"fold": False})]
+FORMS = [("gds", {}), ("oas", {})]
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def fuzz(masks, count, seed):
             try:
                 content = PARSE[suffix](broken, limit=LIMIT)
                 for top in content.tops[:3]:
-                    content.counts(top)
+                    content.places(top)
             except MaskFileError as error:
                 refused += "byte" in str(error) or "cell" in str(error)
             finally:
@@ -194,8 +195,8 @@ def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
     assert values["form"] == []
     assert first == (0 if values["ok"] else 1)
     square = np.array([[0, 0], [900, 0], [900, 900], [0, 900]])
-    both = {name: CellContent(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
-    assemble.write(MaskAssembly("LIB", both, {}), tmp_path / "m.gds")
+    both = {name: MaskCell(name, {(1, 0): [square]}) for name in ("ONE", "TWO")}
+    assemble.write_gdsii(MaskLibrary("LIB", both), tmp_path / "m.gds")
     assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
     told = capsys.readouterr().out
     assert "keeps the design rules" in told.splitlines()[0]

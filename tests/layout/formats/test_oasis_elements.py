@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from layout.formats import ByteCursor
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_tiles as tiles
+from layout.formats.oasis_cursor import ByteCursor
 from layout.formats.oasis_write import g_delta
 from metalens.core.errors import MaskFileError
 

@@ -8,7 +8,6 @@ import pytest
 import layout
 from layout.formats import handover
 from layout.mask import fields
-from layout.mask.build import prepare_mask
 from layout.process.process import DesignRules, DieSettings, ExposureSettings, Process
 from metalens.core.errors import ProcessError
 from metalens.lens.record import DiameterMap
@@ -143,7 +142,7 @@ def test_fine_crosses_are_a_fifth_of_the_coarse_ones_beside_them():
 def test_verniers_are_said_on_the_job_sheet_and_can_be_left_out():
     for wanted in (True, False):
         made = process(verniers=wanted)
-        plan = prepare_mask(lens_map(), made).plan
+        plan = layout.plan(lens_map(), made)
         split = fields.split_write_fields(lens_map(), made)
         sheet = handover.job_sheet(plan, made, split, {}, "fine")
         assert (f"{STEP_NM:g} nm longer from bar to bar" in sheet) == wanted

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import layout
-from layout.mask import PillarLattice, build, cells, die, font, marks
+from layout.mask import cells, die, font, marks
+from layout.mask.plan import PillarArray
 from layout.pec import psf
 from layout.process.process import (
     DesignRules,
@@ -111,7 +112,7 @@ def test_a_pitch_off_the_grid_is_refused():
 def test_coordinates_beyond_32_bit_are_refused():
     rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
     with pytest.raises(ProcessError, match="32 bits"):
-        PillarLattice(
+        PillarArray(
             "LENS",
             rows,
             2,
@@ -155,32 +156,17 @@ def test_a_coarse_grid_holds_for_everything():
 BEAM = {"alpha_um": 0.012, "beta_um": 27.0, "eta": 0.65}
 
 
-def test_without_a_point_exposure_the_lens_has_one_datatype_and_one_dose():
-    for process in (
-        Process(),
-        Process(exposure=ExposureSettings(**BEAM, correct=False)),
-    ):
-        made = build.prepare_mask(disc_map(61), process)
-        assert made.dose is None
-        lens = [c for c in made.plan.classes if c.name[0] == "D"]
-        assert {c.layer for c in lens} == {(1, 0)}
-        assert made.plan.doses[1, 0] == 1.0
-
-
 def test_doses_become_named_datatypes_and_every_shape_has_one():
-    made = build.prepare_mask(
-        disc_map(61), Process(exposure=ExposureSettings(**BEAM, tolerance=0.02))
-    )
-    assert made.dose is not None
-    assert made.dose.worst < 0.02
-    drawn = {c.layer for c in made.plan.classes} | {
-        layer for f in made.plan.figures for layer in f.polygons
+    plan = layout.plan(disc_map(61), Process())
+    made = layout.correct(plan, ExposureSettings(**BEAM, tolerance=0.02))
+    drawn = {c.layer for c in made.classes} | {
+        layer for f in made.figures for layer in f.polygons
     }
-    assert drawn - set(made.plan.doses) == {(10, 0)}
-    for c in made.plan.classes:
-        assert made.plan.doses[c.layer] == c.dose
-        assert made.plan.layer_names[c.layer].endswith(f"dose_{c.dose:.4f}")
-    assert len({c.layer for c in made.plan.classes if c.layer[0] == 1}) > 1
+    assert drawn - set(made.doses) == {(10, 0)}
+    for c in made.classes:
+        assert made.doses[c.layer] == c.dose
+        assert made.layer_names[c.layer].endswith(f"dose_{c.dose:.4f}")
+    assert len({c.layer for c in made.classes if c.layer[0] == 1}) > 1
 
 
 def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
@@ -188,7 +174,7 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
     of them, at some edges.
     """
     settings = ExposureSettings(**BEAM, tolerance=0.01)
-    plan = build.prepare_mask(disc_map(41), Process(exposure=settings)).plan
+    plan = layout.correct(layout.plan(disc_map(41), Process()), settings)
     point = psf.point_exposure(settings)
     centres, wide, dose, goal = [], [], [], []
     for lattice in plan.lattices:
@@ -280,7 +266,7 @@ def test_the_aperture_opens_the_lens_and_the_test_structures():
 
 @given(radius=st.floats(1e3, 5e6), grid=st.sampled_from([1, 5]))
 def test_the_aperture_disc_keeps_its_area_and_fits_gdsii(radius, grid):
-    shape = die.disc_polygon(radius, (0.0, 0.0), grid)
+    shape = die.aperture_polygon(radius, (0.0, 0.0), grid)
     assert len(shape) <= 8000
     assert (shape % grid == 0).all()
     # rounding moves each vertex by at most 0.71 grid steps, its edge by as much: 1.5 g

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from layout.drc import check_plan
+from layout.drc.lattice import check_plan
 from layout.formats import compare, gdsii_read, gdsii_write, oasis_read, oasis_write
 from layout.mask import build, shaped
 from layout.process import process as processes
@@ -289,7 +289,7 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
 )
 def test_what_is_not_drawn_is_refused_by_name(made, change, words):
     with pytest.raises(ProcessError, match=words):
-        build.prepare_mask(made, dataclasses.replace(PROCESS, **change))
+        build.draw_mask(made, dataclasses.replace(PROCESS, **change))
 
 
 LONE = dataclasses.replace(PROCESS, bias=Bias(isolated_nm=-14.0, range_um=0.6))
@@ -297,7 +297,7 @@ LONE = dataclasses.replace(PROCESS, bias=Bias(isolated_nm=-14.0, range_um=0.6))
 
 def drawn_of(made, process):
     """(y, x) class of every site, 0 for none."""
-    found = build.prepare_mask(made, process)
+    found = build.draw_mask(made, process)
     return found.cells.classes, (None, *found.plan.classes)
 
 
@@ -743,7 +743,7 @@ def test_sizes_are_rounded_by_no_more_than_is_told():
     made = dataclasses.replace(
         lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4)
     )
-    found = build.prepare_mask(made, PROCESS)
+    found = build.draw_mask(made, PROCESS)
     drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[
         found.cells.classes
     ]

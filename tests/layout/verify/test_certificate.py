@@ -11,11 +11,12 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.formats import doses
-from layout.mask import build
+from layout.formats import handover
 from layout.pec import psf
 from layout.process.process import EtchProfile, ExposureSettings, Process
-from layout.verify import LensRows, polygon_edges, verify_exposure
+from layout.verify import polygon_edges
+from layout.verify.as_written import LensRows
+from layout.verify.exposure import verify_exposure
 from layout.verify.polygon_edges import ExposedPolygons
 from metalens.cell import Cell
 from metalens.core.errors import ProcessError
@@ -38,16 +39,15 @@ def lens_map(n=61, pitch=0.4):
 @functools.cache
 def written(process, furnished=True):
     """The mask as files: the plan, what a reader finds, and its dose table."""
-    plan = build.prepare_mask(
-        lens_map(), process, furniture="die" if furnished else "none"
-    ).plan
+    bare = layout.plan(lens_map(), process, furnished=furnished)
+    plan = layout.correct(bare, process.exposure)
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
-        doses.write_dose_table(plan, process, Path(folder) / "doses.csv")
+        handover.write_dose_table(plan, process, Path(folder) / "doses.csv")
         return (
             plan,
             layout.read_oasis(Path(folder) / "m.oas"),
-            doses.read_dose_table(Path(folder) / "doses.csv"),
+            handover.read_dose_table(Path(folder) / "doses.csv"),
         )
 
 

@@ -7,8 +7,7 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.formats import doses
-from layout.mask import build
+from layout.formats import handover
 from layout.process.process import DieSettings, ExposureSettings, Process
 from layout.verify import polygon_edges
 from layout.verify.polygon_edges import ExposedPolygons
@@ -19,6 +18,11 @@ from tests.referees.verified import verify
 pytest.importorskip("klayout.db")
 
 UNEXPOSED = (2, 7, 10)  # aperture (another step), write fields, outline
+
+
+def corrected(source, process, **options):
+    """The plan of a lens with a dose for every shape."""
+    return layout.correct(layout.plan(source, process, **options), process.exposure)
 
 
 def lens_map(n, pitch, low, high, share):
@@ -63,9 +67,9 @@ def test_every_pillar_comes_out_at_its_size(tmp_path, beam, source):
     circles add 0.3 % and 0.1 nm.
     """
     process = Process(exposure=ExposureSettings(**beam))
-    plan = build.prepare_mask(lens_map(*source), process, furniture="none").plan
+    plan = corrected(lens_map(*source), process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
+    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     assert len(drawn) == plan.counts()[1:].sum()
     terms = [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -107,9 +111,9 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
         die=DieSettings(margin_um=330, mark_um=40, label="R4"),
     )
     made = of_two_sizes(lens_map(29, 0.4, thinnest_um, 0.29, 0.7), thinnest_um, 0.29)
-    plan = build.prepare_mask(made, process).plan
+    plan = corrected(made, process)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
+    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
     drawn = plain_exposure.shapes(tmp_path / "m.gds", tmp_path / "doses.csv", UNEXPOSED)
     resist = plain_exposure.Resist(
         drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
@@ -117,7 +121,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     found = verify(
         plan,
         layout.read_gdsii(tmp_path / "m.gds"),
-        doses.read_dose_table(tmp_path / "doses.csv"),
+        handover.read_dose_table(tmp_path / "doses.csv"),
         process,
     ).report.edges
     assert set(found.layer.tolist()) == {

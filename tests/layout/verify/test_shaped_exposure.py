@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import layout
-from layout.formats import doses
-from layout.mask import build
+from layout.formats import handover
 from layout.process.process import DieSettings, ExposureSettings, Process
-from layout.verify import LensRows, verify_exposure
+from layout.verify.as_written import LensRows
+from layout.verify.exposure import verify_exposure
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
 from metalens.fabrication import Bias
@@ -46,6 +46,11 @@ CASES = {  # shape, lattice, sizes, turned, beam
     ),
 }
 NAMES = ("alpha_um", "beta_um", "eta", "gamma_um", "nu")
+
+
+def corrected(source, process, **options):
+    """The plan of a lens with a dose for every shape."""
+    return layout.correct(layout.plan(source, process, **options), process.exposure)
 
 
 def lens(shape, lattice, sizes, turned, empty=0.25):
@@ -87,13 +92,13 @@ def test_every_shape_comes_out_with_its_area_and_the_certificate_says_how_nearly
     exposure = ExposureSettings(**dict(zip(NAMES, beam, strict=False)))
     process = Process(exposure=exposure, die=DieSettings(margin_um=300))
     source = lens(*made)
-    plan = build.prepare_mask(source, process, furniture="none").plan
+    plan = corrected(source, process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
+    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
     found = certified(
         layout.read_gdsii(tmp_path / "m.gds"),
         plan,
-        doses.read_dose_table(tmp_path / "doses.csv"),
+        handover.read_dose_table(tmp_path / "doses.csv"),
         process,
     )
     assert len(found) == plan.counts()[1:].sum()
@@ -130,14 +135,14 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     assert np.mean(corner.corners, axis=0) == pytest.approx([0.1, -0.1])
     process = Process(exposure=ExposureSettings(alpha_um=0.019, beta_um=3.9, eta=0.75))
     source = lens(corner, lattice, (0.22, 0.226), turned=False)
-    plan = build.prepare_mask(source, process, furniture="none").plan
+    plan = corrected(source, process, furnished=False)
     layout.write_oasis(plan, tmp_path / "m.oas")
-    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
+    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
     rows = LensRows(plan)
     verify_exposure(
         layout.read_oasis(tmp_path / "m.oas"),
         plan,
-        doses.read_dose_table(tmp_path / "doses.csv"),
+        handover.read_dose_table(tmp_path / "doses.csv"),
         process,
         keep=rows.take,
     )
@@ -183,12 +188,12 @@ def test_lone_pillars_of_any_shape_and_lattice_come_out_as_designed(tmp_path, ca
         bias=Bias(isolated_nm=-12.0, range_um=1.1),
     )
     source = lens(*made, empty=0.0)
-    plan = build.prepare_mask(source, process, furniture="none").plan
+    plan = corrected(source, process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    doses.write_dose_table(plan, process, tmp_path / "doses.csv")
+    handover.write_dose_table(plan, process, tmp_path / "doses.csv")
     content, table = (
         layout.read_gdsii(tmp_path / "m.gds"),
-        doses.read_dose_table(tmp_path / "doses.csv"),
+        handover.read_dose_table(tmp_path / "doses.csv"),
     )
     found, d = verify(plan, content, table, process), source.diameters
     x, y, size = found.x_um, found.y_um, found.made_nm

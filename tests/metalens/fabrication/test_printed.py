@@ -1,6 +1,6 @@
 """What is known of a mask without drawing one is what its maker's rules say."""
 
-from layout.process import DesignRules
+from layout.process.process import DesignRules
 from metalens.fabrication import Printed, of_process
 
 

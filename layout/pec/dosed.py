@@ -8,24 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from layout.mask.build import check_layers
 from layout.mask.held import hold_on_disk
-from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarClass, PillarLattice
-from layout.pec import (
-    DoseLadder,
-    DoseSolution,
-    DrawnDiscs,
-    DrawnKinds,
-    DrawnOutlines,
-    ExposedRectangles,
-    PillarArray,
-)
+from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarClass
 from layout.pec import correct as dose
-from layout.process import LayerNumber, Process
+from layout.pec.assign import DoseLadder, dose_ladder
+from layout.pec.bodies import ExposedRectangles
+from layout.pec.correct import DoseSolution
+from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
+from layout.process.process import ExposureSettings, LayerNumber, LayerTable
 from layout.shapes import rectilinear
 from metalens.core.arrays import Array
+from metalens.core.errors import ProcessError
 from metalens.core.units import nm
-
-_BLOCK_SITES = 1 << 22
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -41,26 +36,74 @@ class WantedPlan:
     of: Array
 
 
-def solve_wanted_doses(plan: MaskPlan, process: Process) -> WantedPlan:
+def solve_wanted_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedPlan:
     """The doses that everything on a plan needs, before they are rounded to classes.
 
     Raises:
         ProcessError: as :func:`layout.pec.correct.correct`.
     """
-    dose.refuse_negative(process)
+    if plan.standing is not None:
+        raise ProcessError(
+            "a dose per pillar needs drawn pillars, but tone is 'negative' (the gaps "
+            "are drawn); draw the pillars, or set exposure.correct = false"
+        )
     unit = plan.unit_nm * nm
-    parts = [_body(lattice, unit) for lattice in plan.lattices]
+    parts = [dataclasses.replace(l, unit_um=unit) for l in plan.lattices]
     goals = np.array([1.0, *(made.goal for made in plan.classes)])
-    boxes, of, group = _pieces(plan, parts, process)
+    boxes, of, group = _pieces(plan, parts, exposure)
     cut = ExposedRectangles(boxes * unit, group, np.ones(len(boxes)))
-    found = dose.solve_doses(
-        parts, _drawn(plan, unit), goals, process.exposure, cut=cut
-    )
+    found = dose.solve_doses(parts, _drawn(plan, unit), goals, exposure, cut=cut)
     return WantedPlan(plan, found, boxes, of)
 
 
+def correct(mask: MaskPlan, exposure: ExposureSettings) -> MaskPlan:
+    """Proximity effect correction: a plan with a dose for every shape.
+
+    Args:
+        mask: of a die, every dose 1.
+        exposure: point exposure, tolerance and number of doses.
+
+    Raises:
+        ProcessError: as :func:`correct_plans`.
+
+    Accuracy:
+        Edges of all shapes are at dose to size within the tolerance, as
+        :func:`layout.verify.exposure.verify_exposure` finds.
+    """
+    return correct_plans([mask], exposure)[0][0]
+
+
+def correct_plans(
+    plans: Sequence[MaskPlan],
+    exposure: ExposureSettings,
+    layers: LayerTable | None = None,
+) -> list[tuple[MaskPlan, DoseSolution]]:
+    """Plans that are written in one job, with a dose for every shape.
+
+    Args:
+        plans: each with the lens, if any, as its first lattice.
+        exposure: point exposure, tolerance and number of doses.
+        layers: whose numbers no dose may take; None: not checked.
+
+    Returns:
+        The dosed plans, every dose rounded to the nearest of one geometric series for
+        all of them.
+
+    Raises:
+        ProcessError: as :func:`layout.pec.correct.solve_doses`; a negative tone;
+            datatypes of the doses that are layers of something else.
+    """
+    wanted = [solve_wanted_doses(plan, exposure) for plan in plans]
+    steps = dose_ladder([one.doses.range for one in wanted], exposure)
+    made = [apply_dose_classes(one, *steps) for one in wanted]
+    for plan, _ in made:
+        if layers is not None:
+            check_layers(plan, layers)
+    return made
+
+
 def apply_dose_classes(
-    wanted: WantedPlan, process: Process, ladder: DoseLadder, needed: int
+    wanted: WantedPlan, ladder: DoseLadder, needed: int
 ) -> tuple[MaskPlan, DoseSolution]:
     """The plan with corrected doses: classes of diameter and dose, marks and labels in
     pieces of one dose each.
@@ -69,17 +112,17 @@ def apply_dose_classes(
     """
     plan, boxes, of = wanted.plan, wanted.boxes, wanted.of
     found = dose.round_doses(wanted.doses, ladder, needed)
-    classes, lookup, names = _classes(plan, found, process)
+    classes, lookup, names = _classes(plan, found)
     lattices = tuple(_redrawn(l, n, found, lookup) for n, l in enumerate(plan.lattices))
     figures, more = _figures(plan, found, (boxes, of))
     doses = {**{made.layer: made.dose for made in classes}, **more}
     kept = {
         layer: level
         for layer, level in plan.doses.items()
-        if layer not in _replaced(plan, process)
+        if layer not in _replaced(plan)
     }
     titled = {
-        **_untitled(plan, process),
+        **_untitled(plan),
         **names,
         **{layer: _name(plan, layer, level) for layer, level in more.items()},
     }
@@ -95,13 +138,6 @@ def apply_dose_classes(
     )
 
 
-def _body(lattice: PillarLattice, unit: float) -> PillarArray:
-    """Sites in um."""
-    place = lattice.pitch * unit, lattice.x0 * unit, lattice.y0 * unit
-    rows = lattice.row_pitch * unit, lattice.centred
-    return PillarArray(lattice.rows, lattice.columns, *place, lattice.source, *rows)
-
-
 def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
     """The classes as discs where all stand for one, else as polygons."""
     if all(made.round for made in plan.classes):
@@ -113,7 +149,7 @@ def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
     )
 
 
-def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
+def _replaced(plan: MaskPlan) -> set[LayerNumber]:
     """Layers whose shapes get datatypes of their own."""
     return {made.layer for made in plan.classes} | {
         layer
@@ -123,8 +159,8 @@ def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
     }
 
 
-def _untitled(plan: MaskPlan, process: Process) -> dict[LayerNumber, str]:
-    gone = _replaced(plan, process)
+def _untitled(plan: MaskPlan) -> dict[LayerNumber, str]:
+    gone = _replaced(plan)
     return {
         layer: name for layer, name in plan.layer_names.items() if layer not in gone
     }
@@ -144,7 +180,7 @@ def layer_title(kind: str, level: float) -> str:
 
 
 def _pieces(
-    plan: MaskPlan, parts: Sequence[PillarArray], process: Process
+    plan: MaskPlan, parts: Sequence[PillarArray], exposure: ExposureSettings
 ) -> tuple[Array, Array, Array]:
     """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer
     number, (n,) shape.
@@ -167,7 +203,7 @@ def _pieces(
     every = np.concatenate(whole)
     step_um = plan.grid * plan.unit_nm * nm
     made, box = dose.fracture_by_surroundings(
-        every // plan.grid, parts, process.exposure, step_um=step_um
+        every // plan.grid, parts, exposure, step_um=step_um
     )
     return made * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
 
@@ -199,15 +235,15 @@ def _touching(boxes: Array) -> Array:
 
 
 def _classes(
-    plan: MaskPlan, found: DoseSolution, process: Process
+    plan: MaskPlan, found: DoseSolution
 ) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
     """Classes of diameter and dose, (old class, dose) -> new class number, and names of
     their layers.
     """
     used = np.argwhere(found.pairs > 0)
-    bases = {
-        kind: getattr(process.layers, kind) for kind in ("pillar", "dose", "witness")
-    }
+    bases: dict[str, LayerNumber] = {}
+    for made in plan.classes:
+        bases[made.role] = min(made.layer, bases.get(made.role, made.layer))
     datatypes: dict[str, list[int]] = {kind: [] for kind in bases}
     for k, j in used.tolist():
         kind = plan.classes[k - 1].role
@@ -219,7 +255,7 @@ def _classes(
     lookup = np.zeros(
         (len(plan.classes) + 1, 256), np.uint8 if len(used) <= 255 else np.uint16
     )
-    made, names = [], {}
+    classes, names = [], {}
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
         old = plan.classes[k - 1]
@@ -227,27 +263,22 @@ def _classes(
         layer = (bases[kind][0], bases[kind][1] + number[kind][j])
         names[layer] = layer_title({"dose": "dose_test"}.get(kind, kind), level)
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
-        made.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
+        classes.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
         lookup[k, j] = n
-    return tuple(made), lookup, names
+    return tuple(classes), lookup, names
 
 
 def _redrawn(
-    lattice: PillarLattice, number: int, found: DoseSolution, lookup: Array
-) -> PillarLattice:
+    lattice: PillarArray, number: int, found: DoseSolution, lookup: Array
+) -> PillarArray:
     """A lattice with the classes of diameter and dose, in blocks of rows."""
 
     def blocks() -> Iterator[tuple[int, Array]]:
-        size = max(1, _BLOCK_SITES // max(1, lattice.columns))
-        for first, block in lattice.blocks(size):
-            whole = np.ascontiguousarray(block)
-            yield first, lookup[whole, found.classes(number, first, whole)]
+        for first, block in lattice.blocks():
+            yield first, lookup[block, found.classes(number, first, block)]
 
     kept = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
-    made = kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
-    return dataclasses.replace(
-        made, row_pitch=lattice.row_pitch, centred=lattice.centred
-    )
+    return kept.within(lattice)
 
 
 def _figures(

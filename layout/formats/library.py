@@ -1,0 +1,603 @@
+"""A mask as cells: polygons, and references to other cells; the walk through them.
+
+One model for what is read from a file and for what is written to one. Millions of
+pillars of a lens stay an array of class numbers (:class:`PillarSites`).
+"""
+
+import dataclasses
+import graphlib
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from layout.formats.digest import PlacementDigest, RunningDigest
+from layout.mask.plan import MaskPlan, PillarArray
+from layout.process.process import LayerNumber
+from layout.shapes import polygon
+from metalens.core.arrays import Array
+from metalens.core.errors import MaskFileError
+
+CIRCLE_CORNERS = 64  # of the polygon that stands for a true circle
+MAX_DEPTH = 64  # of nested references
+_AT_ONCE = 1 << 22  # placements that are sorted by cell at once
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """A mirror at the x axis (or none), then a turn counter-clockwise, then a scale."""
+
+    angle_deg: float = 0.0
+    mirrored: bool = False
+    scale: float = 1.0
+
+    @property
+    def quarter(self) -> bool:
+        """Whether it is a multiple of 90 degrees without a scale."""
+        return self.scale == 1 and self.angle_deg % 90 == 0
+
+    def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Points in this orientation.
+
+        Args:
+            x: coordinates, database units.
+            y: coordinates of the same points.
+
+        Returns:
+            x and y; exact where ``quarter``, else rounded to whole units.
+        """
+        if self.mirrored:
+            y = -y
+        if self.quarter:
+            for _ in range(int(self.angle_deg // 90) & 3):
+                x, y = -y, x
+            return x, y
+        angle = math.radians(self.angle_deg)
+        c, s = self.scale * math.cos(angle), self.scale * math.sin(angle)
+        turned = np.rint(c * x - s * y), np.rint(s * x + c * y)
+        return turned[0].astype(np.int64), turned[1].astype(np.int64)
+
+    def after(self, inner: "Orientation") -> "Orientation":
+        """The orientation that equals ``inner`` followed by this one."""
+        sign = -1 if self.mirrored else 1
+        return Orientation(
+            (self.angle_deg + sign * inner.angle_deg) % 360,
+            self.mirrored != inner.mirrored,
+            self.scale * inner.scale,
+        )
+
+
+QUARTERS = tuple(Orientation(90.0 * (k & 3), bool(k & 4)) for k in range(8))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CellPlacements:
+    """Placements in one cell.
+
+    children: names of cells.
+    child: (n,) index into them.
+    x, y: (n,) int32 places, database units.
+    turn: (n,) index into ``turns``.
+    turns: orientations; the first eight are multiples of 90 degrees counter-clockwise
+        (bits 0-1) after a mirror at the x axis (bit 2).
+    """
+
+    children: tuple[str, ...]
+    child: Array
+    x: Array
+    y: Array
+    turn: Array
+    turns: tuple[Orientation, ...] = QUARTERS
+
+    def kinds(self, part: slice = slice(None)) -> Array:
+        """(n,) number of child and orientation together: child * len(turns) + turn.
+
+        Args:
+            part: of the placements.
+        """
+        return np.asarray(
+            self.child[part].astype(np.int64) * len(self.turns) + self.turn[part]
+        )
+
+
+NOTHING = CellPlacements((), *(np.empty(0, np.int32),) * 3, np.empty(0, np.uint8))
+
+
+@dataclass(frozen=True, slots=True)
+class CellReference:
+    """A cell placed once, or as an array.
+
+    child: name of the cell.
+    x, y: place of the first, database units.
+    turn: orientation of all.
+    columns, rows: of the array; instance (i, j) stands at (x, y) + i across + j up.
+    across, up: steps of the array.
+    """
+
+    child: str
+    x: int
+    y: int
+    turn: Orientation = QUARTERS[0]
+    columns: int = 1
+    rows: int = 1
+    across: tuple[int, int] = (0, 0)
+    up: tuple[int, int] = (0, 0)
+
+    @property
+    def count(self) -> int:
+        """Number of instances."""
+        return self.columns * self.rows
+
+    def places(self) -> tuple[Array, Array]:
+        """x and y of all instances, (count,) each, row by row."""
+        i, j = np.arange(self.columns), np.arange(self.rows)[:, None]
+        x, y = (
+            at + i * a + j * u
+            for at, a, u in zip((self.x, self.y), self.across, self.up, strict=True)
+        )
+        return x.ravel(), y.ravel()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PillarSites:
+    """Pillars of a cell, never all in memory.
+
+    lattice: class numbers.
+    children: cell of each class from 1 on; empty for one that does not occur.
+    """
+
+    lattice: PillarArray
+    children: tuple[str, ...]
+
+    def numbered(self, number: Mapping[str, int]) -> PillarArray:
+        """The lattice with other class numbers.
+
+        Args:
+            number: of each cell; the lattice holds it plus 1, and 0 for other cells.
+        """
+        lookup = np.array(
+            [0, *(number.get(c, -1) + 1 for c in self.children)], np.int32
+        )
+        source = self.lattice.source
+        return dataclasses.replace(
+            self.lattice, source=lambda a, b: lookup[source(a, b)], array=None
+        )
+
+    def sums(self) -> dict[str, tuple[int, ...]]:
+        """{cell: count, sums of x and y, turned, hash} of those that occur."""
+        array, digest = self.lattice, RunningDigest()
+        for first, block in array.blocks():
+            y = array.y0 - first * array.down
+            digest.sites(block, array.x0, y, (array.pitch, array.down))
+        found = digest.of(np.arange(1, len(self.children) + 1))
+        every = (tuple(int(v[k]) for v in found) for k in range(len(self.children)))
+        pairs = zip(self.children, every, strict=True)
+        return {child: sums for child, sums in pairs if sums[0]}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MaskCell:
+    """One cell.
+
+    polygons: {(layer, datatype): (n, 2) corners each}.
+    circles: {(layer, datatype): x, y, radius each}.
+    placed: placements of other cells.
+    texts: number of texts.
+    sums: of the placements of each of ``placed.children``, where there are more than
+        are kept; ``placed`` then holds none.
+    skipped: other elements of the file that draw nothing.
+    references: placements and arrays beside ``placed``.
+    pillars: a lattice of cells beside these.
+    """
+
+    name: str
+    polygons: Mapping[LayerNumber, list[Array]] = field(default_factory=dict)
+    circles: Mapping[LayerNumber, list[tuple[int, int, int]]] = field(
+        default_factory=dict
+    )
+    placed: CellPlacements = NOTHING
+    texts: int = 0
+    sums: PlacementDigest | None = None
+    skipped: Counter[str] = field(default_factory=Counter)
+    references: tuple[CellReference, ...] = ()
+    pillars: PillarSites | None = None
+
+    def kept(self) -> CellPlacements:
+        """The placements.
+
+        Raises:
+            MaskFileError: only their sums were kept.
+        """
+        if self.sums is not None:
+            raise MaskFileError(
+                f"cell {self.name!r}: of its placements only the sums were kept; read "
+                "all of them"
+            )
+        return self.placed
+
+    @property
+    def children(self) -> tuple[str, ...]:
+        """Names of the cells that are placed."""
+        own = (*self.placed.children, *(one.child for one in self.references))
+        more = self.pillars.children if self.pillars is not None else ()
+        return tuple(dict.fromkeys(child for child in (*own, *more) if child))
+
+    def counts(self) -> dict[tuple[str, Orientation], int]:
+        """How often each cell is placed in each orientation; of sums all together."""
+        found: Counter[tuple[str, Orientation]] = Counter()
+        if self.sums is not None:
+            for child, count in zip(
+                self.placed.children, self.sums.count.tolist(), strict=True
+            ):
+                found[child, QUARTERS[0]] += count
+        total = np.zeros(len(self.placed.children) * len(self.placed.turns), np.int64)
+        for first in range(0, len(self.placed.child), _AT_ONCE):
+            kinds = self.placed.kinds(slice(first, first + _AT_ONCE))
+            total += np.bincount(kinds, minlength=len(total))
+        for kind in np.flatnonzero(total).tolist():
+            child, turn = divmod(kind, len(self.placed.turns))
+            key = self.placed.children[child], self.placed.turns[turn]
+            found[key] += int(total[kind])
+        for one in self.references:
+            found[one.child, one.turn] += one.count
+        if self.pillars is not None:
+            number = self.pillars.lattice.counts(len(self.pillars.children))
+            for child, count in zip(
+                self.pillars.children, number[1:].tolist(), strict=True
+            ):
+                found[child, QUARTERS[0]] += count
+        return {key: count for key, count in found.items() if count}
+
+    def instances(self) -> Iterator[tuple[str, Orientation, Array, Array]]:
+        """Placements by cell and orientation: name, orientation, x and y (n,) each.
+
+        Raises:
+            MaskFileError: only sums of the placements were kept.
+        """
+        placed = self.kept()
+        for first in range(0, len(placed.child), _AT_ONCE):
+            block = slice(first, first + _AT_ONCE)
+            x, y = placed.x[block], placed.y[block]
+            for kind, members in group_equal(placed.kinds(block)):
+                child, turn = divmod(kind, len(placed.turns))
+                yield placed.children[child], placed.turns[turn], x[members], y[members]
+        for one in self.references:
+            yield one.child, one.turn, *one.places()
+        if self.pillars is not None:
+            yield from self._pillars(self.pillars)
+
+    def _pillars(
+        self, sites: PillarSites
+    ) -> Iterator[tuple[str, Orientation, Array, Array]]:
+        array = sites.lattice
+        for first, block in array.blocks():
+            row, column = np.nonzero(block)
+            x = array.x0 + column * array.pitch
+            y = array.y0 - (first + row) * array.down
+            for number, members in group_equal(block[row, column]):
+                child = sites.children[number - 1]
+                yield child, QUARTERS[0], x[members], y[members]
+
+    def drawn(self) -> dict[LayerNumber, list[Array]]:
+        """Polygons of each layer, true circles as polygons of 64 corners."""
+        found = {layer: list(shapes) for layer, shapes in self.polygons.items()}
+        for layer, circles in self.circles.items():
+            found.setdefault(layer, []).extend(circle_polygon(*one) for one in circles)
+        return found
+
+    @property
+    def layers(self) -> set[LayerNumber]:
+        """Layers of its own shapes."""
+        return {*self.polygons, *self.circles}
+
+    @property
+    def shapes(self) -> int:
+        """Number of its own shapes; 1 for a cell that holds nothing at all."""
+        own = sum(map(len, (*self.polygons.values(), *self.circles.values())))
+        return own or int(not self.children)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MaskLibrary:
+    """All of a mask.
+
+    name: of the library.
+    cells: by name, in the order of the file.
+    unit_nm: database unit.
+    layer_names: shown by viewers.
+    doses: relative dose of each (layer, datatype) that is exposed, where it is known.
+    kind: of the file that it was read from, ``GDSII`` or ``OASIS``.
+    """
+
+    name: str
+    cells: Mapping[str, MaskCell]
+    unit_nm: float = 1.0
+    layer_names: Mapping[LayerNumber, str] = field(default_factory=dict)
+    doses: Mapping[LayerNumber, float] = field(default_factory=dict)
+    kind: str = ""
+
+    @property
+    def layers(self) -> set[LayerNumber]:
+        """All that are drawn on."""
+        return set().union(*(cell.layers for cell in self.cells.values()))
+
+    @property
+    def tops(self) -> list[str]:
+        """Cells that no other cell places."""
+        used = {name for cell in self.cells.values() for name in cell.children}
+        return [name for name in self.cells if name not in used]
+
+    @property
+    def skipped(self) -> Counter[str]:
+        """Elements of the cells that draw nothing: {kind: number}, texts among them."""
+        found = sum((cell.skipped for cell in self.cells.values()), Counter())
+        texts = sum(cell.texts for cell in self.cells.values())
+        return found + Counter(text=texts)
+
+    def cell(self, name: str) -> MaskCell:
+        """The cell of a name.
+
+        Raises:
+            MaskFileError: no such cell.
+        """
+        if name not in self.cells:
+            raise MaskFileError(
+                f"cell {name!r} is placed, but the file does not hold it"
+            )
+        return self.cells[name]
+
+    def below(self, top: str) -> "MaskLibrary":
+        """The cells that one cell draws, itself as the only top cell.
+
+        Args:
+            top: name of the cell.
+
+        Raises:
+            MaskFileError: the mask has no such cell.
+        """
+        if top not in self.cells:
+            raise MaskFileError(
+                f"no cell {top!r} in the mask; top cells: {', '.join(self.tops[:8])}"
+            )
+        kept: set[str] = set()
+        waiting = [top]
+        while waiting:
+            name = waiting.pop()
+            if name in self.cells and name not in kept:
+                kept.add(name)
+                waiting += self.cells[name].children
+        cells = {name: cell for name, cell in self.cells.items() if name in kept}
+        return dataclasses.replace(self, cells=cells)
+
+    def walk(self, top: str) -> Iterator[tuple[str, Orientation, Array, Array]]:
+        """Every cell below ``top`` and itself: name, orientation, x and y (n,) int32.
+
+        Instances of a cell that places nothing come together, some millions at once.
+
+        Raises:
+            MaskFileError: a cell that places itself or is missing, a place beyond 32
+                bits.
+        """
+        zero = np.zeros(1, np.int32)
+        yield top, QUARTERS[0], zero, zero
+        yield from self._walk(top, QUARTERS[0], 0, 0, ())
+
+    def _walk(
+        self, name: str, turn: Orientation, x: int, y: int, above: tuple[str, ...]
+    ) -> Iterator[tuple[str, Orientation, Array, Array]]:
+        """All cells below an instance of one."""
+        if name in above or len(above) > MAX_DEPTH:
+            raise MaskFileError(
+                f"cell {name!r} places itself through {' > '.join(above[:9])}; the "
+                "file is no mask"
+            )
+        for child, own, px, py in self.cell(name).instances():
+            inner = turn.after(own)
+            px, py = turn.apply(px.astype(np.int64), py.astype(np.int64))
+            px, py = px + x, py + y
+            if max(np.abs(px).max(), np.abs(py).max()) > 2**31 - 1:
+                raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
+            yield child, inner, px.astype(np.int32), py.astype(np.int32)
+            if self.cell(child).children:
+                for u, v in zip(px.tolist(), py.tolist(), strict=True):
+                    yield from self._walk(child, inner, u, v, (*above, name))
+
+    def places(self, top: str) -> dict[str, tuple[Array, Array]]:
+        """{cell: x and y of all its instances} of the cells below ``top`` that place
+        nothing themselves.
+
+        Raises:
+            MaskFileError: as :meth:`walk`.
+        """
+        found: dict[str, list[tuple[Array, Array]]] = {}
+        for name, _, x, y in self.walk(top):
+            if name != top and not self.cells[name].children:
+                found.setdefault(name, []).append((x, y))
+        joined = {name: list(zip(*parts, strict=True)) for name, parts in found.items()}
+        return {
+            n: (np.concatenate(x), np.concatenate(y)) for n, (x, y) in joined.items()
+        }
+
+    def topological_order(self) -> list[str]:
+        """All cells, each after those that place it.
+
+        Raises:
+            MaskFileError: a cell that places itself, or one that is placed and missing.
+        """
+        above: dict[str, list[str]] = {name: [] for name in self.cells}
+        for name, cell in self.cells.items():
+            for child in cell.children:
+                self.cell(child)
+                above[child].append(name)
+        try:
+            return list(graphlib.TopologicalSorter(above).static_order())
+        except graphlib.CycleError as error:
+            name, *others = error.args[1]
+            raise MaskFileError(
+                f"cell {name!r} places itself through {' > '.join(others[:9])}; the "
+                "file is no mask"
+            ) from None
+
+    def drawn_counts(self) -> dict[str, int]:
+        """{cell: how often the top cells draw it}, by products from the top down.
+
+        Raises:
+            MaskFileError: as :meth:`topological_order`.
+        """
+        times = dict.fromkeys(self.topological_order(), 0)
+        times |= dict.fromkeys(self.tops, 1)
+        for name in times:
+            for (child, _), count in self.cells[name].counts().items():
+                times[child] += times[name] * count
+        return times
+
+    def count_shapes(self) -> Counter[LayerNumber]:
+        """Shapes that the top cells draw on each layer.
+
+        Raises:
+            MaskFileError: as :meth:`topological_order`.
+        """
+        found: Counter[LayerNumber] = Counter()
+        for name, times in self.drawn_counts().items():
+            cell = self.cells[name]
+            for shapes in (cell.polygons, cell.circles):
+                found.update({k: times * len(some) for k, some in shapes.items()})
+        return found
+
+    def areas_um2(self) -> dict[LayerNumber, float]:
+        """{layer: sum of the areas of all shapes below the top cells}."""
+        weight = dict.fromkeys(self.topological_order(), 0.0)
+        weight |= dict.fromkeys(self.tops, (1e-3 * self.unit_nm) ** 2)
+        found: dict[LayerNumber, float] = {}
+        for name in weight:
+            cell = self.cells[name]
+            for (child, turn), count in cell.counts().items():
+                weight[child] += weight[name] * count * turn.scale**2
+            for layer, shapes in cell.polygons.items():
+                area = sum(abs(polygon.twice_area(p)) / 2 for p in shapes)
+                found[layer] = found.get(layer, 0.0) + weight[name] * area
+            for layer, circles in cell.circles.items():
+                area = sum(math.pi * radius**2 for *_, radius in circles)
+                found[layer] = found.get(layer, 0.0) + weight[name] * area
+        return found
+
+    def refuse_beyond(self, limit: int) -> None:
+        """Refuse a mask that is too large to be taken apart.
+
+        Args:
+            limit: shapes; instances of a cell that holds nothing count as one each.
+
+        Raises:
+            MaskFileError: more than these; as :meth:`topological_order`.
+        """
+        times = self.drawn_counts()
+        total = sum(count * self.cells[name].shapes for name, count in times.items())
+        if total > limit:
+            raise MaskFileError(
+                f"the mask draws {total:,} shapes when its arrays are taken apart, at "
+                f"most {limit:,} are taken (metalens check --max-shapes sets another "
+                "limit, at 25 to 150 bytes of memory for each)"
+            )
+
+
+def library_of(plan: MaskPlan) -> MaskLibrary:
+    """A plan as cells: pillar classes that occur, figures, lattices, and the top cell."""
+    occurs = plan.counts()[1:] > 0
+    pairs = list(zip(plan.classes, occurs.tolist(), strict=True))
+    children = tuple(made.name if used else "" for made, used in pairs)
+    cells = [
+        MaskCell(made.name, {made.layer: list(made.polygons)})
+        for made, used in pairs
+        if used
+    ]
+    for figure in plan.figures:
+        shapes = {layer: list(some) for layer, some in figure.polygons.items()}
+        cells.append(MaskCell(figure.name, shapes))
+    cells += [
+        MaskCell(lattice.name, pillars=PillarSites(lattice, children))
+        for lattice in plan.lattices
+    ]
+    placed = tuple(CellReference(name, 0, 0) for name in plan.placed_names)
+    cells.append(MaskCell(plan.name, references=placed))
+    by_name = {cell.name: cell for cell in cells}
+    return MaskLibrary(plan.name, by_name, plan.unit_nm, plan.layer_names, plan.doses)
+
+
+def group_equal(numbers: Array) -> Iterator[tuple[int, Array]]:
+    """Each distinct number, and the indices where it stands."""
+    order = np.argsort(numbers, kind="stable")
+    distinct, starts = np.unique(numbers[order], return_index=True)
+    if len(distinct):
+        parts = np.split(order, starts[1:])
+        yield from zip(distinct.tolist(), parts, strict=True)
+
+
+def circle_polygon(x: int, y: int, radius: int) -> Array:
+    """(64, 2) corners of a polygon of the area of a circle, on whole units."""
+    return polygon.disc_polygon(radius, (x, y), CIRCLE_CORNERS)
+
+
+# flat shapes
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PolygonStack:
+    """Polygons of one cell and layer with equally many corners, at the same places.
+
+    outlines: (k, n, 2), counter-clockwise, in the orientation of the instances.
+    x, y: (m,) places of the cell.
+    """
+
+    cell: str
+    layer: LayerNumber
+    outlines: Array
+    x: Array
+    y: Array
+
+
+def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
+    """Every polygon below ``top``; true circles as polygons of 64 corners.
+
+    Raises:
+        MaskFileError: as :meth:`MaskLibrary.walk`.
+    """
+    for name, turn, x, y in library.walk(top):
+        for layer, polygons in library.cell(name).drawn().items():
+            corners = np.array([len(points) for points in polygons])
+            for _, members in group_equal(corners):
+                points = np.stack([polygons[n] for n in members.tolist()])
+                yield PolygonStack(name, layer, _turned(points, turn), x, y)
+
+
+def equal_shapes(
+    library: MaskLibrary, key: Callable[[PolygonStack], Hashable]
+) -> dict[Hashable, list[PolygonStack]]:
+    """Shapes below all top cells that are equal, as stacks of one polygon.
+
+    Args:
+        library: of a file.
+        key: of a stack; polygons of different keys are not equal.
+
+    Raises:
+        MaskFileError: as :meth:`MaskLibrary.walk`.
+    """
+    found: dict[Hashable, list[PolygonStack]] = {}
+    for top in library.tops:
+        for stack in flatten_stacks(library, top):
+            for outline in stack.outlines:
+                same = key(stack), np.ascontiguousarray(outline).tobytes()
+                one = dataclasses.replace(stack, outlines=outline[None])
+                found.setdefault(same, []).append(one)
+    return found
+
+
+def _turned(outlines: Array, turn: Orientation) -> Array:
+    """(k, n, 2) corners in some orientation, counter-clockwise again."""
+    outlines = outlines.astype(np.int64)
+    made = np.stack(turn.apply(outlines[..., 0], outlines[..., 1]), -1)
+    after = np.roll(made, -1, axis=1)
+    area = (made[..., 0] * after[..., 1] - after[..., 0] * made[..., 1]).sum(1)
+    made[area < 0] = made[area < 0, ::-1]
+    return made

@@ -1,2 +1,0 @@
-from . import page as page
-from .focus import check_study_lens as check_study_lens
