@@ -31,6 +31,7 @@ class StandingPart:
 
     @property
     def text(self) -> str:
+        """Name and place."""
         return f"{self.part.name} at ({self.x / PER_UM:g}, {self.y / PER_UM:g}) um"
 
     def box(self) -> Array:

@@ -39,7 +39,7 @@ def read_mask(
     if other:
         raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
     is_oasis = start.startswith(oasis.MAGIC)
-    reader = oasis_read.read_oasis if is_oasis else gdsii_read.read
+    reader = oasis_read.read_oasis if is_oasis else gdsii_read.read_gdsii
     return reader(
         path, limit=placement_limit(path) if limit is None else limit, keep=keep
     )

@@ -28,14 +28,14 @@ def test_public_names_are_functions_even_after_their_modules_are_loaded():
 
 
 def test_unknown_names_are_attribute_errors():
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+    with pytest.raises(AttributeError, match="nonsense"):
         _ = layout.nonsense
 
 
 def test_making_a_mask_never_loads_torch_nor_the_cad_kernel():
     code = (
         "import numpy as np, layout, sys\nfrom metalens.lens import DiameterMap\n"
-        "from layout.process import Process\n"
+        "from layout.process.process import Process\n"
         "plan = layout.plan(DiameterMap(np.full((3, 3), 0.2), 0.4), Process())\n"
         "layout.check_plan(plan, Process().rules)\nprint(' '.join(sys.modules))"
     )

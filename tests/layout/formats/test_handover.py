@@ -79,7 +79,7 @@ def test_areas_of_both_tones_are_the_die():
         )
         * 1e-6
     )
-    positive = handover.areas_um2(layout.plan(lens_map(), PROCESS, furnished=False))
+    positive = library_of(layout.plan(lens_map(), PROCESS, furnished=False)).areas_um2()
     assert positive[1, 0] == pytest.approx(
         lens, rel=2e-3
     )  # steps of 2 nm average out, polygons to 1e-3
