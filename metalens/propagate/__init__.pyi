@@ -4,13 +4,11 @@ from .choice import MethodChoice as MethodChoice
 from .choice import choose_method as choose_method
 from .direct import field_at as field_at
 from .direct import field_exact as field_exact
-from .estimate import SAFETY as SAFETY
-from .estimate import ErrorSample as ErrorSample
+from .estimate import NodeLight as NodeLight
 from .estimate import draw_pixels as draw_pixels
-from .estimate import morton_scan as morton_scan
 from .estimate import pupil_error as pupil_error
 from .estimate import relative_error as relative_error
-from .estimate import square_error as square_error
+from .estimate import sampled_square_error as sampled_square_error
 from .geometry import PropagationCase as PropagationCase
 from .geometry import axis_positions as axis_positions
 from .geometry import check_aperture as check_aperture

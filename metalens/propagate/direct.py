@@ -1,22 +1,177 @@
-"""The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64, and the
-light that meets the lens.
-
-Beside it the angular spectrum as users know it: textbook zero-padded, and band-limited
-(paper Eq. 3).
+"""Direct Rayleigh-Sommerfeld sum over all pillars in float64: the reference of every
+faster method; and the angular spectrum on the zero-padded pillar lattice.
 """
 
+import functools
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.threads import run_split
+from metalens.lens import Media, media
 from metalens.propagate.geometry import PropagationCase, check_aperture
-from metalens.propagate.layered import add_rays, complex_product, media_arrays
-from metalens.propagate.paths import from_source
+from metalens.propagate.paths import from_source, ray_amplitude
 from metalens.propagate.sincos import sincos_turns64
+
+DEGREES = (8, 16, 32, 64)  # of the series of a point wave through films
+ROUNDING = 1e-15  # of the largest coefficient, below which a series has converged
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PointWave:
+    """Field of a point of the lens at lateral distance ρ on the sensor, as series.
+
+        h(ρ) = v² A(v) exp(ik [n D / v + P(v)]),    v = D / √(D² + ρ²)
+
+    In one medium D is the distance, P = 0 and A = v / (2π D²) - ik / (2π D): that is
+    d/(2πr²)(1/r - ik) exp(ikr) itself. Through films A and P are Chebyshev series.
+
+    length_um: D. path_per_v_um: n D. wavenumber: k in rad/um.
+    v_range: (middle, half) of the interval of v that the series map to [-1, 1].
+    series: (degree, 3) Chebyshev coefficients of P, Re A and Im A.
+    """
+
+    length_um: float
+    path_per_v_um: float
+    wavenumber: float
+    v_range: tuple[float, float]
+    series: Array
+
+    @property
+    def numbers(self) -> tuple[Array, Array]:
+        """Arguments of the compiled sum."""
+        ranges = (self.length_um, self.path_per_v_um, self.wavenumber, *self.v_range)
+        return np.array(ranges), self.series
+
+
+def point_wave(case: PropagationCase, points_um: Array) -> PointWave:
+    """Field of a point of the lens at sensor points (point, [x, y]).
+
+    Args:
+        case: lens, distance, wavelength and films behind the lens.
+        points_um: whose farthest sets the range of the series.
+    """
+    if case.behind is None:
+        d, k = case.sensor_distance_um, case.wavenumber
+        series = np.array([[0, 0, -k / (2 * np.pi * d)], [0, 0.5 / (np.pi * d * d), 0]])
+        return PointWave(d, d, k, (0.0, 1.0), series)
+    far = np.abs(points_um).max(0) + case.half_size_um[::-1]
+    return _films_wave(case.behind, case.wavenumber, math.hypot(*far))
+
+
+@functools.lru_cache(maxsize=64)
+def _films_wave(behind: Media, wavenumber: float, reach_um: float) -> PointWave:
+    """Series of the ray's path and amplitude, doubled until their tails round off."""
+    layers = behind.layers
+    length = layers[0][0] * behind.reduced_um
+    level = layers[0][0] * length
+    low = length / math.hypot(length, reach_um)
+    middle, half = (1 + low) / 2, (1 - low) / 2
+    for count in DEGREES:
+        u = chebyshev.chebpts1(count)
+        v = middle + half * u
+        w = media.square(layers, length**2 * (1 / v**2 - 1))
+        path = np.asarray(media.whole_path(layers, w)) - level / v
+        amplitude = ray_amplitude(behind, wavenumber, w, reach_um) / v**2
+        values = np.stack([path, amplitude.real, amplitude.imag], -1)
+        series = chebyshev.chebvander(u, count - 1).T @ values * (2 / count)
+        series[0] /= 2
+        scale = np.array([level, *[np.abs(amplitude).max()] * 2])
+        tail = np.abs(series[-2:] / scale).max()
+        if tail < ROUNDING:
+            break
+    kept = np.flatnonzero((np.abs(series / scale) > ROUNDING / 8).any(1))
+    series = np.ascontiguousarray(series[: kept[-1] + 1])
+    return PointWave(length, level, wavenumber, (middle, half), series)
+
+
+@numba.njit(
+    fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
+)
+def _complex_product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
+    """Σ ab of complex rows given by their parts."""
+    real, imaginary = 0.0, 0.0
+    for j in range(a_re.size):
+        real += a_re[j] * b_re[j] - a_im[j] * b_im[j]
+        imaginary += a_re[j] * b_im[j] + a_im[j] * b_re[j]
+    return complex(real, imaginary)
+
+
+@numba.njit(
+    fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
+)
+def _clenshaw(u, series, column, out, work):  # type: ignore[no-untyped-def]
+    """Chebyshev series (degree, column) along a row of u in [-1, 1]."""
+    before = work
+    out[:], before[:] = series[series.shape[0] - 1, column], 0.0
+    for n in range(series.shape[0] - 2, -1, -1):
+        twice = 2.0 if n > 0 else 1.0
+        for j in range(u.size):
+            now = twice * u[j] * out[j] - before[j] + series[n, column]
+            before[j], out[j] = out[j], now
+
+
+@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
+def _add_point_waves(re, im, x, y, points, wave, out):  # type: ignore[no-untyped-def]
+    """Add the light (depth, y, x) of pillars, times their waves, to (depth, point)."""
+    (length, level, k, middle, half), series = wave
+    columns = x.size
+    v, u, work = np.empty(columns), np.empty(columns), np.empty(columns)
+    path, h_re, h_im = np.empty(columns), np.empty(columns), np.empty(columns)
+    for p in range(points.shape[0]):
+        for i in range(y.size):
+            across = (points[p, 1] - y[i]) ** 2 + length**2
+            for j in range(columns):
+                v[j] = length / np.sqrt((points[p, 0] - x[j]) ** 2 + across)
+                u[j] = (v[j] - middle) / half
+            if series.shape[0] == 2:  # one medium
+                for j in range(columns):
+                    path[j] = 0.0
+                    h_re[j], h_im[j] = series[1, 1] * u[j], series[0, 2]
+            else:
+                _clenshaw(u, series, 0, path, work)
+                _clenshaw(u, series, 1, h_re, work)
+                _clenshaw(u, series, 2, h_im, work)
+            for j in range(columns):
+                turns = (level / v[j] + path[j]) * (k / (2 * np.pi))
+                c, s = sincos_turns64(turns - np.rint(turns))
+                a, b = v[j] * v[j] * h_re[j], v[j] * v[j] * h_im[j]
+                h_re[j], h_im[j] = a * c - b * s, a * s + b * c
+            for z in range(re.shape[0]):
+                out[z, p] += _complex_product(re[z, i], im[z, i], h_re, h_im)
+
+
+def add_point_waves(
+    light: Array,
+    at_um: tuple[Array, Array],
+    points_um: Array,
+    wave: PointWave,
+    out: Array,
+) -> None:
+    """Add the field of points of the lens to ``out`` (depth, point), in float64.
+
+    Args:
+        light: (depth, y, x) complex amplitude of every point.
+        at_um: (y,) and (x,) positions of the points on the lens.
+        points_um: (point, [x, y]) of the sensor plane.
+        wave: of :func:`point_wave`.
+        out: (depth, point) complex128, changed in place.
+    """
+    y, x = at_um
+    real, imaginary = (np.ascontiguousarray(p) for p in (light.real, light.imag))
+    add: Any = _add_point_waves
+    points = np.ascontiguousarray(points_um, float)
+
+    def work(a: int, b: int) -> None:
+        add(real, imaginary, x, y, points[a:b], wave.numbers, out[:, a:b])
+
+    run_split(len(points), work)
 
 
 def field_exact(phase_rad: Array, transmission: Array, case: PropagationCase) -> Array:
@@ -57,6 +212,7 @@ def field_at(
     check_aperture(phase_rad, transmission, case)
     y, x = case.pillars_um
     points = np.ascontiguousarray(points_um, float)
+    wave = point_wave(case, points)
     out = np.zeros((len(case.inverse_depths_per_um), len(points)), complex)
     for start in range(0, case.shape[0], 16):
         rows = slice(start, start + 16)
@@ -72,36 +228,8 @@ def field_at(
             y[rows],
             x[columns],
         )
-        _add_rows(light, (y[rows], x[columns]), points, case, out)
-    return out
-
-
-def _add_rows(
-    light: Array,
-    at_um: tuple[Array, Array],
-    points: Array,
-    case: PropagationCase,
-    out: Array,
-) -> None:
-    """Add the light of pillar rows (depth, y, x) to ``out`` (depth, point)."""
-    y, x = at_um
-    real, imaginary = np.ascontiguousarray(light.real), np.ascontiguousarray(light.imag)
-    numbers: Any = (case.wavenumber, case.sensor_distance_um, case.area_um2)
-    kernel: Any = _accumulate
-    if case.behind is not None:
-        y_far, x_far = (
-            np.abs(points[:, i]).max() + half
-            for i, half in zip((1, 0), case.half_size_um, strict=True)
-        )
-        films = media_arrays(
-            case.behind, case.wavenumber, float(np.hypot(y_far, x_far))
-        )
-        kernel, numbers = add_rays, (case.area_um2, (case.wavenumber, *films))
-
-    def work(a: int, b: int) -> None:
-        kernel(real, imaginary, x, y, points[a:b], numbers, out[:, a:b])
-
-    run_split(len(points), work)
+        add_point_waves(light, (y[rows], x[columns]), points, wave, out)
+    return out * case.area_um2
 
 
 def sum_field(
@@ -117,27 +245,6 @@ def sum_field(
     inverse = np.array(case.inverse_depths_per_um)[:, None, None]
     path = from_source(case, x_um[None, :], y_um[:, None], case.tangents, inverse)
     return np.asarray(transmission * np.exp(1j * (phase_rad + case.wavenumber * path)))
-
-
-@numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _accumulate(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-def]
-    """Add the light of a block of rows to ``out`` (depth, point)."""
-    k, distance, area = numbers
-    depths, rows, columns = re.shape
-    h_re, h_im = np.empty(columns), np.empty(columns)
-    for p in range(points.shape[0]):
-        for i in range(rows):
-            across = (points[p, 1] - y[i]) ** 2 + distance**2
-            for j in range(columns):
-                r2 = (points[p, 0] - x[j]) ** 2 + across
-                r = np.sqrt(r2)
-                t = r * (k / (2 * np.pi))
-                c, s = sincos_turns64(t - np.rint(t))
-                scale = distance * area / (2 * np.pi * r2)
-                h_re[j] = scale * (c / r + k * s)
-                h_im[j] = scale * (s / r - k * c)
-            for z in range(depths):
-                out[z, p] += complex_product(re[z, i], im[z, i], h_re, h_im)
 
 
 def free_space_transfer(

@@ -17,9 +17,6 @@ from metalens.propagate.paths import from_source, ray_cosines, reference_depth
 RAYS = 33  # along an axis, whose reach the quadratic follows
 SPARE = 1.2  # grid of the lens over the least that the kernel's band asks for
 MOST = 20000  # points of a transform along an axis
-FIELDS = 14  # depth fields, about
-# of a transform and what is multiplied to it, on one core, per point and depth field
-SECONDS = 1e-8
 # points of the lens that a window asks for, and half-waves in it, from which no other
 # method does as well; below some
 # 35 the fading and the grid beyond the lens's rim are as wide as lens and window, and
@@ -150,23 +147,6 @@ def _beyond(
         left = p * bend - fit.reach_um - fit.stretch_um * (p - fit.middle)
         found.append(float(np.abs(np.where(seen, left, 0)).max()))
     return found
-
-
-def expected_cost(case: PropagationCase, tolerance: float) -> float:
-    """Expected time on one core, without the pillars; inf where the method does not do."""
-    found = wide_axes(case, tolerance)
-    if found is None:
-        return math.inf
-    y, x = found
-    fields = min(len(case.inverse_depths_per_um), FIELDS)
-    points = (
-        (y.count * x.first + y.first * x.size) / 2 + y.size * x.size + y.fine * x.fine
-    )
-    return (
-        1e-3
-        + fields * points * SECONDS
-        + len(case.inverse_depths_per_um) * fields * math.prod(case.samples) * 4e-10
-    )
 
 
 def is_wide(case: PropagationCase, tolerance: float) -> bool:

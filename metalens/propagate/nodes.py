@@ -59,13 +59,12 @@ class NodeCounts:
 @dataclass(frozen=True, slots=True)
 class WindowLayout:
     """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
-    sizes: of every tile;
-    seconds: expected for all tiles on one core."""
+    sizes: of every tile; work: products for all tiles."""
 
     nodes: tuple[int, int]
     parts: int
     sizes: NodeCounts
-    seconds: float
+    work: float
 
 
 @functools.lru_cache(maxsize=1024)
@@ -87,11 +86,11 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
             _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
         }
         found = _largest([node_counts(tile, tolerance) for tile in corners])
-        passed_on = nodes[0] * nodes[1] * (1e-8 + 2e-10 * found.nodes[0])
-        each = _seconds(rows[0][0], found, len(case.inverse_depths_per_um)) + passed_on
-        seconds = 1e-3 + each * sum(map(len, rows))
-        if found.table <= MOST_TABLE and (best is None or seconds < best.seconds):
-            best = WindowLayout(nodes, parts, found, seconds)
+        tile, depths = rows[0][0], len(case.inverse_depths_per_um)
+        handing_down = nodes[0] * nodes[1] * (50 + found.nodes[0])
+        work = parts**2 * (_products(tile, found, depths) + handing_down)
+        if found.table <= MOST_TABLE and (best is None or work < best.work):
+            best = WindowLayout(nodes, parts, found, work)
         elif best is not None:
             break
     return best
@@ -117,16 +116,13 @@ def _largest(found: list[NodeCounts]) -> NodeCounts:
     return NodeCounts(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
 
 
-def _seconds(case: PropagationCase, found: NodeCounts, depths: int) -> float:
-    """Expected time of one tile on one core: light on its own nodes, products along y
-    and x.
-    """
+def _products(case: PropagationCase, found: NodeCounts, depths: int) -> float:
+    """Complex products of one tile: along y, along x, and of the depth fields; reading
+    a node counts as 25 of them."""
     (my, mx), (ny, nx), b = case.samples, found.nodes, min(depths, 14)
     fields = 0.75 * b * max(found.window)
-    products = (
-        found.directions * fields * (ny * (4e-9 + 1.8e-10 * my) + 1.5e-10 * mx * my)
-    )
-    return 2e-5 + products + 5e-9 * b * ny * nx
+    along = found.directions * fields * (ny * (25 + my) + mx * my)
+    return 1e5 + along + 30 * b * ny * nx
 
 
 def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:

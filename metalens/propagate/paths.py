@@ -23,7 +23,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.paths import hypot_minus_length, sensor_path
-from metalens.lens import media, saddle_correction
+from metalens.lens import Media, media, saddle_correction
 from metalens.propagate.geometry import PropagationCase
 
 SOME = 32  # pillars along an axis whose rays tell what films leave out
@@ -91,32 +91,33 @@ def ray_to_offset(
     reach2 = dx * dx + dy * dy
     w0 = media.square(case.behind.layers, reach2)
     w, away = media.longer(case.behind.layers, w0, reach2, more)
-    return ray_amplitude(case, case.behind.layers, w), away
+    return ray_amplitude(case.behind, case.wavenumber, w, case.reach_um), away
 
 
-def ray_amplitude(case: PropagationCase, pairs: media.Pairs, w: Any) -> Any:
+def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> Any:
     """Complex amplitude of the module's heading for the ray of w = p², the phase kL
     taken off.
+
+    Args:
+        behind: media from lens to sensor. wavenumber: in vacuum, rad/um.
+        w: squared p of the rays. reach_um: largest lateral way of any ray.
     """
-    real, ahead, aside = ray_amplitude_parts(case, pairs, w)
+    real, ahead, aside = ray_amplitude_parts(
+        behind, wavenumber, behind.layers, w, reach_um
+    )
     return -1j * real * (ahead + 1j * aside)
 
 
 def ray_amplitude_parts(
-    case: PropagationCase, pairs: media.Pairs, w: Any
+    behind: Media, wavenumber: float, pairs: media.Pairs, w: Any, reach_um: float
 ) -> tuple[Any, Any, Any]:
     """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the
     ray of w = p²; for complex
     steps in w and in thicknesses, on which C itself counts as not depending."""
-    k = case.wavenumber
-    order = case.behind.order if case.behind is not None else ()
-    level = (
-        k / (2 * np.pi) * (media.passed_at(order, w) / media.widening(pairs, w)) ** 0.5
-    )
-    turn = 1 / (k * media.whole_path(pairs, w))
-    if case.behind is None:
-        return level, 1 + 0 * turn, turn
-    ahead, aside = saddle_correction(case.behind, k, case.reach_um).at(w)
+    passed = media.passed_at(behind.order, w) / media.widening(pairs, w)
+    level = wavenumber / (2 * np.pi) * passed**0.5
+    turn = 1 / (wavenumber * media.whole_path(pairs, w))
+    ahead, aside = saddle_correction(behind, wavenumber, reach_um).at(w)
     return level, 1 - turn * aside, turn * ahead
 
 
@@ -209,7 +210,8 @@ def residual_path(
         return d / (2 * np.pi * r * r) * (1 / r - 1j * k), path
     w0, g, more = _from_ray(case, p, far, X, Y)
     w, away = media.longer(case.behind.layers, w0, (p * g) ** 2 + far * far, more)
-    return ray_amplitude(case, case.behind.layers, w), away + p * X + far / g * Y
+    level = ray_amplitude(case.behind, case.wavenumber, w, case.reach_um)
+    return level, away + p * X + far / g * Y
 
 
 def _from_ray(
@@ -265,7 +267,9 @@ def _slopes(case: PropagationCase, p: Any, far: Any, X: Any, Y: Any) -> Array:
         else:
             moved = moved + 2j * h * (across, down)[step - 1]
         w = media.square(pairs, moved)
-        level, ahead, aside = ray_amplitude_parts(case, pairs, w)
+        level, ahead, aside = ray_amplitude_parts(
+            behind, case.wavenumber, pairs, w, case.reach_um
+        )
         rate = level.imag / level.real + (ahead.imag + 1j * aside.imag) / (
             ahead.real + 1j * aside.real
         )

@@ -28,7 +28,6 @@ from metalens.propagate.blocks import (
     AxisBlocks,
     Kernel,
     ReferencePhase,
-    carrier_turns,
     choose_blocks,
 )
 from metalens.propagate.compiled import grid_pillars, interpolate_to_pillars
@@ -42,7 +41,6 @@ Bands = list[tuple[slice, slice]]
 BAND = 128  # nodes whose shares of an even grid are taken at once
 # of carrier polynomials and of nodes held at once, and of maps' copies in a thread
 KEEP_BYTES = 32e6
-DEVICE_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,16 +48,16 @@ class PillarMoments:
     """How pillars are reduced.
 
     blocks: of rows and columns; carrier: the phase that is taken off; table: its
-    polynomials, where they are small
-    enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the
-    blocks (on other devices than the
-    processor: at the pillars); bands: of each, the nodes that are taken at once and the
-    moments that have a share.
+    polynomials, where they are small enough to be kept; dtype: of the maps.
+    rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks, in the dtype of
+    the sums; bands: of each, the nodes that are taken at once and the moments that have
+    a share.
     """
 
     blocks: tuple[AxisBlocks, AxisBlocks]
     carrier: ReferencePhase
     table: Any
+    dtype: torch.dtype
     rows: torch.Tensor
     columns: torch.Tensor
     bands: tuple[Bands, Bands]
@@ -75,7 +73,7 @@ class PillarMoments:
         stay below ``KEEP_BYTES``.
         """
         rows, columns = self.blocks
-        itemsize = self.rows.element_size()
+        itemsize = self.dtype.itemsize
         nodes, carrier = (
             2 * rows.nodes * columns.count * columns.nodes,
             ORDER[itemsize] * self.carrier.case.shape[1],
@@ -92,18 +90,21 @@ def plan_moments(
     *,
     tolerance: float,
     dtype: torch.dtype,
-    device: torch.device | None = None,
+    sums: torch.dtype = torch.float64,
     nodes: int = NODES,
     more: int = 0,
 ) -> PillarMoments:
     """Blocks, and what light at their nodes is worth in each moment.
 
     Args:
+        case, reference: geometry, and inverse depth whose phase is taken off.
+        tolerance: relative root mean square error of the moments.
+        dtype, sums: of the maps, and of what is summed over blocks.
         weights: of the rows and of the columns, (place,) um to (place, m): polynomials,
             or shares of an even grid.
         kernel, nodes, more: as :func:`metalens.propagate.blocks.choose_blocks`.
     """
-    itemsize = torch.finfo(dtype).bits // 8
+    itemsize = dtype.itemsize
     blocks = choose_blocks(
         case, reference, kernel, tolerance / SHARE, itemsize, nodes=nodes, more=more
     )
@@ -117,18 +118,17 @@ def plan_moments(
     )
     places = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
     table = None
-    if device is not None and device.type != "cpu":
-        places = case.pillars_um
-    elif case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
+    if case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
     found = [weight(place) for weight, place in zip(weights, places, strict=True)]
     polynomials = [
-        torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found
+        torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in found
     ]
     return PillarMoments(
         blocks,
         wave,
         table,
+        dtype,
         polynomials[0],
         polynomials[1],
         (_bands(found[0]), _bands(found[1])),
@@ -175,14 +175,8 @@ def reduce_to_moments(
     incoherent, and the interpolation
     inside blocks that the plan allows.
     """
-    if (
-        phase_rad.requires_grad
-        or transmission.requires_grad
-        or phase_rad.device.type != "cpu"
-    ):
-        phase_rad, transmission = (
-            m.to(plan.rows.dtype) for m in (phase_rad, transmission)
-        )
+    if phase_rad.requires_grad or transmission.requires_grad:
+        phase_rad, transmission = (m.to(plan.dtype) for m in (phase_rad, transmission))
     parts, power = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
     return torch.complex(parts[0], parts[1]), float(power)
 
@@ -214,8 +208,7 @@ class _Reduce(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.save_for_backward(phase, level)
         ctx.plan = plan
-        gathered = _gather if phase.device.type == "cpu" else _gather_plain
-        out, power = gathered(phase, level, plan)
+        out, power = _gather(phase, level, plan)
         total = torch.tensor(power, dtype=torch.float64)
         ctx.mark_non_differentiable(total)
         return out, total
@@ -233,8 +226,7 @@ class _Reduce(torch.autograd.Function):
         need = ctx.needs_input_grad
         out_phase = torch.empty_like(phase) if need[0] else None
         out_level = torch.empty_like(level) if need[1] else None
-        spread_out = _spread if phase.device.type == "cpu" else _spread_plain
-        spread_out((phase, level), ctx.plan, grads[0], (out_phase, out_level))
+        _spread((phase, level), ctx.plan, grads[0], (out_phase, out_level))
         return out_phase, out_level, None
 
 
@@ -268,7 +260,9 @@ def _gather(
     out = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
     kernel: Any = grid_pillars
     powers: list[float] = []
-    along, shares, (row_bases, column_bases) = _fixed(plan, out.numpy().dtype)
+    along, shares, (row_bases, column_bases) = _fixed(
+        plan, torch.empty(0, dtype=plan.dtype).numpy().dtype
+    )
     # block rows at once, where maps of another dtype are copied
     step = max(
         1,
@@ -278,7 +272,7 @@ def _gather(
         table = _table(plan, panel, along.dtype)
         count = panel.stop - panel.start
         nodes = torch.zeros(
-            (count * rows.nodes, 2, columns.count * columns.nodes), dtype=out.dtype
+            (count * rows.nodes, 2, columns.count * columns.nodes), dtype=plan.dtype
         )
         view = nodes.numpy()
 
@@ -302,8 +296,9 @@ def _gather(
 
         run_split(count, work)
         sums = torch.zeros((count * rows.nodes * 2, n), dtype=out.dtype)
+        light = nodes.flatten(0, 1).to(out.dtype)
         for at, to in plan.bands[1]:
-            sums[:, to].addmm_(nodes.flatten(0, 1)[:, at], plan.columns[at, to])
+            sums[:, to].addmm_(light[:, at], plan.columns[at, to])
         sums, before = sums.view(-1, 2 * n), panel.start * rows.nodes
         for at, to in _in(plan.bands[0], before, panel.stop * rows.nodes):
             out[to].addmm_(
@@ -330,7 +325,7 @@ def _spread(
     fixed = _fixed(plan, phase.dtype)
     for panel in plan.panels:
         table = _table(plan, panel, phase.dtype)
-        nodes = _given(plan, panel, inner).numpy()
+        nodes = _given(plan, panel, inner).to(plan.dtype).numpy()
 
         def work(
             a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel
@@ -354,55 +349,3 @@ def _given(plan: PillarMoments, panel: slice, inner: torch.Tensor) -> torch.Tens
         [sums[:, to] @ plan.columns[at, to].T for at, to in plan.bands[1]], 1
     )
     return nodes.view(-1, 2, columns.count * columns.nodes)
-
-
-def _phasors(phase: torch.Tensor, plan: PillarMoments, start: int) -> torch.Tensor:
-    """(y, x) complex phasors of some rows, for devices without compiled loops."""
-    wave = plan.carrier
-    y, x = (torch.tensor(v, device=phase.device) for v in wave.case.pillars_um)
-    y = y[start : start + phase.shape[0], None]
-    turns = phase.double() / (2 * torch.pi) + carrier_turns(
-        wave.case, wave.reference, x, y
-    )
-    angle = ((turns - turns.round()) * 2 * torch.pi).to(phase.dtype)
-    return torch.complex(torch.cos(angle), torch.sin(angle))
-
-
-def _gather_plain(
-    phase: torch.Tensor, level: torch.Tensor, plan: PillarMoments
-) -> tuple[torch.Tensor, float]:
-    """Moments by plain tensor operations, for devices without compiled loops: every
-    pillar is a node.
-    """
-    out = torch.zeros(
-        plan.counts,
-        dtype=torch.complex(phase[0, 0], phase[0, 0]).dtype,
-        device=phase.device,
-    )
-    for start in range(0, phase.shape[0], DEVICE_ROWS):
-        rows = slice(start, start + DEVICE_ROWS)
-        light = level[rows] * _phasors(phase[rows], plan, start)
-        out = out + plan.rows[rows].T.to(light.dtype) @ (
-            light @ plan.columns.to(light.dtype)
-        )
-    return torch.stack([out.real, out.imag]), float((level.double() ** 2).sum())
-
-
-def _spread_plain(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    plan: PillarMoments,
-    grad: torch.Tensor,
-    out: tuple[Any, Any],
-) -> None:
-    """Gradients by plain tensor operations."""
-    both = torch.complex(grad[0], grad[1])
-    for start in range(0, maps[0].shape[0], DEVICE_ROWS):
-        rows = slice(start, start + DEVICE_ROWS)
-        at = plan.rows[rows].to(both.dtype) @ both @ plan.columns.T.to(both.dtype)
-        turned = (
-            at * _phasors(maps[0][rows], plan, start).conj()
-        )  # its real part: along the phasor
-        if out[0] is not None:
-            out[0][rows] = turned.imag * maps[1][rows]
-        if out[1] is not None:
-            out[1][rows] = turned.real

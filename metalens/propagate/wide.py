@@ -75,7 +75,7 @@ class WidePlan:
     left: float
 
     @property
-    def nodes_um(self) -> tuple[Array, Array]:
+    def judged_um(self) -> tuple[Array, Array]:
         """(e,), (x,) positions of the grid over the lens."""
         y, x = (grid_um(axis) for axis in self.axes)
         return y, x
@@ -98,9 +98,13 @@ class WidePlan:
 
 
 def wide_plan(
-    case: PropagationCase, tolerance: float, dtype: torch.dtype, device: torch.device
+    case: PropagationCase, tolerance: float, dtype: torch.dtype
 ) -> WidePlan:
     """A new plan.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps and of the transforms.
 
     Raises:
         PropagationError: rays too steep, or too unlike a quadratic, for the method.
@@ -117,15 +121,15 @@ def wide_plan(
         over_blocks(case),
         tolerance=tolerance,
         dtype=dtype,
-        device=device,
+        sums=dtype,
         nodes=max(axis.count for axis in found) // 2,
     )
     kind = torch.complex64 if dtype == torch.float32 else torch.complex128
     fields, coefficients = _depth_fields(case, found, tolerance / 2)
     lens = _lens_phase(case, found)
     arrays = coefficients, *(np.ascontiguousarray(a.T) for a in _behind(case, found))
-    given = [torch.tensor(a, dtype=kind, device=device) for a in arrays]
-    table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind, device=device)
+    given = [torch.tensor(a, dtype=kind) for a in arrays]
+    table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind)
     for one, field in zip(table, fields, strict=True):
         one.copy_(torch.from_numpy(field * lens))
     return WidePlan(
@@ -260,25 +264,27 @@ def light_wide(
     maps: tuple[torch.Tensor, torch.Tensor],
     plan: WidePlan,
     pupils: Pupils | None = None,
-) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
-    """Light on the window (depth, y, x); that of every map on the even grid of the
-    lens; the sums of squares of their
-    transmissions.
+) -> tuple[torch.Tensor, Array, list[float]]:
+    """Irradiance on the window (depth, y, x); light of every map on the even grid of the
+    lens; sums of squares of the transmissions.
 
-    Differentiable in phase and transmission. maps: (map, y, x) of both. pupils: factors
-    on their light; None for the
-    |U|² of one map.
+    Differentiable once in the maps.
+
+    Args:
+        maps: (map, y, x) phase and transmission. plan: of :func:`plan_wide`.
+        pupils: factors on the light of the maps; None for the |U|² of one map.
     """
     found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
-    gathered, total = torch.stack([g for g, _ in found]), None
-    for sign, light in mix_components(gathered, pupils, plan.nodes_um):
+    grid, total = torch.stack([g for g, _ in found]), None
+    for sign, light in mix_components(grid, pupils, plan.judged_um):
         mixture, coefficients = (
             (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
         )
         here = _mixed(fields_wide(light, plan, mixture), coefficients)
         here = here if sign == 1 else sign * here
         total = here if total is None else total + here
-    return torch.as_tensor(total), gathered.detach(), [power for _, power in found]
+    powers = [power for _, power in found]
+    return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
 def _fewer(light: torch.Tensor, plan: WidePlan) -> tuple[torch.Tensor, torch.Tensor]:

@@ -16,7 +16,6 @@ from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
-from metalens.propagate.estimate import MORE
 from metalens.propagate.geometry import PropagationCase, window_tiles
 from metalens.propagate.nodes import WindowLayout, plan_layout
 from metalens.propagate.operators import (
@@ -40,6 +39,7 @@ SMOOTH = (
     4,
     2,
 )  # nodes more over the lens, and in a block, where light is multiplied by such factors there
+MORE = 8  # orders of the moments beyond those used, for the posterior error
 KEPT_BYTES = 400e6  # of plans that are kept
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
@@ -49,10 +49,9 @@ class WindowPlan:
     """Everything that depends on the geometry alone, ready for many lenses.
 
     The moments go ``MORE`` orders beyond what the method uses, for the error estimate.
-    tensors: the operators in the
-    dtype and on the device in use, those of the tiles stacked (tile, …); ``turn``
-    (tile, e, x) is the phase from the
-    window's centre to the tile's own on the nodes of the whole window.
+    tensors: the operators, those of the tiles stacked (tile, …); ``turn`` (tile, e, x)
+    is the phase from the window's centre to the tile's own on the nodes of the whole
+    window.
     """
 
     case: PropagationCase
@@ -116,7 +115,6 @@ def plan_window(
     case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,
-    device: torch.device,
     moving: bool = False,
     *,
     smooth: bool = False,
@@ -125,29 +123,34 @@ def plan_window(
     ``KEPT_BYTES``.
 
     Args:
-        moving: for use with :class:`MovingGeometry`. smooth: with factors (``Pupils``)
-            on the
-            light of the nodes.
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps; sums over blocks of pillars are in float64.
+        moving: for use with :class:`MovingGeometry`.
+        smooth: with factors (``Pupils``) on the light of the nodes.
 
     Raises:
         PropagationError: the window is too large for the method.
     """
     made = functools.partial(
-        _planned, case, tolerance, dtype, device, moving=moving, smooth=smooth
+        _planned, case, tolerance, dtype, moving=moving, smooth=smooth
     )
-    return _keep((case, tolerance, dtype, device, moving, smooth), made)
+    return _keep((case, tolerance, dtype, moving, smooth), made)
 
 
 def plan_wide(
-    case: PropagationCase, tolerance: float, dtype: torch.dtype, device: torch.device
+    case: PropagationCase, tolerance: float, dtype: torch.dtype
 ) -> WidePlan:
     """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps and of the transforms.
 
     Raises:
         PropagationError: rays too steep for the method.
     """
-    made = functools.partial(wide_plan, case, tolerance, dtype, device)
-    return _keep((case, tolerance, dtype, device, "wide"), made)
+    made = functools.partial(wide_plan, case, tolerance, dtype)
+    return _keep((case, tolerance, dtype, "wide"), made)
 
 
 def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
@@ -173,7 +176,6 @@ def _planned(
     case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,
-    device: torch.device,
     *,
     moving: bool,
     smooth: bool,
@@ -195,15 +197,12 @@ def _planned(
         over_blocks(case),
         tolerance=tolerance,
         dtype=dtype,
-        device=device,
         more=inside,
     )
     depths = depth_basis(
         case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving
     )
-    tensors = _shared(case, found, depths, dtype, device) | _stacked(
-        case, found, depths, tolerance, (dtype, device)
-    )
+    tensors = _shared(case, found, depths) | _stacked(case, found, depths, tolerance)
     return WindowPlan(case, tolerance, found, depths, pillars, tensors)
 
 
@@ -220,10 +219,6 @@ def legendre_bases(
     return tuple(over(n, h) for n, h in zip(counts, case.half_size_um, strict=True))
 
 
-def _complex(dtype: torch.dtype) -> torch.dtype:
-    return torch.complex64 if dtype == torch.float32 else torch.complex128
-
-
 def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Array]:
     hy, hx = case.half_size_um
     return np.asarray(legendre.mapped_nodes(counts[0], -hy, hy)), np.asarray(
@@ -235,8 +230,6 @@ def _shared(
     case: PropagationCase,
     found: WindowLayout,
     depths: DepthBasis,
-    dtype: torch.dtype,
-    device: torch.device,
 ) -> dict[str, torch.Tensor]:
     """Moments to the nodes of the window, those to the nodes of the tiles, and the
     depths.
@@ -254,8 +247,7 @@ def _shared(
     away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
     return {
-        name: torch.tensor(a, dtype=_complex(dtype), device=device)
-        for name, a in arrays.items()
+        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
     }
 
 
@@ -264,7 +256,6 @@ def _stacked(
     found: WindowLayout,
     depths: DepthBasis,
     tolerance: float,
-    kind: tuple[torch.dtype, torch.device],
     slope: int | None = None,
 ) -> dict[str, torch.Tensor]:
     """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any
@@ -286,12 +277,11 @@ def _stacked(
             [_padded(getattr(one, name), most)[..., kept[0]] for one in made]
         )
     out = {
-        name: torch.tensor(a, dtype=_complex(kind[0]), device=kind[1])
-        for name, a in arrays.items()
+        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
     }
     directions = np.concatenate([one.to_directions for one in made])
-    out["to_directions"] = torch.tensor(directions, dtype=kind[0], device=kind[1])
-    out["fields"] = torch.tensor(kept[1], device=kind[1])
+    out["to_directions"] = torch.tensor(directions)
+    out["fields"] = torch.tensor(kept[1])
     return out
 
 
@@ -305,27 +295,22 @@ def _slope(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
     kept with the plan.
     """
     if axis not in plan.slopes:
-        kind = plan.moments.rows.dtype, plan.moments.rows.device
         plan.slopes[axis] = _stacked(
-            plan.case, plan.layout, plan.depths, plan.tolerance, kind, axis
+            plan.case, plan.layout, plan.depths, plan.tolerance, axis
         )
     return plan.slopes[axis]
 
 
 def field_windowed(
-    phase_rad: torch.Tensor,
-    transmission: torch.Tensor,
-    plan: WindowPlan,
-    moving: MovingGeometry | None = None,
-) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of
-    squares of its transmission.
+    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: WindowPlan
+) -> torch.Tensor:
+    """(depth, y, x) complex field on the window, differentiable once in both maps.
 
-    Differentiable in phase and transmission (y, x), and in ``moving`` where given
-    (first derivatives).
+    Args:
+        phase_rad, transmission: (y, x) maps. plan: of :func:`plan_window`.
     """
-    gathered, power = reduce_to_moments(phase_rad, transmission, plan.moments)
-    return from_moments(gathered, plan, moving), gathered.detach(), power
+    moments, _ = reduce_to_moments(phase_rad, transmission, plan.moments)
+    return _from_nodes(_on_nodes(moments, plan), plan, None)
 
 
 def light_windowed(
@@ -333,34 +318,27 @@ def light_windowed(
     plan: WindowPlan,
     moving: MovingGeometry | None,
     pupils: Pupils | None,
-) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
-    """Light on the window, (depth, y, x); the moments of every map; the sums of squares
-    of their transmissions.
+) -> tuple[torch.Tensor, Array, list[float]]:
+    """Irradiance on the window (depth, y, x); light of every map on the nodes of the
+    posterior error; sums of squares of the transmissions.
 
-    maps: (map, y, x) phase and transmission. pupils: factors on their light, for a plan
-    made ``smooth``; None for the
-    |U|² of one map.
+    Differentiable once in the maps, and in ``moving`` where given.
+
+    Args:
+        maps: (map, y, x) phase and transmission. plan: of :func:`plan_window`.
+        moving: geometry with gradients. pupils: factors on the light of the maps, for a
+            plan made ``smooth``; None for the |U|² of one map.
     """
     found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
-    gathered, powers = torch.stack([g for g, _ in found]), [power for _, power in found]
-    parts = mix_components(_on_nodes(gathered, plan), pupils, plan.whole_um)
-    lit = [(sign, _from_nodes(light, plan, moving)) for sign, light in parts]
-    total = functools.reduce(
-        torch.add,
-        (_power(field) if sign == 1 else sign * _power(field) for sign, field in lit),
-    )
-    return total, gathered.detach(), powers
-
-
-def _power(field: torch.Tensor) -> torch.Tensor:
-    return field.real**2 + field.imag**2
-
-
-def from_moments(
-    gathered: torch.Tensor, plan: WindowPlan, moving: MovingGeometry | None = None
-) -> torch.Tensor:
-    """(depth, y, x) field on the window from the moments of a lens."""
-    return _from_nodes(_on_nodes(gathered, plan), plan, moving)
+    moments, powers = torch.stack([m for m, _ in found]), [power for _, power in found]
+    parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
+    total: Any = 0
+    for sign, light in parts:
+        field = _from_nodes(light, plan, moving)
+        total = total + sign * (field.real**2 + field.imag**2)
+    fine, (m, n) = moments.detach().numpy(), moments.shape[-2:]
+    with one_blas_thread():
+        return total, legendre.to_nodes(m).T @ fine @ legendre.to_nodes(n), powers
 
 
 def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
@@ -419,8 +397,7 @@ def _joined(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
 
 def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
     """(depth, b) of the depth basis, differentiable in the source's position."""
-    device = moving.tangents.device
-    e, x = (torch.tensor(v, device=device) for v in plan.nodes_um)
+    e, x = (torch.tensor(v) for v in plan.nodes_um)
     ny, nx = plan.layout.sizes.nodes
     inverse = moving.inverse_depths[:, None, None]
     angle = depth_factors(
@@ -429,12 +406,10 @@ def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
     weight = torch.tensor(
         np.outer(
             legendre.gauss_legendre_nodes(ny)[1], legendre.gauss_legendre_nodes(nx)[1]
-        ),
-        device=device,
+        )
     )
-    basis = torch.tensor(plan.depths.basis, device=device)
-    found = (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
-    return found.to(plan.tensors["coefficients"].dtype)
+    basis = torch.tensor(plan.depths.basis)
+    return (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
 
 
 def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -1,5 +1,5 @@
-"""Intensity of one lens in one direction, by the cheapest method, checked and repeated
-until the tolerance is met.
+"""Irradiance of one lens in one direction by the cheapest method, repeated at a tighter
+setting until its measured error is within the tolerance.
 """
 
 import math
@@ -14,9 +14,9 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.propagate import (
     SHARE,
-    ErrorSample,
     MethodChoice,
     MovingGeometry,
+    NodeLight,
     PropagationCase,
     Pupils,
     check_aperture,
@@ -34,64 +34,31 @@ from metalens.propagate import (
 )
 from metalens.psf.vector import PolarizationMixing, has_faces, s_and_p
 
-FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
-# times the light of random phases below which float32 loses what is left of the sum
-BRIGHT = 30.0
-MOVING = 1000  # by which the setting is tighter where the geometry carries gradients
-FINEST = 1e-12  # setting below which float64 has nothing left to give
-ROUNDING = {
-    torch.float32: 8e-7,
-    torch.float64: 1e-11,
-}  # of a pillar's phasor, standard deviation
-TRANSFORMS = {
-    torch.float32: 1e-6,
-    torch.float64: 5e-15,
-}  # rounding of three transforms, above all that was found
-MANY = 8192  # samples of a window from which an estimate looks at few of them
-# of the setting of such a window: what rare errors those few may miss (0.002 and less
-# were seen)
-MISSED = 0.02
-# times its estimate: errors beside a spot and where the window is dim are seen by few
-# of the few
-SCATTER = 1.5
-EXACT = {
-    torch.float32: 1e-7,
-    torch.float64: 4e-12,
-}  # rounding of exact sums and of what they are kept in
-HALF_DIGIT, SPREAD = (
-    1.1e-16,
-    2.0,
-)  # rounding of a number in float64; sums of few pillars vary about their mean noise
-OUTPUT = {
-    torch.float32: 4e-7,
-    torch.float64: 2e-15,
-}  # of the sums behind the pillars, in relative L2
-KEPT = {
-    torch.float32: 1.5e-7,
-    torch.float64: 0.0,
-}  # of intensities brought back to the caller's type and normalised in it
+# standard deviation of a pillar's phasor and relative error of three transforms, by
+# rounding, several times the machine epsilon of the maps
+ROUNDING = {torch.float32: (8e-7, 1e-6), torch.float64: (1e-11, 5e-15)}
+EXACT = 4e-12  # rounding of exact sums in float64
+FEW = 64  # samples whose rounding has no mean: their pillars are added in float64
+TIGHTEST = 1e-12  # setting below which float64 has nothing left to give
+MOVING = 1000  # tighter setting: parts of a derivative in the geometry nearly cancel
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class IntensityResult:
-    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and
-    why it stopped.
+    """Irradiance on a window and its errors, relative L2.
 
+    intensity: (depth, y, x). error: of the sums. reason: method, and why it stopped.
     power: sum of squares of the transmission over the pillars, wavelengths weighted.
-    brightness: mean of the window at
-        the darkest depth, against pillars of random phases. sampling: error of an
-        integration over cells. source: of a
-        source of finite size taken as alike. rays: of both polarisations as rays to the
-        window's middle have them; of a
-        scalar behind films, of the mean of s and p that it takes; nan of a scalar in
-        one medium.
+    sampling: of the integration over cells. source: of a finite source taken as
+    shift-invariant.
+    rays: of both polarisations as rays to the window's middle have them; of a scalar
+    behind films, of the mean of s and p; nan of a scalar in one medium.
     """
 
     intensity: torch.Tensor
     error: float
     reason: str
     power: float
-    brightness: float = math.inf
     sampling: float = 0.0
     source: float = 0.0
     rays: float = math.nan
@@ -102,73 +69,10 @@ class IntensityResult:
         return math.hypot(self.error, self.sampling, self.source)
 
 
-def compute_intensity(
-    phase: torch.Tensor,
-    level: torch.Tensor,
-    cases: list[PropagationCase],
-    weights: list[float],
-    *,
-    tolerance: float,
-    moving: Any = None,
-    mixing: PolarizationMixing | None = None,
-) -> IntensityResult:
-    """|U|² on the window, wavelengths added with their weights.
-
-    Args:
-        phase, level: (wavelength, y, x), or with ``mixing`` as many maps of a
-            wavelength after each other as it takes.
-        cases: one a wavelength, alike in everything else.
-        moving: :class:`Moving` or None. mixing: both polarisations in place of |U|² of
-            one scalar.
-
-    The windowed method is repeated at a tighter setting, and at last in float64, until
-    its own error estimate is within
-    tolerance, all that is added to it later included; the result of the last try is
-    returned with its estimate in any
-    case. Dim and tiny windows are summed in float64, since the estimate knows rounding
-    as noise of a mean size only.
-    """
-    lit = IntensityRequest(phase, level, cases, weights, mixing)
-    needs_grad = phase.requires_grad or level.requires_grad or moving is not None
-    if (
-        not needs_grad and phase.device.type == "cpu"
-    ):  # at the setting that the windowed method begins with
-        choices = [choose_method(case, max(tolerance / 2, FINEST)) for case in cases]
-        if all(choice.method == "exact" for choice in choices):
-            return _exact(lit, choices[0].reason)
-    first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
-    if cases[0].samples[0] * cases[0].samples[1] < FEW:
-        first = torch.float64
-    # gradients see the kernel's error pillar by pillar, and at a focus their parts
-    # nearly cancel
-    start = (
-        max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
-    )
-    if (
-        moving is not None
-    ):  # parts of a derivative in the geometry exceed it some hundred times
-        start, first = tolerance / MOVING, torch.float64
-    tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
-    dim = False
-    for setting, kind in tries:
-        dtype = torch.float64 if dim else kind
-        result = _windowed(lit, dtype, max(setting, FINEST), moving)
-        error = math.hypot(result.error, OUTPUT[dtype], KEPT[phase.dtype], lit.films)
-        dim = dtype != torch.float64 and result.brightness < BRIGHT
-        if error <= tolerance and not dim:
-            break
-    return IntensityResult(
-        result.intensity.to(phase.dtype),
-        error,
-        result.reason,
-        result.power,
-        rays=result.rays,
-    )
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class IntensityRequest:
-    """What :func:`compute_intensity` is asked of."""
+    """Maps (wavelength · map, y, x), a case and a weight for each wavelength, and the
+    mixing of both polarisations; None for |U|² of one scalar."""
 
     phase: torch.Tensor
     level: torch.Tensor
@@ -181,7 +85,7 @@ class IntensityRequest:
     ) -> Iterator[
         tuple[tuple[torch.Tensor, torch.Tensor], PropagationCase, float, Pupils | None]
     ]:
-        """(maps of one, case, weight, components) of every wavelength."""
+        """(maps, case, weight, mixing) of every wavelength."""
         count = 1 if self.mixing is None else self.mixing.maps
         for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
             some = slice(i * count, (i + 1) * count)
@@ -189,23 +93,17 @@ class IntensityRequest:
             yield (self.phase[some], self.level[some]), case, weight, pupils
 
     @property
-    def films(self) -> float:
-        """Relative L2 error of what is left out behind films, the worst over
-        wavelengths.
-        """
-        if self.cases[0].behind is None:
-            return 0.0
-        each = [
-            (case, maps[1].detach()[0].cpu().numpy())
+    def films_error(self) -> float:
+        """Relative L2 error of the kernel through films, the worst over wavelengths."""
+        return max(
+            paths.films_error(case, maps[1].detach()[0].numpy())
             for maps, case, _, _ in self.each()
-        ]
-        return max(paths.films_error(case, level) for case, level in each)
+        )
 
     @property
-    def judged(self) -> Callable[[PropagationCase], Pupils] | None:
-        """Factors on the light of single points that it is compared with: of both
-        polarisations by their own rays, or
-        of s and p apart where a scalar meets faces of films."""
+    def own_mixing(self) -> Callable[[PropagationCase], Pupils] | None:
+        """Mixing by the rays to a single point, with which the window's is compared; of
+        s and p where a scalar meets faces of films."""
         if self.mixing is not None:
             return self.mixing.pupils
         return s_and_p if has_faces(self.cases[0]) else None
@@ -213,238 +111,203 @@ class IntensityRequest:
     def power(
         self, case: PropagationCase, powers: list[float], level: torch.Tensor
     ) -> float:
-        """What the pillars of a wavelength let through, from the sums of squares of its
-        maps.
-        """
-        return (
-            powers[0] if self.mixing is None else self.mixing.power(case, powers, level)
-        )
+        """Power behind the pillars, from the sums of squares of the maps ``level``."""
+        if self.mixing is None:
+            return powers[0]
+        return self.mixing.power(case, powers, level)
 
 
-def _exact(lit: IntensityRequest, reason: str) -> IntensityResult:
+def compute_intensity(
+    request: IntensityRequest,
+    *,
+    tolerance: float,
+    moving: MovingGeometry | None = None,
+) -> IntensityResult:
+    """|U|² on the window, wavelengths added with their weights.
+
+    Pillars are added in the precision of their maps where that holds the tolerance, all
+    later sums in float64. The result of the last try is returned with its estimate in
+    any case.
+
+    Args:
+        request: maps, cases (alike in all but the wavelength), weights and mixing.
+        tolerance: relative L2 error of the PSFs.
+        moving: geometry with gradients, or None.
+    """
+    phase, case = request.phase, request.cases[0]
+    differentiable = (
+        phase.requires_grad or request.level.requires_grad or moving is not None
+    )
+    rest = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
+    if not differentiable:
+        setting = max(tolerance / 2, TIGHTEST)
+        choices = [choose_method(one, setting) for one in request.cases]
+        if all(choice.method == "exact" for choice in choices):
+            return _finished(_exact(request, choices[0].reason), rest, phase.dtype)
+    first = phase.dtype if tolerance > 1e-6 else torch.float64
+    if math.prod(case.samples) < FEW or moving is not None:
+        first = torch.float64
+    start = tolerance / 2
+    if moving is not None:
+        start = tolerance / MOVING
+    elif differentiable:  # gradients hold the kernel's error pillar by pillar
+        start = max(tolerance / 32, min(tolerance / 8, 1e-6))
+    tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
+    for setting, dtype in tries:
+        result = _windowed(request, dtype, max(setting, TIGHTEST), moving)
+        if math.hypot(result.error, rest) <= tolerance:
+            break
+    return _finished(result, rest, phase.dtype)
+
+
+def _finished(
+    result: IntensityResult, rest: float, dtype: torch.dtype
+) -> IntensityResult:
+    """In the precision of the maps, with what rounding and films add to its error."""
+    error = math.hypot(result.error, rest)
+    return replace(result, intensity=result.intensity.to(dtype), error=error)
+
+
+def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
+    """The exact sum over pillars, of every component of the light."""
     total: Any = 0.0
-    power, noise, samples = 0.0, 0.0, []
-    for (phase, level), case, weight, pupils in lit.each():
-        powers = (level.double() ** 2).sum((-1, -2)).tolist()
-        power += weight * lit.power(case, powers, level)
-        noise = max(noise, _turned(phase, level, case) * _incoherent(sum(powers), case))
-        if lit.judged is not None:
-            samples.append(_of_pillars((phase, level), case, weight, pupils))
-        if pupils is None:
-            total = (
-                total
-                + weight
-                * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
-            )
-            continue
+    power, noise, checked = 0.0, 0.0, []
+    for (phase, level), case, weight, pupils in request.each():
+        phase, level = phase.double(), level.double()
+        powers = (level**2).sum((-1, -2)).tolist()
+        power += weight * request.power(case, powers, level)
+        turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
+        turns += float((phase.abs() * (level != 0)).max())
+        rounding = np.finfo(float).eps / 2 * turns
+        noise = max(noise, rounding * _incoherent(sum(powers), case))
+        if request.own_mixing is not None:
+            checked.append(_pillar_light((phase, level), case, weight, pupils))
         for sign, light in mix_components(
-            torch.polar(level.double(), phase.double()), pupils, case.pillars_um
+            torch.polar(level, phase), pupils, case.pillars_um
         ):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
-    error = math.hypot(EXACT[lit.phase.dtype], lit.films, _noisy_sum(total, noise))
-    found = IntensityResult(
-        torch.as_tensor(total).to(lit.phase.dtype), error, reason, power
-    )
-    return _from_middle(found, lit, [samples], [total])
+    error = math.hypot(EXACT, _noise_error(total, noise))
+    result = IntensityResult(torch.as_tensor(total), error, reason, power)
+    return _with_rays(result, request, [checked], [total])
 
 
-def _turned(phase: torch.Tensor, level: torch.Tensor, case: PropagationCase) -> float:
-    """Rounding of a pillar's phase in float64, rad: of the paths to it and on to the
-    window, and of its own phase.
-    """
-    turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
-    return HALF_DIGIT * (turns + float((phase.double().abs() * (level != 0)).max()))
-
-
-def _noisy_sum(light: Array, noise: float) -> float:
-    """Relative L2 error of PSFs from light (depth, y, x) to whose field noise of this
-    size is added: its part along the
-    field, 2 Re U* n. Nothing at a focus, where noise is of N pillars and light of N²,
-    and most beside the light."""
+def _noise_error(light: Array, noise: float) -> float:
+    """Twice the relative L2 error of PSFs by noise of this size on the field of
+    ``light`` (depth, y, x): its part along the field, 2 Re U* n."""
     whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
     share, square = light / whole[:, None, None], 2 * noise**2 / whole
-    return float(SPREAD * math.sqrt(square.sum() / (share**2).sum()))
+    return 2 * math.sqrt(float(square.sum() / (share**2).sum()))
 
 
-def _of_pillars(
+def _pillar_light(
     maps: tuple[torch.Tensor, torch.Tensor],
     case: PropagationCase,
     weight: float,
     pupils: Pupils | None,
-) -> ErrorSample:
-    """What a sum over all pillars took of a wavelength, to be judged."""
+) -> NodeLight:
+    """Light of all pillars with its carrier taken off, to be checked."""
     y, x = case.pillars_um
     path = paths.from_source(
         case, x, y[:, None], case.tangents, paths.reference_depth(case)
     )
     turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
-    light = torch.polar(
-        maps[1].double(), maps[0].double() + torch.as_tensor(turn)
-    ).numpy()
-    return ErrorSample(
-        case, weight, light, 0.0, 1, (y, x), None if pupils is None else pupils(y, x)
-    )
+    light = torch.polar(maps[1], maps[0] + torch.as_tensor(turn)).numpy()
+    at = None if pupils is None else pupils(y, x)
+    return NodeLight(case, weight, light, (y, x), 0.0, at)
 
 
-def _from_middle(
+def _with_rays(
     result: IntensityResult,
-    lit: IntensityRequest,
-    samples: list[list[ErrorSample]],
-    seen: list[Any],
+    request: IntensityRequest,
+    checked: list[list[NodeLight]],
+    light: list[Any],
 ) -> IntensityResult:
-    """With what rays to the window's middle leave out of both polarisations; of a
-    scalar behind films, what it does.
-    """
-    return (
-        result
-        if lit.judged is None
-        else replace(result, rays=pupil_error(samples, seen, lit.judged))
-    )
+    """With the error of one polarisation mixing for the whole window."""
+    own = request.own_mixing
+    if own is None:
+        return result
+    return replace(result, rays=pupil_error(checked, light, own))
 
 
 def _windowed(
-    lit: IntensityRequest, dtype: torch.dtype, tolerance: float, moving: Any
+    request: IntensityRequest,
+    dtype: torch.dtype,
+    tolerance: float,
+    moving: MovingGeometry | None,
 ) -> IntensityResult:
-    """One try with sums of a dtype: every wavelength and window, then the estimate from
-    all of them.
+    """One try: every wavelength and part of the window, then the measured error.
+
+    Raises:
+        PropagationError: no light in the window.
     """
     choice = choose_method(
-        lit.cases[0], tolerance, differentiable=True, moving=moving is not None
+        request.cases[0], tolerance, differentiable=True, moving=moving is not None
     )
-    if choice.method == "wide":
-        return _wide(lit, dtype, tolerance, choice)
-    samples: list[list[ErrorSample]] = [[] for row in choice.tiles for _ in row]
-    seen: list[Any] = [0.0] * len(samples)
+    is_wide = choice.method == "wide"
+    checked: list[list[NodeLight]] = [[] for row in choice.tiles for _ in row]
+    seen: list[Any] = [0.0] * len(checked)
     total: Any = 0
-    given = 0.0
-    for maps, case, weight, pupils in lit.each():
+    whole_power = 0.0
+    for maps, case, weight, pupils in request.each():
         rows, index = [], 0
         for row in _windows(case, choice, tolerance):
             parts = []
             for window in row:
-                made = plan_window(
-                    window,
-                    tolerance,
-                    dtype,
-                    maps[0].device,
-                    moving is not None,
-                    smooth=pupils is not None,
-                )
-                light, gathered, powers = light_windowed(
-                    maps, made, _shifted(moving, case, window), pupils
-                )
-                _check(maps, case, sum(powers), gathered)
-                power = lit.power(case, powers, maps[1])
-                at = None if pupils is None else pupils(*made.judged_um)
-                noise = _phasor(dtype, tolerance, made) * _incoherent(
-                    _noisy(powers, at), case
-                )
-                moments = gathered.cpu().numpy().astype(complex)
-                samples[index].append(
-                    ErrorSample(
-                        window, weight, moments, noise, made.layout.parts, pupils=at
+                plan: Any
+                if is_wide:
+                    plan = plan_wide(window, tolerance, dtype)
+                    light, nodes, powers = light_wide(maps, plan, pupils)
+                else:
+                    plan = plan_window(
+                        window,
+                        tolerance,
+                        dtype,
+                        moving is not None,
+                        smooth=pupils is not None,
                     )
-                )
-                here = weight * light
-                parts.append(here)
-                seen[index] = seen[index] + here.detach().cpu().numpy()
+                    shifted = _shifted(moving, case, window)
+                    light, nodes, powers = light_windowed(maps, plan, shifted, pupils)
+                _check(maps, case, sum(powers), nodes)
+                at_um = plan.judged_um
+                at = None if pupils is None else pupils(*at_um)
+                rounding = plan.moments.carrier.rounding_rad
+                noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
+                noise *= _incoherent(_noisy_power(powers, at), case)
+                checked[index].append(NodeLight(window, weight, nodes, at_um, noise, at))
+                parts.append(light if weight == 1 else weight * light)
+                seen[index] = seen[index] + parts[-1].detach().numpy()
                 index += 1
-            rows.append(torch.cat(parts, -1))
-        given += weight * power
-        total = total + torch.cat(rows, -2)
-    result = _judged(total, samples, seen, (lit.cases, lit.weights, given), choice)
-    result = _from_middle(result, lit, samples, seen)
-    return (
-        _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
-    )
+            rows.append(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
+        whole_power += weight * request.power(case, powers, maps[1])
+        here = rows[0] if len(rows) == 1 else torch.cat(rows, -2)
+        total = here if isinstance(total, int) else total + here
+    if not bool((total.detach().sum((-1, -2)) > 0).all()):
+        raise PropagationError(
+            "no light reaches the window at some depth; move or widen the window"
+        )
+    error = relative_error(checked, seen)
+    if is_wide:
+        error = math.hypot(error, ROUNDING[dtype][1])
+    result = IntensityResult(total, error, choice.reason, whole_power)
+    return _with_rays(result, request, checked, seen)
 
 
-def _phasor(dtype: torch.dtype, tolerance: float, made: Any) -> float:
-    """Standard deviation of a pillar's phasor: arithmetic, interpolation inside blocks,
-    polynomials of long paths.
-    """
-    return math.hypot(
-        ROUNDING[dtype], tolerance / SHARE, made.moments.carrier.rounding_rad
-    )
-
-
-def _noisy(powers: list[float], at: Any) -> float:
-    """Sum of squares of the transmission of all components, each factor as large as it
-    gets: what rounds.
-    """
+def _noisy_power(powers: list[float], at: tuple[Array, Array] | None) -> float:
+    """Sum of squares of the transmission of all components, each factor at its largest:
+    what rounds."""
     if at is None:
         return powers[0]
     return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
 
 
-def _wide(
-    lit: IntensityRequest, dtype: torch.dtype, tolerance: float, choice: MethodChoice
-) -> IntensityResult:
-    """One try of a wide window by Fourier transforms, as :func:`_windowed`."""
-    total: Any = None
-    power, samples = 0.0, []
-    for maps, case, weight, pupils in lit.each():
-        made = plan_wide(case, tolerance, dtype, maps[0].device)
-        light, gathered, powers = light_wide(maps, made, pupils)
-        _check(maps, case, sum(powers), gathered)
-        at = None if pupils is None else pupils(*made.nodes_um)
-        noise = _phasor(dtype, tolerance, made) * _incoherent(_noisy(powers, at), case)
-        given = gathered.cpu().numpy().astype(complex)
-        samples.append(ErrorSample(case, weight, given, noise, 1, made.nodes_um, at))
-        light = light if weight == 1 else light * weight
-        total = light if total is None else total + light
-        power += weight * lit.power(case, powers, maps[1])
-    seen = [total.detach().cpu().numpy()]
-    result = _judged(total, [samples], seen, (lit.cases, lit.weights, power), choice)
-    result = _few_seen(_from_middle(result, lit, [samples], seen), tolerance)
-    return replace(result, error=math.hypot(result.error, TRANSFORMS[dtype]))
-
-
-def _few_seen(result: IntensityResult, tolerance: float) -> IntensityResult:
-    """With what an estimate from few of many samples may miss."""
-    return replace(result, error=math.hypot(SCATTER * result.error, MISSED * tolerance))
-
-
-def _judged(
-    total: torch.Tensor,
-    samples: list[list[ErrorSample]],
-    seen: list[Any],
-    given: tuple[list[PropagationCase], list[float], float],
-    choice: MethodChoice,
-) -> IntensityResult:
-    """The result of a try with its estimate; seen: intensity of each part of the
-    window; given: cases, weights, sum of
-    squares of the transmission.
-
-    Raises:
-        PropagationError: no light in the window.
-    """
-    cases, weights, light = given
-    if not bool((total.detach().sum((-1, -2)) > 0).all()):
-        raise PropagationError(
-            "no light reaches the window at some depth; move or widen the window"
-        )
-    seen_light = total.detach().flatten(-2)
-    if (
-        choice.method == "wide"
-    ):  # of the light itself: what is dim about it weighs as little in the error
-        lit = torch.stack([(row @ row) / row.sum() for row in seen_light]).min()
-    else:
-        lit = seen_light.mean(-1).min()
-    brightness = float(lit) / sum(
-        weight * _incoherent(1.0, case) ** 2
-        for case, weight in zip(cases, weights, strict=True)
-    )
-    error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
-    return IntensityResult(total, error, choice.reason, light, brightness=brightness)
-
-
 def _windows(
     case: PropagationCase, choice: MethodChoice, tolerance: float
 ) -> tuple[tuple[PropagationCase, ...], ...]:
-    """Windows of a wavelength that are computed apart: cut as at the first wavelength."""
-    found = choose_method(case, tolerance, differentiable=True).tiles
+    """Parts of the window of a wavelength, cut as at the first wavelength."""
+    if choice.method == "wide":
+        return ((case,),)
+    found = choose_method(case, tolerance, differentiable=True, moving=True).tiles
     if [len(row) for row in found] == [len(row) for row in choice.tiles]:
         return found
     return tuple(
@@ -457,7 +320,7 @@ def _check(
     maps: tuple[torch.Tensor, torch.Tensor],
     case: PropagationCase,
     power: float,
-    moments: torch.Tensor,
+    nodes: Array,
 ) -> None:
     """Refuse maps that hold nothing or what is not finite, as the sums over all pillars
     tell.
@@ -465,18 +328,11 @@ def _check(
     Raises:
         PropagationError: naming row and column.
     """
-    if (
-        power > 0
-        and math.isfinite(power)
-        and bool(torch.isfinite(torch.view_as_real(moments)).all())
-    ):
+    finite = math.isfinite(power) and bool(np.isfinite(nodes).all())
+    if finite and power > 0:
         return
-    check_aperture(
-        maps[0][0].detach().cpu().numpy(), maps[1][0].detach().cpu().numpy(), case
-    )
-    if not (
-        math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())
-    ):
+    check_aperture(maps[0][0].detach().numpy(), maps[1][0].detach().numpy(), case)
+    if not finite:
         raise PropagationError(
             "phase or transmission is too large for its dtype; use float64, or wrap the phase"
         )
@@ -488,22 +344,13 @@ def _shifted(
     """Moving geometry seen from a tile of the window."""
     if moving is None or tile.centre_um == case.centre_um:
         return moving
-    shift = [a - b for a, b in zip(tile.centre_um, case.centre_um, strict=True)]
-    return replace(
-        moving,
-        centre=moving.centre
-        + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device),
-    )
+    shift = np.subtract(tile.centre_um, case.centre_um)
+    return replace(moving, centre=moving.centre + torch.from_numpy(shift))
 
 
 def _incoherent(power: float, case: PropagationCase) -> float:
     """Magnitude of the field at the window centre if all pillars added with random
     phases.
     """
-    area = (
-        case.area_um2
-        * case.sensor_distance_um
-        * case.wavenumber
-        / (2 * math.pi * chief_path(case) ** 2)
-    )
-    return math.sqrt(power) * area
+    near = case.sensor_distance_um * case.wavenumber / (2 * math.pi)
+    return math.sqrt(power) * case.area_um2 * near / chief_path(case) ** 2

@@ -5,8 +5,6 @@ taken so many at a time as fit.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
-
 import torch
 
 from metalens.core.arrays import Array
@@ -23,7 +21,11 @@ from metalens.psf.cells import (
     integrate_cells,
     plan_pixel_cells,
 )
-from metalens.psf.compute import IntensityResult, compute_intensity
+from metalens.psf.compute import (
+    IntensityRequest,
+    IntensityResult,
+    compute_intensity,
+)
 from metalens.psf.extended import Extent
 from metalens.psf.vector import PolarizationMixing, apart_maps
 
@@ -255,13 +257,11 @@ def _intensity(
     tolerance: float,
     moving: MovingGeometry | None,
 ) -> IntensityResult:
-    about: dict[str, Any] = {
-        "tolerance": tolerance,
-        "moving": moving,
-        "mixing": given.mixing,
-    }
     cases = given.at(case)
-    return compute_intensity(*given.shaded(cases), cases, given.weights, **about)
+    request = IntensityRequest(
+        *given.shaded(cases), cases, given.weights, given.mixing
+    )
+    return compute_intensity(request, tolerance=tolerance, moving=moving)
 
 
 def _blurred(

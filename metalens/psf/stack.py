@@ -16,7 +16,7 @@ from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import among
 from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import Budget, Polarisation
-from metalens.psf.compute import EXACT, KEPT, IntensityResult
+from metalens.psf.compute import ROUNDING, IntensityResult
 from metalens.psf.direction import DirectionRequest, compute_direction
 from metalens.psf.extended import Extent
 from metalens.psf.metrics import blur_um
@@ -339,7 +339,7 @@ def _record(
 
 def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
     """What keeps an estimate above the tolerance."""
-    least = max(KEPT[dtype], EXACT[dtype])
+    least = torch.finfo(dtype).eps
     if tolerance < least:
         more = ", give float64 maps" if dtype != torch.float64 else ""
         return f"above the tolerance: {str(dtype).removeprefix('torch.')} holds {least:.2g}{more}"
@@ -412,7 +412,7 @@ def _maps(
             f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each"
         )
     phase = to_tensor(phase)
-    if phase.dtype not in KEPT:
+    if phase.dtype not in ROUNDING:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
     level = to_tensor(level).to(phase)
     if phase.ndim < 2 or 0 in phase.shape[:-2] or not _broadcasts(level, phase):
