@@ -5,7 +5,7 @@ interpolation inside their blocks is added as noise of the pillars.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,7 @@ class NodeLight:
     case: geometry of the window. weight: of the wavelength.
     light: (map, e, x) complex amplitudes. nodes_um: (e,), (x,) positions.
     noise: standard deviation of the field by rounding and interpolation at the pillars.
+    parts: tiles along each axis of the window.
     pupils: (component,) signs and (component, map, e, x) factors on the light, whose
     squares add up; None for the light of one map.
     """
@@ -45,6 +46,7 @@ class NodeLight:
     light: Array
     nodes_um: tuple[Array, Array]
     noise: float
+    parts: int = 1
     pupils: tuple[Array, Array] | None = None
 
     @property
@@ -128,21 +130,20 @@ def sampled_square_error(light: Array, chance: Array, difference: Array) -> floa
 
 
 def draw_pixels(
-    light: Array, count: int, near: Array | None = None
+    light: Array, count: int, others: Sequence[Array] = ()
 ) -> tuple[Array, Array]:
     """Systematic sample of (n,) pixels, and the mean number of draws of each.
 
-    The chance goes in equal shares by the light, by its root, by the light near, and
-    evenly. All pixels are taken where ``count`` is not below their number.
+    The chance goes in equal shares by the light and by other densities, its root by
+    default. All pixels are taken where ``count`` is not below their number.
 
     Args:
         light: (pixel,) of sum 1. count: of pixels to draw.
-        near: (pixel,) mean light about each, for errors beside a sharp spot.
+        others: (pixel,) densities of any sum.
     """
     if len(light) <= count:
         return np.arange(len(light)), np.ones(len(light))
-    shares = [light, np.sqrt(light), np.ones(len(light))]
-    shares += [] if near is None else [near]
+    shares = [light, *(others or (np.sqrt(light),))]
     density = np.sum([share / share.sum() for share in shares], axis=0) / len(shares)
     total = np.cumsum(density)
     picks = (np.arange(count) + 0.5) / count
@@ -162,16 +163,26 @@ def _sample(
     energy = light.sum(1)
     light /= energy[:, None]
     mean = np.maximum(light.mean(0), 0.0)  # a flux may run back where it is dark
-    shapes = [part[0].case.samples for part in windows]
-    ends = np.cumsum([rows * columns for rows, columns in shapes])[:-1]
-    near = np.concatenate(
-        [
-            uniform_filter(part.reshape(shape), NEAR).ravel()
-            for part, shape in zip(np.split(mean, ends), shapes, strict=True)
-        ]
-    )
-    points, chance = draw_pixels(mean, count, near)
+    edges, near, first = [], [], 0
+    for part in windows:
+        rows, columns = part[0].case.samples
+        spot = mean[first : first + rows * columns].reshape(rows, columns)
+        near.append(uniform_filter(spot, NEAR).ravel())
+        y, x = (_tile_position(n, part[0].parts) for n in spot.shape)
+        edges.append((1 + 9 * np.maximum(np.abs(x), np.abs(y)[:, None]) ** 8).ravel())
+        first += rows * columns
+    others = np.sqrt(mean) * np.concatenate(edges), np.concatenate(near)
+    points, chance = draw_pixels(mean, count, others)
     return light, energy, depths, points, chance
+
+
+def _tile_position(count: int, parts: int) -> Array:
+    """(count,) positions of pixels within their tile, -1 to 1: truncated series err
+    most at its ends."""
+    if count == 1:
+        return np.zeros(1)
+    place = (np.arange(count) + 0.5) / count * min(parts, count)
+    return np.asarray(2 * (place % 1) - 1)
 
 
 def _by_part(

@@ -214,7 +214,7 @@ def _pillar_light(
     turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
     light = torch.polar(maps[1], maps[0] + torch.as_tensor(turn)).numpy()
     at = None if pupils is None else pupils(y, x)
-    return NodeLight(case, weight, light, (y, x), 0.0, at)
+    return NodeLight(case, weight, light, (y, x), 0.0, pupils=at)
 
 
 def _with_rays(
@@ -274,7 +274,10 @@ def _windowed(
                 rounding = plan.moments.carrier.rounding_rad
                 noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
                 noise *= _incoherent(_noisy_power(powers, at), case)
-                checked[index].append(NodeLight(window, weight, nodes, at_um, noise, at))
+                cut = 1 if is_wide else plan.layout.parts
+                checked[index].append(
+                    NodeLight(window, weight, nodes, at_um, noise, cut, at)
+                )
                 parts.append(light if weight == 1 else weight * light)
                 seen[index] = seen[index] + parts[-1].detach().numpy()
                 index += 1
