@@ -19,13 +19,8 @@ from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.paths import source_path
-from metalens.propagate import (
-    SAFETY,
-    PropagationCase,
-    draw_pixels,
-    morton_scan,
-    square_error,
-)
+from metalens.propagate import PropagationCase
+from metalens.propagate.estimate import SAFETY, draw_pixels, sampled_square_error
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -173,18 +168,13 @@ def _rim_error(lens: Radial, case: PropagationCase, field: Array) -> float:
     power = np.abs(field[depths]).reshape(len(depths), -1) ** 2
     energy = power.sum(1, keepdims=True)
     normalised = power / energy
-    points, chance = (
-        np.tile(v, (len(depths), 1))
-        for v in draw_pixels(
-            normalised.mean(0, keepdims=True), morton_scan(field.shape), 160
-        )
-    )
-    value = np.take_along_axis(field[depths].reshape(power.shape), points, 1)
+    points, chance = draw_pixels(normalised.mean(0), 160)
+    value = field[depths].reshape(power.shape)[:, points]
     y, x = case.window_um
-    at = np.stack([x[points[0] % len(x)], y[points[0] // len(x)]], -1)
+    at = np.stack([x[points % len(x)], y[points // len(x)]], -1)
     surplus = _surplus(lens, case, np.array(case.inverse_depths_per_um)[depths], at)
     difference = (np.abs(value + surplus) ** 2 - np.abs(value) ** 2) / energy
-    square = square_error(normalised, points, chance, difference)
+    square = sampled_square_error(normalised[:, points], chance, difference)
     return float(SAFETY * np.sqrt(square / (normalised**2).sum()))
 
 

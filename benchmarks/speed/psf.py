@@ -36,7 +36,7 @@ from benchmarks.speed._psf_case import (
 )
 from metalens import propagate, psf
 from metalens.propagate.direct import free_space_transfer
-from metalens.propagate.estimate import draw_pixels, morton_scan, square_error
+from metalens.propagate.estimate import draw_pixels, sampled_square_error
 
 WIDE = dict(
     window_um=128.0, samples=64, integrate=False
@@ -333,8 +333,8 @@ def _polarised_error(
     """
     plain, depth = stack.numpy(), len(stack.depths_um) // 2
     flat = np.asarray(plain.intensity[depth], float).reshape(1, -1)
-    points, chance = draw_pixels(flat, morton_scan(plain.intensity.shape), 64)
-    y, x = np.divmod(points[0], len(plain.x_um))
+    points, chance = draw_pixels(flat[0], 64)
+    y, x = np.divmod(points, len(plain.x_um))
     where = np.stack([plain.x_um[x], plain.y_um[y]], -1)
     one = {
         "depths_um": plain.depths_um[depth],
@@ -349,10 +349,11 @@ def _polarised_error(
         )[0]
 
     want = np.abs(at(1.0)) ** 2 if kind == "scalar" else _from_fields(at, case, kind)
-    difference = want * plain.step_um**2 / float(
-        plain.energy_um2[depth]
-    ) - np.take_along_axis(flat, points, 1)
-    return math.sqrt(square_error(flat, points, chance, difference) / (flat**2).sum())
+    difference = (
+        want * plain.step_um**2 / float(plain.energy_um2[depth]) - flat[:, points]
+    )
+    square = sampled_square_error(flat[:, points], chance, difference)
+    return math.sqrt(square / (flat**2).sum())
 
 
 def _from_fields(

@@ -10,6 +10,7 @@ from metalens.propagate.geometry import PropagationCase, split_window
 from metalens.propagate.nodes import MOST_NODES, WindowLayout, plan_layout
 
 EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
+WIDE_WORK = 1e9  # pillars x samples from which transforms are
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,8 @@ def choose_method(
     if not differentiable and pillars * points * (depths + 2) / 3 < EXACT_WORK:
         reason = f"exact sum: {pillars:,} pillars at {points} points"
         return MethodChoice("exact", reason, ((case,),))
-    if not moving and grids.is_wide(case, tolerance):
+    many = pillars * points > WIDE_WORK
+    if not moving and many and grids.is_wide(case, tolerance):
         return MethodChoice("wide", "wide window by Fourier transforms", ((case,),))
     with one_blas_thread():
         tiles = _windows(case, tolerance)

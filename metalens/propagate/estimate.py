@@ -19,13 +19,16 @@ from metalens.propagate.operators import depth_factors
 from metalens.propagate.paths import rayleigh_sommerfeld_kernel, to_sensor
 from metalens.propagate.pillars import Pupils
 
-POINTS, EVERY = 128, 32  # least number of points, and pixels to a point in a large window
+POINTS, EVERY = (
+    128,
+    32,
+)  # least number of points, and pixels to a point in a large window
 FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed WORK
 DEPTHS = 8  # judged at most
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
 NEAR = 9  # pixels along a side of the neighbourhood of a pixel
-RAYS = 8  # points at which a polarisation mixing of their own is formed
+RAYS = 12  # points at which a polarisation mixing of their own is formed
 FACTORS = 12  # nodes along an axis of the lens on which it is formed
 
 
@@ -87,8 +90,7 @@ def relative_error(windows: list[list[NodeLight]], intensity: list[Array]) -> fl
     difference = direct / energy[:, None] - light[:, points]
     noise = sum(2 * abs(s.weight) * s.noise**2 * (1 / energy).sum() for s in windows[0])
     total = sampled_square_error(light[:, points], chance, difference) + float(noise)
-    safety = SAFETY if 4 * len(points) >= pixels else SCATTER * SAFETY
-    return safety * math.sqrt(total / float((light**2).sum()))
+    return _relative_root(total, light, len(points))
 
 
 def pupil_error(
@@ -115,7 +117,14 @@ def pupil_error(
                     one, depths, (row, column), pupils
                 )
     total = sampled_square_error(light[:, points], chance, changed / energy[:, None])
-    return SAFETY * math.sqrt(total / float((light**2).sum()))
+    return _relative_root(total, light, len(points))
+
+
+def _relative_root(total: float, light: Array, count: int) -> float:
+    """Root of a sampled square error over that of ``light`` (depth, pixel), with the
+    safety factor of ``count`` points."""
+    safety = SAFETY if 4 * count >= light.shape[1] else SCATTER * SAFETY
+    return safety * math.sqrt(total / float((light**2).sum()))
 
 
 def sampled_square_error(light: Array, chance: Array, difference: Array) -> float:

@@ -121,9 +121,7 @@ def plan_moments(
     if case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
     found = [weight(place) for weight, place in zip(weights, places, strict=True)]
-    polynomials = [
-        torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in found
-    ]
+    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in found]
     return PillarMoments(
         blocks,
         wave,

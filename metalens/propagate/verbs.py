@@ -327,9 +327,7 @@ def windowed(
         )
     phase = to_tensor(phase_rad)
     level = to_tensor(transmission).to(phase)
-    made = plan_window(
-        make_case(phase.shape, **geometry), tolerance, torch.float64
-    )
+    made = plan_window(make_case(phase.shape, **geometry), tolerance, torch.float64)
     field = field_windowed(phase.double(), level.double(), made)
     field = field.to(torch.complex(phase.new_zeros(()), phase.new_zeros(())).dtype)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

@@ -97,9 +97,7 @@ class WidePlan:
         )
 
 
-def wide_plan(
-    case: PropagationCase, tolerance: float, dtype: torch.dtype
-) -> WidePlan:
+def wide_plan(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
     """A new plan.
 
     Args:

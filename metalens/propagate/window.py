@@ -137,9 +137,7 @@ def plan_window(
     return _keep((case, tolerance, dtype, moving, smooth), made)
 
 
-def plan_wide(
-    case: PropagationCase, tolerance: float, dtype: torch.dtype
-) -> WidePlan:
+def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
     """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
 
     Args:
@@ -227,9 +225,7 @@ def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Ar
 
 
 def _shared(
-    case: PropagationCase,
-    found: WindowLayout,
-    depths: DepthBasis,
+    case: PropagationCase, found: WindowLayout, depths: DepthBasis
 ) -> dict[str, torch.Tensor]:
     """Moments to the nodes of the window, those to the nodes of the tiles, and the
     depths.
@@ -246,9 +242,7 @@ def _shared(
     parts = [part for row in window_tiles(case, found.parts)[1] for part in row]
     away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
-    return {
-        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
-    }
+    return {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
 
 
 def _stacked(
@@ -276,9 +270,7 @@ def _stacked(
         arrays[name] = np.stack(
             [_padded(getattr(one, name), most)[..., kept[0]] for one in made]
         )
-    out = {
-        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
-    }
+    out = {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
     directions = np.concatenate([one.to_directions for one in made])
     out["to_directions"] = torch.tensor(directions)
     out["fields"] = torch.tensor(kept[1])

@@ -118,10 +118,7 @@ class IntensityRequest:
 
 
 def compute_intensity(
-    request: IntensityRequest,
-    *,
-    tolerance: float,
-    moving: MovingGeometry | None = None,
+    request: IntensityRequest, *, tolerance: float, moving: MovingGeometry | None = None
 ) -> IntensityResult:
     """|U|² on the window, wavelengths added with their weights.
 

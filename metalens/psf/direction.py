@@ -5,6 +5,7 @@ taken so many at a time as fit.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+
 import torch
 
 from metalens.core.arrays import Array
@@ -21,11 +22,7 @@ from metalens.psf.cells import (
     integrate_cells,
     plan_pixel_cells,
 )
-from metalens.psf.compute import (
-    IntensityRequest,
-    IntensityResult,
-    compute_intensity,
-)
+from metalens.psf.compute import IntensityRequest, IntensityResult, compute_intensity
 from metalens.psf.extended import Extent
 from metalens.psf.vector import PolarizationMixing, apart_maps
 
@@ -258,9 +255,7 @@ def _intensity(
     moving: MovingGeometry | None,
 ) -> IntensityResult:
     cases = given.at(case)
-    request = IntensityRequest(
-        *given.shaded(cases), cases, given.weights, given.mixing
-    )
+    request = IntensityRequest(*given.shaded(cases), cases, given.weights, given.mixing)
     return compute_intensity(request, tolerance=tolerance, moving=moving)
 
 

@@ -19,7 +19,6 @@ from metalens.cell import Film, Index
 from metalens.core.errors import PropagationError
 from metalens.lens import Layers, Media, media
 from metalens.propagate import PropagationCase
-from metalens.propagate.layered import solve_rays
 from metalens.propagate.paths import (
     chief_path,
     from_source,
@@ -285,7 +284,7 @@ def test_derivatives_in_distance_and_window_centre(step):
         moved = dataclasses.replace(case, behind=behind, centre_um=tuple(centre))
         reach2 = (centre[0] + X - x) ** 2 + (centre[1] + Y - y) ** 2
         w = media.square(behind.layers, reach2)
-        level = ray_amplitude(moved, behind.layers, w)
+        level = ray_amplitude(behind, moved.wavenumber, w, moved.reach_um)
         return np.log(level) + 1j * case.wavenumber * media.whole_path(behind.layers, w)
 
     across = ray_cosines(case, x - case.centre_um[0], y - case.centre_um[1])
@@ -371,22 +370,3 @@ def test_chief_ray_and_its_path_obey_snell():
     )
     assert chief_path(case) == pytest.approx(length, rel=1e-12)
     assert isinstance(case, PropagationCase)
-
-
-def test_rays_of_a_row_are_found_from_any_others() -> None:
-    """Through 20 nm of air, where reach² is bent most, from rays straight ahead, from
-    these, and from grazing ones.
-    """
-    layers = Media((1.0, 1.45, 2.02), (0.02, 480.0, 30.0)).layers
-    squared, thick = (
-        np.array([n * n for n, _ in layers]),
-        np.array([t for _, t in layers]),
-    )
-    reach2 = np.array([0.0, 1e-9, 3.1, 470.3**2, 441.0**2, 0.07, 505.6**2])
-    want = np.array([media.square(layers, one) for one in reach2])
-    work = np.empty((6, reach2.size))
-    s = np.zeros(reach2.size)
-    for start in (0.0 * s, want[::-1] / (1 - want[::-1]), np.full(reach2.size, 1e7)):
-        s[:] = start
-        solve_rays(reach2, squared, thick, s, work)
-        assert work[0] == pytest.approx(want, rel=1e-13, abs=1e-15)

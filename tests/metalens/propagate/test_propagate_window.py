@@ -235,7 +235,7 @@ def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
         )
         for i in range(21)
     ]
-    about = 1e-3, torch.float32, torch.device("cpu")
+    about = 1e-3, torch.float32
     first = [windowed.plan_window(one, *about) for one in cases]
     assert all(
         windowed.plan_window(one, *about) is kept
@@ -334,7 +334,7 @@ def test_gradcheck_of_the_moments_and_of_the_window():
     assert torch.autograd.gradcheck(
         lambda p, t: torch.view_as_real(reduce_to_moments(p, t, made)[0]), maps
     )
-    found = plan_window(case, 1e-4, torch.float64, torch.device("cpu"))
+    found = plan_window(case, 1e-4, torch.float64)
     count = found.tensors["turn"].shape[0]
     light = torch.randn(
         count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True
@@ -446,59 +446,6 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
         assert got == pytest.approx(want, rel=2e-6), (
             name
         )  # finite differences: 1e-9 of the value over the step
-
-
-@pytest.fixture
-def threads():
-    """Sets how many there are, for one test."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize(
-    ("shape", "count"), [((6, 9), 1), ((70, 130), 1), ((300, 20), 2)]
-)
-def test_torch_path_for_other_devices_equals_the_compiled_loops(
-    shape, count, monkeypatch, threads
-):
-    """Field on the window and gradients: pillars themselves as nodes, some rows at a
-    time, against nodes of blocks; of
-    the last 16 nodes a block along y and single ones along x, the lower half by another
-    thread."""
-    from metalens.propagate import pillars
-    from metalens.propagate.window import from_moments, plan_window
-
-    monkeypatch.setattr(pillars, "DEVICE_ROWS", 32)
-    threads(count)
-    made = plan_window(
-        propagate.make_case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu")
-    )
-    blocks, case = made.moments, made.case
-    places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)
-    at_pillars = [
-        torch.tensor(legendre.legendre_values(n, p / h)) for n, p, h in places
-    ]
-    plain = dataclasses.replace(blocks, rows=at_pillars[0], columns=at_pillars[1])
-    maps = tuple(torch.tensor(m) for m in lens(shape, kind="noisy"))
-    (first, power), (second, same) = (
-        pillars._gather(*maps, blocks),
-        pillars._gather_plain(*maps, plain),
-    )
-    assert power == pytest.approx(same, rel=1e-12)
-    fields = [from_moments(torch.complex(m[0], m[1]), made) for m in (first, second)]
-    assert (fields[0] - fields[1]).norm() < 1e-10 * fields[1].norm()
-    second.requires_grad_()
-    weight = torch.linspace(-1, 1, fields[1].numel(), dtype=torch.float64).view(
-        fields[1].shape
-    )
-    (
-        from_moments(torch.complex(second[0], second[1]), made).abs() ** 2 * weight
-    ).sum().backward()
-    out = torch.zeros(2, 2, *shape, dtype=torch.float64)
-    pillars._spread(maps, blocks, second.grad, tuple(out[0]))
-    pillars._spread_plain(maps, plain, second.grad, tuple(out[1]))
-    assert (out[0] - out[1]).norm() < 1e-9 * out[1].norm()
 
 
 def test_choose_takes_the_exact_sum_for_few_pillars_and_says_why():
