@@ -211,8 +211,12 @@ class Cell:
 
     @property
     def sections(self) -> tuple[Layer, ...]:
-        """The layers, or the one section that the pillar is."""
-        return self.layers or (Layer(self.height_um),)
+        """The layers, or the one section that the pillar is; none of a pillar without
+        height.
+        """
+        if self.layers or not self.height_um:
+            return self.layers
+        return (Layer(self.height_um),)
 
     @property
     def height_shares(self) -> tuple[float, ...]:
@@ -260,7 +264,7 @@ class Cell:
         wall, layers, their coats.
         """
         slope, foot = -2 * math.tan(self.sidewall_rad), -self.height_um / 2
-        bare, coated = [], []
+        bare, coated = ([0.0], [0.0]) if not self.sections else ([], [])
         for layer in self.sections:
             ends = [
                 layer.grow_um + slope * height

@@ -1,13 +1,14 @@
-"""Pillars by their own shape: exact derivatives of their Jones matrices by the
-pillar-response errors, and by their edges.
+"""Pillars by their own shape: central differences of ln t by the pillar-response errors,
+and by their edges.
 """
 
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metalens.cell import Cell
+from metalens.cell import Cell, Index, Layer, index
 from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
@@ -16,9 +17,11 @@ from metalens.library.axes import cell_of_sizes
 
 if TYPE_CHECKING:
     from metalens.lens import Lens
-    from metalens.rcwa import JonesDerivatives
 
-_UPRIGHT, _TILTED = (6, 8), (5, 6)  # harmonics of the coarser and the finer truncation
+_TRUNCATIONS = (5, 7)  # harmonics of the coarser and the finer solution
+_STEP = 1e-3  # um, rad or 1 of a number of the pillar, to either side
+_WALL_STEP_RAD = 5e-3  # 0.7 um of height then moves foot and top by 3.5 nm
+_SECTIONS = 6  # upright sections that stand for a tilted wall: 1 % of its derivative
 _HANDS = {"left": -1.0, "right": 1.0}
 _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 
@@ -43,8 +46,15 @@ class OwnRates:
 
 
 def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
-    """Exact derivatives of RCWA at a fixed truncation, for the light that the lens's
-    proxy is of.
+    """Derivatives of ln t of a lens's pillars by central differences of RCWA, for the
+    light that the lens's proxy is of.
+
+    Args:
+        lens: with one size a pillar.
+        size_um: (n,) sizes of pillars.
+
+    Returns:
+        Derivatives at these sizes by every pillar-response error.
 
     Accuracy: ``error``, the change from a coarser truncation: a few percent.
 
@@ -88,14 +98,13 @@ def _rates(
     weights: tuple[Array, ...],
 ) -> list[OwnRates]:
     """Of pillars of these cells and sizes, for each weighting of the Jones matrix."""
-    reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
-    tasks = [(cell, size, harmonics) for harmonics in reach for cell, size in cells]
+    tasks = [(cell, size, order) for order in _TRUNCATIONS for cell, size in cells]
     some = list(
         executor.gather_parallel(_derived, (lens.wavelength_um, edges, weights), tasks)
     )
     every = (
         np.array(some)
-        .reshape(len(reach), len(cells), len(weights), -1)
+        .reshape(len(_TRUNCATIONS), len(cells), len(weights), -1)
         .transpose(2, 0, 3, 1)
     )
     return [_judged(coarse, fine) for coarse, fine in every]
@@ -127,66 +136,100 @@ def _derived(
     task: tuple[Cell, float, int],
 ) -> list[list[complex]]:
     """For each weighting: derivatives of ln t by every pillar-response error, and by
-    the
-    edges less by the size.
+    the edges less by the size.
     """
-    from metalens.rcwa import jones_derivatives
-
-    (wavelength_um, edges, weights), (cell, size_um, harmonics) = about, task
+    (wavelength_um, edges, weights), (cell, size_um, _harmonics) = about, task
     causes = [row for _, row in of_kind(ResponseError)]
-    wanted = [_numbers(row, cell, size_um) for row in causes]
-    names = dict.fromkeys(name for some in (*wanted, edges) for name in some or {})
-    found = jones_derivatives(
-        cell, size_um, wavelength_um, harmonics=harmonics, by=names
-    )
-
-    def by(numbers: dict[str, float], weight: Array) -> complex:
-        return sum(
-            (share * _of(found, name, weight) for name, share in numbers.items()), 0j
-        )
-
-    differ = [
-        [by(some, weight) for weight in weights]
-        if some is not None
-        else _difference(row, wavelength_um, weights, task)
-        for row, some in zip(causes, wanted, strict=True)
-    ]
-    differ.append([by(edges, weight) for weight in weights])
-    return [list(each) for each in zip(*differ, strict=True)]
+    rows = [*(_numbers(row, cell, size_um) for row in causes), edges]
+    return np.transpose(
+        [_slopes(numbers, wavelength_um, weights, task) for numbers in rows]
+    ).tolist()
 
 
-def _numbers(row: Perturbation, cell: Cell, size_um: float) -> dict[str, float] | None:
+def _numbers(row: Perturbation, cell: Cell, size_um: float) -> dict[str, float]:
     acts = row.acts
-    return (
-        acts.numbers(cell, size_um)
-        if isinstance(acts, ResponseError) and acts.numbers
-        else None
-    )
+    if isinstance(acts, ResponseError) and acts.numbers:
+        return acts.numbers(cell, size_um)
+    return {}
 
 
-def _of(found: "JonesDerivatives", name: str, weight: Array) -> complex:
-    return complex((weight * found.by[name].t).sum() / (weight * found.jones.t).sum())
-
-
-def _difference(
-    row: Perturbation,
+def _slopes(
+    numbers: dict[str, float],
     wavelength_um: float,
     weights: tuple[Array, ...],
     task: tuple[Cell, float, int],
 ) -> list[complex]:
-    """Central differences of ln t by a cause of which no number of the cell tells, for
-    each weighting.
+    """Central differences of ln t, for each weighting, as numbers of a pillar grow at
+    these rates; 0 where there are none.
     """
-    from metalens.rcwa import jones
+    from metalens.rcwa import solve_truncation
 
-    (cell, size_um, harmonics), acts = task, row.acts
-    if not isinstance(acts, ResponseError) or acts.changed is None:
+    cell, size_um, harmonics = task
+    if not numbers:
         return [0j] * len(weights)
-    ends = (acts.changed(cell, sign * acts.step, wavelength_um) for sign in (-1, 1))
-    less, more = (
-        jones(end, size_um, wavelength_um, harmonics=harmonics).t for end in ends
+    step = _WALL_STEP_RAD if "sidewall_rad" in numbers else _STEP
+    less, middle, more = (
+        changed_pillar(cell, size_um, numbers, amount, wavelength_um)
+        for amount in (-step, 1e-6 * step, step)
+    )
+    t_less, t_more = (
+        solve_truncation(*end, wavelength_um, harmonics=harmonics, normals_of=middle).t
+        for end in (less, more)
     )
     return [
-        complex(np.log((w * more).sum() / (w * less).sum()) / (2 * acts.step))
+        complex(np.log((w * t_more).sum() / (w * t_less).sum()) / (2 * step))
         for w in weights
     ]
+
+
+def changed_pillar(
+    cell: Cell,
+    size_um: float,
+    numbers: dict[str, float],
+    amount: float,
+    wavelength_um: float,
+) -> tuple[Cell, float]:
+    """A pillar whose numbers have grown, with upright sections for a tilted wall.
+
+    Args:
+        cell, size_um: the pillar as designed.
+        numbers: rate of each number, named as in a cell file (``height_um``,
+            ``shape.ratio``, ``layers.0.height_um``, ``pillar.n``); ``size_um``, and
+            ``grow_um`` of all edge pairs.
+        amount: that the rates are multiplied by.
+        wavelength_um: in vacuum, of the refractive index.
+
+    Returns:
+        Cell and size of the changed pillar.
+    """
+    from metalens.rcwa import staircase_layers
+
+    layers = list(cell.layers)
+    for name, rate in numbers.items():
+        first, *rest = name.split(".")
+        change = rate * amount
+        if name == "size_um":
+            size_um += change
+        elif name == "grow_um":
+            layers = [_grown(layer, name, change) for layer in cell.sections]
+        elif name == "pillar.n":
+            n = index(cell.pillar, wavelength_um)
+            cell = dataclasses.replace(cell, pillar=Index(n.real + change, n.imag))
+        elif first == "shape":
+            cell = dataclasses.replace(cell, shape=_grown(cell.shape, rest[0], change))
+        elif first == "layers":
+            layers[int(rest[0])] = _grown(layers[int(rest[0])], rest[1], change)
+        else:
+            cell = _grown(cell, name, change)
+    if layers:
+        height_um = sum(layer.height_um for layer in layers)
+        cell = dataclasses.replace(cell, layers=tuple(layers), height_um=height_um)
+    if cell.sidewall_rad:
+        sections: tuple[Layer, ...] = tuple(staircase_layers(cell, _SECTIONS))
+        cell = dataclasses.replace(cell, sidewall_rad=0.0, layers=sections)
+    return cell, size_um
+
+
+def _grown(record: Any, name: str, change: float) -> Any:
+    """A record with one number larger."""
+    return dataclasses.replace(record, **{name: getattr(record, name) + change})

@@ -64,10 +64,9 @@ class ResponseError:
     the cause; None where a pillar of the same size has no more of it. step: of
     differences through a solver. exact: the number of the cell that tables of t follow
     by powers (:class:`metalens.fabrication.Solved`), empty where none does.
-    numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives`
-    names them, by cell and size of
-    the pillar; {} where such a pillar cannot have the cause. None: by differences, step
-    by step.
+    numbers: rate of each number of a cell, as
+    :func:`metalens.fabrication.own.changed_pillar` names them, by cell and size of the
+    pillar; {} where such a pillar cannot have the cause.
     """
 
     quick: Callable[[Guide], Array]

@@ -114,7 +114,7 @@ def has_upright_walls(cell: Cell, engine: str) -> bool:
     """Whether the modal engine solves the pillar by itself: its lights of one direction
     then share modes and a mesh.
     """
-    return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
+    return engine == "modal" and not cell.sidewall_rad
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:

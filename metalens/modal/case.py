@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.cell import Cell, Incidence, index
+from metalens.cell import Cell, Film, Incidence, index
 from metalens.core.errors import CellError
 
 LEAST_CONTRAST = (
@@ -21,6 +21,9 @@ RARER = 3.0
 NORMAL_RAD = (
     1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 )
+
+
+Films = tuple[tuple[complex, float], ...]  # permittivity, thickness
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,8 @@ class ModalCase:
     around: complex
     bloch: float
     p: bool
+    under: Films = ()
+    over: Films = ()
 
     @property
     def size(self) -> float:
@@ -114,16 +119,6 @@ class MeshSolution:
         return self.waves + self.rim
 
 
-def fresnel_scattering(case: ModalCase) -> np.ndarray:
-    """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
-    kz1, kz2 = (
-        math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above)
-    )
-    y1, y2 = (case.below / kz1, case.above / kz2) if case.p else (kz1, kz2)
-    r, t = (y1 - y2) / (y1 + y2), 2 * math.sqrt(y1 * y2) / (y1 + y2)
-    return np.array([[r, t], [t, -r]], complex)
-
-
 def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
     """Check a case, and put it into half pitches.
 
@@ -143,6 +138,13 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
         abs(math.sin(light.angle_rad)),
     )
     bloch = k0 * sine * half
+
+    def films(stack: tuple[Film, ...]) -> Films:
+        return tuple(
+            (index(film.material, light.wavelength_um) ** 2, film.thickness_um / half)
+            for film in stack
+        )
+
     return ModalCase(
         rho=diameter_um / cell.pitch_um,
         k0=k0 * half,
@@ -153,6 +155,8 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
         around=around**2,
         bloch=bloch if bloch > NORMAL_RAD else 0.0,
         p=light.polarization in ("p", along),
+        under=films(cell.under),
+        over=films(cell.over[::-1]),
     )
 
 
@@ -197,10 +201,9 @@ def check_shape(cell: Cell, diameter_um: float) -> None:
         raise CellError(
             f"the modal engine takes round pillars on a square lattice, not {cell.described}; use metalens.rcwa"
         )
-    if cell.under or cell.over or cell.sidewall_rad:
+    if cell.sidewall_rad:
         raise CellError(
-            "the elements take an upright pillar without films; metalens.modal.solve puts coupled waves right "
-            "for others"
+            "the elements take an upright pillar; metalens.rcwa solves tilted walls"
         )
     if not (math.isfinite(diameter_um) and 0 < diameter_um < cell.pitch_um):
         raise CellError(

@@ -12,7 +12,7 @@ from metalens.cell import Cell, Incidence, Polarization, Response, check_toleran
 from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
 from metalens.modal.assembly import AssembledDisc, assemble_disc
-from metalens.modal.case import MeshSolution, ModalCase, case_of, fresnel_scattering
+from metalens.modal.case import MeshSolution, ModalCase, case_of
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import HomogeneousBasis, homogeneous_modes
 from metalens.modal.ladder import COMPARED, RUNGS, MeshLevel, first_rung
@@ -30,7 +30,6 @@ from metalens.modal.match import (
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, is_lossless, magnetic_pencil
 from metalens.modal.spaces import build_symmetry_class, class_topology
-from metalens.rcwa import anchored
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
@@ -135,7 +134,8 @@ def layer_between(
     Few modes where the layer is without loss and thick enough that few carry, else all.
     """
     medium = LayerMedium(case.k0, case.disc, case.around)
-    if is_lossless(medium):
+    clear = all(complex(e).imag == 0 for e, _ in (*case.under, *case.over))
+    if clear and is_lossless(medium):
         pencil = (magnetic_pencil if magnetic else electric_pencil)(b, medium)
         modes = few_modes(pencil, case.height, weak=weak)
         if modes is not None:
@@ -175,12 +175,14 @@ def solve_form(
         else np.ones((2, 2))
     )
 
+    sides = (case.below, case.under), (case.above, case.over)
+
     def matched(
         bloch: float | None,
     ) -> tuple[ScatteringMatch, int, list[int], tuple[HalfSpace, HalfSpace]]:
         below, above = (
-            half_space(b, case.k0, e, magnetic=magnetic, bloch=bloch)
-            for e in (case.below, case.above)
+            half_space(b, case.k0, *side, magnetic=magnetic, bloch=bloch)
+            for side in sides
         )
         foot = zero_order(b, below, case.bloch, te=te)
         return (
@@ -193,8 +195,7 @@ def solve_form(
     match, foot, pair, halves = matched(case.bloch)
     matrix = match.matrix[pair][:, pair] * sign
     plain = [
-        half_space(b, case.k0, e, magnetic=magnetic).admittance
-        for e in (case.below, case.above)
+        half_space(b, case.k0, *side, magnetic=magnetic).admittance for side in sides
     ]
     grazing = 0.0
     if any(
@@ -355,8 +356,7 @@ def solve(
     """Zero-order response of a round pillar by the modal method, exact along z where
     the wall is upright.
 
-    A tilted wall and films: coupled waves put right by the modal method, see
-    :mod:`metalens.rcwa.anchored`.
+    Pillars with tilted walls or films are solved by :func:`metalens.rcwa.solve`.
 
     diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx =
     k0 sin angle), the same in
@@ -377,47 +377,22 @@ def solve(
     light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
-    if cell.round and (cell.sidewall_rad or cell.under or cell.over):
-        return _as_built(cell, float(diameter_um), light, tolerance)
-    case = case_of(cell, diameter_um, light)
-    if case.height == 0:
-        matrix = fresnel_scattering(case)
-        energy = float((np.abs(matrix[:, 0]) ** 2).sum())
-        return Response(
-            complex(matrix[1, 0]),
-            complex(matrix[0, 0]),
-            1e-15,
-            1,
-            energy,
-            "film",
-            True,
-            "closed form",
+    if cell.round and (cell.sidewall_rad or cell.height_um == 0):
+        from metalens import rcwa
+
+        return rcwa.solve(
+            cell,
+            diameter_um,
+            wavelength_um,
+            angle_rad=angle_rad,
+            azimuth_rad=azimuth_rad,
+            polarization=polarization,
+            tolerance=tolerance,
         )
+    case = case_of(cell, diameter_um, light)
     end = refine_mesh(case, tolerance)
     t, r = complex(end.solution.matrix[1, 0]), complex(end.solution.matrix[0, 0])
     unknowns, energy = end.solution.unknowns, end.solution.energy
     return Response(
         t, r, end.error, unknowns, energy, "modal", end.converged, end.reason
-    )
-
-
-def _as_built(
-    cell: Cell, diameter_um: float, light: Incidence, tolerance: float
-) -> Response:
-    """A pillar with a tilted wall or films, from upright ones without."""
-    plain = anchored.upright_cell(cell)
-    upright = [
-        solve(
-            plain,
-            node,
-            light.wavelength_um,
-            angle_rad=light.angle_rad,
-            azimuth_rad=light.azimuth_rad,
-            polarization=light.polarization,
-            tolerance=max(tolerance * anchored.SHARE, 2e-6),
-        )
-        for node in anchored.node_diameters(cell, diameter_um)
-    ]
-    return anchored.solve_anchored(
-        cell, diameter_um, light, upright, tolerance=tolerance
     )

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from metalens.modal.case import Films
 from metalens.modal.dense import cholesky_factor, solve_lower
 from metalens.modal.few_modes import FewModes
 from metalens.modal.homogeneous import HomogeneousBasis
@@ -32,39 +33,94 @@ CARRY = 1e-13
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfSpace:
-    """Admittances (n,) of the homogeneous modes (p = Y u going away), and which of them
-    propagate.
+    """A homogeneous half-space seen through its films, in the homogeneous modes.
+
+    Waves that go away have p = Y u. Of the orders that propagate (``ports``), incoming
+    power-normalised amplitudes a add -2 T a to p, and leaving ones are b = T u + R a.
+
+    admittance: (n,) Y. ports: (m,) places. transfer, reflection: (m,) T and R, of a bare
+    half-space sqrt(Y) and -1. lossless: whether no film absorbs.
     """
 
     admittance: np.ndarray
     ports: np.ndarray
+    transfer: np.ndarray
+    reflection: np.ndarray
+    lossless: bool
+
+    @property
+    def dual(self) -> "HalfSpace":
+        """The same for the unknown p in place of u."""
+        y, t = self.admittance[self.ports], self.transfer
+        turned = -(self.reflection + 2 * t**2 / y)
+        return HalfSpace(1 / self.admittance, self.ports, t / y, turned, self.lossless)
+
+    def real_admittance(self, *, dual: bool = False) -> np.ndarray:
+        """Real stand-in for the admittances of a half-space without loss.
+
+        The admittances that decay, and of the ports their size with the sign that the
+        stand-in of a travelling layer mode has, so that the two cannot cancel: plus in
+        the dual unknown, else minus.
+        """
+        near = self.admittance.real.copy()
+        size = np.abs(self.admittance[self.ports])
+        near[self.ports] = size if dual else -size
+        return near
 
 
 def half_space(
     basis: HomogeneousBasis,
     k0: float,
     permittivity: float,
+    films: Films = (),
     *,
     magnetic: bool,
     bloch: float | None = None,
 ) -> HalfSpace:
-    """Admittances p / u: electric form i kz (TE), i k0² eps / kz (TM); magnetic form i
-    kz / eps, i k0² / kz.
+    """Admittances p / u: electric form i kz (TE), i k0^2 eps / kz (TM); magnetic form
+    i kz / eps, i k0^2 / kz.
+
+    Args:
+        basis: homogeneous modes. k0: vacuum wavenumber. permittivity: of the half-space.
+        films: those on it, nearest first.
+        magnetic: the form.
+        bloch: if given, orders near their cut-off get the wavenumbers of the lattice
+            with this kx, see :func:`near_cutoff`.
 
     A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance
     stays finite.
-    bloch: if given, orders near their cut-off get the wavenumbers of the lattice with
-    this kx, see ``near_cutoff``.
     """
     square = np.concatenate([basis.te_exact, basis.tm_exact])
     if bloch is not None:
         square = near_cutoff(square, k0**2 * permittivity, bloch)
-    kz = axial_wavenumber(k0**2 * permittivity - square)
-    kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
-    a = len(basis.te)
-    te, tm = (1 / permittivity, 1.0) if magnetic else (1.0, permittivity)
-    admittance = np.concatenate([1j * kz[:a] * te, 1j * k0**2 * tm / kz[a:]])
-    return HalfSpace(admittance, np.flatnonzero(kz.real > 0))
+    is_te = np.arange(len(square)) < len(basis.te)
+
+    def wave(eps: complex) -> tuple[np.ndarray, np.ndarray]:
+        """kz, and c of p = c du/dz."""
+        kz = axial_wavenumber(k0**2 * eps - square)
+        kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
+        te, tm = (1 / eps, 1.0) if magnetic else (1.0, eps)
+        return kz, np.where(is_te, te, k0**2 * tm / kz**2)
+
+    kz, factor = wave(permittivity)
+    ports = np.flatnonzero(kz.real > 0)
+    y = 1j * kz * factor
+    transfer, reflection = np.sqrt(y), -np.ones(len(y), complex)
+    for eps, thickness in films:
+        kz, factor = wave(eps)
+        once = np.exp(1j * kz * thickness)
+        cosine, sine = (1 + once**2) / 2, (once**2 - 1) / (2j * kz * factor)
+        through = cosine - y * sine  # all times exp(i kz d), so that nothing grows
+        reflection = reflection - 2 * transfer**2 * sine / through
+        transfer = once * transfer / through
+        y = (y * cosine + (kz * factor) ** 2 * sine) / through
+    return HalfSpace(
+        y,
+        ports,
+        transfer[ports],
+        reflection[ports],
+        all(complex(eps).imag == 0 for eps, _ in films),
+    )
 
 
 def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
@@ -135,14 +191,14 @@ def layer_interface(
     layer: LayerModes, carry: np.ndarray, half: HalfSpace
 ) -> LayerInterface:
     """Blocks at a half-space, from all modes of the layer."""
-    admittance, ports = half.admittance, half.ports
+    ports = half.ports
     rate, c = 1j * layer.q, len(carry)
     columns = np.concatenate(
-        [layer.partner[:, carry], np.eye(len(admittance))[:, ports]], 1
+        [layer.partner[:, carry], np.eye(len(half.admittance))[:, ports]], 1
     )
-    real = np.isrealobj(layer.field)
+    real = np.isrealobj(layer.field) and half.lossless
     near_rate = -np.abs(rate) if real else rate
-    near = real_admittance(admittance) if real else admittance
+    near = half.real_admittance() if real else half.admittance
     inward = np.linalg.solve(
         layer.partner * near_rate + near[:, None] * layer.field, columns
     )
@@ -150,7 +206,7 @@ def layer_interface(
         columns.T @ (layer.field @ inward),
         inward,
         columns[:, :c].T @ layer.field[:, carry],
-        InterfaceRates(rate[carry], near_rate[carry], admittance[ports], near[ports]),
+        InterfaceRates(rate[carry], near_rate[carry], near[ports], half),
     )
 
 
@@ -160,8 +216,8 @@ def few_interface(
     """Blocks at a half-space, from the modes that carry and the real admittance of all
     others.
     """
-    admittance = 1 / half.admittance if pencil.dual else half.admittance
-    near, ports = real_admittance(admittance, dual=pencil.dual), half.ports
+    half = half.dual if pencil.dual else half
+    near, ports = half.real_admittance(dual=pencil.dual), half.ports
     a, c = len(pencil.te), len(modes.q)
     operator = modes.near.copy()
     pencil.te_turn.onto(operator[:a, :a], near[:a])
@@ -189,9 +245,7 @@ def few_interface(
         green,
         found,
         partner.T @ modes.field,
-        InterfaceRates(
-            1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]
-        ),
+        InterfaceRates(1j * modes.q, np.full(c, modes.near_rate), near[ports], half),
     )
 
 
@@ -225,26 +279,16 @@ def solve_symmetric(
     )
 
 
-def real_admittance(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
-    """Real stand-in: the admittances that decay, and for those that propagate their
-    size with the sign that the
-    stand-in of a travelling layer mode has, so that the two cannot cancel: plus in the
-    dual unknown, else minus."""
-    return np.where(
-        admittance.real == 0, np.abs(admittance) * (1 if dual else -1), admittance.real
-    )
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class InterfaceRates:
-    """i q of the carrying modes and the admittances of the ports: true, and as the
-    operator holds them.
+    """i q of the carrying modes, true and as the operator holds them; admittances of
+    the ports as it holds them; the half-space.
     """
 
     mode: np.ndarray
     near_mode: np.ndarray
-    port: np.ndarray
     near_port: np.ndarray
+    half: HalfSpace
 
 
 def correct_stand_ins(
@@ -257,22 +301,24 @@ def correct_stand_ins(
     with fields.
     """
     c, m = len(rates.mode), len(green)
-    if (rates.mode != rates.near_mode).any() or (rates.port != rates.near_port).any():
+    port = rates.half.admittance[rates.half.ports]
+    if (rates.mode != rates.near_mode).any() or (port != rates.near_port).any():
         correction = np.zeros((m, m), complex)
         correction[:c, :c] = np.linalg.solve(
             norm.T, np.diag(rates.mode - rates.near_mode)
         ).T
-        correction[c:, c:] = np.diag(rates.port - rates.near_port)
+        correction[c:, c:] = np.diag(port - rates.near_port)
         mend = np.linalg.inv(np.eye(m) + correction @ green)
         green, inward = green @ mend, inward @ mend
-    root = np.sqrt(rates.port)
-    weight = 2 * np.concatenate([rates.mode, root])
+    through = rates.half.transfer
+    weight = 2 * np.concatenate([rates.mode, through])
     arrive = np.linalg.solve(norm, green[:c]) * weight
     return LayerInterface(
         reflect=arrive[:, :c] - np.eye(c),
         enter=arrive[:, c:],
-        leave=root[:, None] * green[c:, :c] * weight[:c],
-        back=root[:, None] * green[c:, c:] * weight[c:] - np.eye(m - c),
+        leave=through[:, None] * green[c:, :c] * weight[:c],
+        back=through[:, None] * green[c:, c:] * weight[c:]
+        + np.diag(rates.half.reflection),
         inward=inward * weight,
     )
 

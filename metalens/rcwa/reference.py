@@ -1,12 +1,13 @@
 """Textbook RCWA: what the engine computes, in one page, without its shortcuts."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from metalens.cell import Cell, Layer, index
 from metalens.core.arrays import Array
+from metalens.rcwa.sidewall import staircase_layers
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -163,19 +164,6 @@ def solve_textbook_rcwa(
     r = np.sqrt(own[:, None] / own) * (direction @ back[pair])
     reflected = -power(back, -V_s) / incident
     return OrderResponse(m, n, t, r, power(on, V_c) / incident, reflected)
-
-
-def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
-    """The sections of a pillar, each of a tilted wall cut into ``steps`` upright ones."""
-    slope, foot, found = -2 * math.tan(cell.sidewall_rad), -cell.height_um / 2, []
-    for layer in cell.sections:
-        count = steps if cell.sidewall_rad else 1
-        each = layer.height_um / count
-        for i in range(count):
-            grow = layer.grow_um + slope * (foot + (i + 0.5) * each)
-            found.append(replace(layer, height_um=each, grow_um=grow))
-        foot += layer.height_um
-    return found
 
 
 def _admittance(medium: complex, kz: complex, angle_rad: float) -> Array:

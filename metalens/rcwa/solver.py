@@ -1,330 +1,675 @@
-"""Harmonics chosen per entry from the tolerance, with an error estimate from how the
-result still moves.
+"""RCWA of one unit cell: Jones matrices of any pillar, lattice and layers, refined over
+truncations until the error estimate meets a tolerance.
+
+Light comes from the substrate; phases run from the foot of the pillar (or the outer
+face of the films under it) to its top; time factor exp(-iwt).
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from metalens.cell import Response
+from metalens.cell import (
+    Cell,
+    Film,
+    Incidence,
+    Polarization,
+    Response,
+    check_tolerance,
+    materials,
+)
+from metalens.cell.shapes import Outline
 from metalens.core.arrays import Array
-from metalens.rcwa import wall
-from metalens.rcwa.conditions import DiscCase, case_waves, taper_um
-from metalens.rcwa.layer import disc_operators, solve_eigenmodes
-from metalens.rcwa.orders.waves import PlaneWaves
-from metalens.rcwa.stack import ScatteredAmplitudes, scatter_zero_order
+from metalens.core.errors import CellError
+from metalens.rcwa.basis import (
+    FLIP_X,
+    FLIP_Y,
+    HALF_TURN,
+    IDENTITY,
+    Operation,
+    PlaneWaves,
+    ReducedOrders,
+    TangentialWave,
+    lattice_frame,
+    plane_waves,
+    reduced_orders,
+    tangential_wave,
+)
+from metalens.rcwa.permittivity import PillarSection, pillar_section, section_operators
+from metalens.rcwa.sidewall import (
+    choose_stage_count,
+    match_walls,
+    sections_with_growth,
+    wall_sections,
+    width_slope,
+)
+from metalens.rcwa.smatrix import StackMedia, scatter_zero_order, solve_eigenmodes
 
-Moved = Callable[[Array], Array]
 _ROUNDING = 1e-13
-# of a matrix of all diameters that are solved together: below 0.5 GB with all its
-# companions
-_ENTRIES = 1_500_000
+_STRAIGHT = 1e-15  # cos or sin of an azimuth in a mirror plane, to rounding
+# The error estimate: the largest change from four (six where a gap, wall or hole is
+# narrow) earlier truncations, times SAFETY for coarse ones down to 3 from 13 on.
+_FIRST = 3  # harmonics of the first truncation where four are compared
+_LAST = {4: 15, 2: 11, 1: 9}  # by the number of symmetry operations: about a second
+_LAST_TILTED = {4: 10, 2: 7, 1: 6}  # collocation costs a hundred times as much
+_COMPARED, MOST_COMPARED = 4, 6
+_OSCILLATION = 0.75  # errors oscillate once while so many orders fit a narrow width
+NARROWEST = 0.02  # of the pitch: widths and gaps below it no truncation resolves
+_TOUCHING, _THIN = 5.0, 1.0  # additional factors for gaps and for walls of no width
+SAFETY = 7.0
+_COARSE = 3  # harmonics that suffice to choose the collocation of a tilted wall
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class TruncatedResponse:
-    """Results at one truncation, each (d,): transmission, reflection and power of all
-    orders.
+class JonesResponse:
+    """Zero-order response of one cell to both polarisations, power-normalised,
+    exp(-iwt), incidence from the substrate.
+
+    basis: ("x", "y") at normal incidence, ("s", "p") else, for an azimuth f from +x to
+        +y: s is a field along (-sin f, cos f), p one in the plane of incidence whose
+        part along the layers lies along (cos f, sin f).
+    t, r: (2, 2); column: incident polarisation, row: leaving. (For r, p is taken along
+        the same tangential direction as that of the incident light.)
+    t_error: estimate of the largest |t - exact| and |r - exact|, not below it.
+    energy: (2,) sum of |t|^2 and |r|^2 of all propagating orders, for each incident
+        polarisation: 1 without absorption. In an absorbing substrate powers of incident
+        and reflected light do not add: it may exceed 1.
+    orders: harmonics of the finest truncation. converged, reason: whether the tolerance
+        is met, and why the refinement ended.
+    earlier: (k, 2, 2) t of up to six earlier truncations, the first of them again where
+        fewer are compared. A number that follows from t has as error bar, like t
+        itself, ``SAFETY`` times its largest change over them.
     """
 
+    basis: tuple[str, str]
     t: Array
     r: Array
+    t_error: float
+    energy: Array
+    orders: int
+    converged: bool
+    reason: str
+    earlier: Array = field(default_factory=lambda: np.empty((0, 2, 2), complex))
+
+
+@dataclass(frozen=True, slots=True)
+class CellProblem:
+    """A cell at one size and light, its media, and the symmetry classes that its
+    polarisations have.
+
+    columns: polarisations that are wanted, 0: x or s, 1: y or p.
+    normals: for each section the outlines of its normal field; none: its own.
+    """
+
+    cell: Cell
+    size_um: float
+    light: TangentialWave
+    media: StackMedia
+    classes: tuple[tuple[Operation, ...], ...]
+    columns: tuple[int, ...] = (0, 1)
+    normals: tuple[tuple[Outline, ...], ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Truncation:
+    """Solution at one truncation: both: (2, 2, 2) t and r; energy: (2,)."""
+
+    both: Array
     energy: Array
 
-    @property
-    def both(self) -> Array:
-        """(2, d) t and r."""
-        return np.stack([self.t, self.r])
 
+def cell_problem(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    angle_rad: float,
+    azimuth_rad: float,
+) -> CellProblem:
+    """Check a cell, its size and its light.
 
-def solve_truncated(
-    this: DiscCase,
-    diameter_um: Array,
-    harmonics: int,
-    stages: int = 0,
-    *,
-    moved: Moved | None = None,
-) -> TruncatedResponse:
-    """Zero-order amplitudes for (d,) diameters with the orders within ``harmonics``.
+    Args:
+        cell: the pillar. size_um: of the shape. wavelength_um: in vacuum.
+        angle_rad, azimuth_rad: direction of the light.
 
-    stages: of the collocation of a tilted wall, see :mod:`metalens.rcwa.wall`; 0:
-    upright.
-    moved: diameter of a cross-section to the one that is taken for it.
+    Raises:
+        CellError: pillars that touch or lose their outline, an impossible angle, no
+            zero order.
+        MaterialError: a wavelength outside the range of a material.
     """
-    ways, zero = case_waves(this, harmonics)
-    size = 1 if stages else max(1, _ENTRIES // len(ways.kappa) ** 2)
-    found = []
-    for start in range(0, len(diameter_um), size):
-        some = diameter_um[start : start + size]
-        if stages:
-            found.append(_tilted(this, ways, zero, float(some[0]), stages, moved))
-            continue
-        media = dataclasses.replace(
-            this.media, heights=(this.cell.height_um * this.k0,)
+    light = tangential_wave(wavelength_um, angle_rad, azimuth_rad)
+    media = stack_media(cell, light)
+    check_size(cell, size_um)
+    classes = symmetry_classes(cell, size_um, light)
+    return CellProblem(cell, size_um, light, media, classes)
+
+
+def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
+    """Indices of half-spaces and films of a ``cell``, thicknesses times k0.
+
+    Raises:
+        CellError: no zero order of the ``light`` in the substrate. MaterialError: a
+            wavelength outside the range of a material.
+    """
+    k0 = 2 * math.pi / light.wavelength_um
+
+    def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
+        return tuple(
+            (materials.index(f.material, light.wavelength_um), f.thickness_um * k0)
+            for f in stack
         )
-        wide = moved(some) if moved else some
-        part = solve_eigenmodes(
-            *disc_operators(ways, wide, this.cell.pitch_um, this.pillar, this.between)
-        )
-        found.append(scatter_zero_order(ways, media, [part], zero))
-    t, r = (
-        np.concatenate([np.atleast_2d(getattr(part, name)) for part in found])
-        for name in ("t", "r")
+
+    below, above = (
+        materials.index(m, light.wavelength_um) for m in (cell.substrate, cell.cover)
     )
-    energy = (np.abs(t) ** 2).sum(axis=-1) + (np.abs(r) ** 2).sum(axis=-1)
-    return TruncatedResponse(t[:, zero], r[:, zero], energy)
+    sine = math.hypot(light.kx, light.ky)
+    if below.real <= sine:
+        raise CellError(
+            f"sin(angle_rad) = {sine:.6g} in a substrate of n = {below.real:.6g}: the "
+            "light cannot come from there; need a smaller angle_rad or another "
+            "substrate"
+        )
+    return StackMedia(below, above, films(cell.under), films(cell.over))
 
 
-def _tilted(
-    this: DiscCase,
-    ways: PlaneWaves,
-    zero: int,
+def check_size(cell: Cell, size_um: float) -> None:
+    """Refuse sizes that leave nothing or overlap, for every section of a ``cell``;
+    round pillars may touch, or have no diameter.
+
+    Raises:
+        CellError: says where the pillar of ``size_um`` is too wide or too thin.
+    """
+    least = ">= 0" if cell.round else "above 0"
+    if not math.isfinite(size_um) or size_um < 0 or (size_um == 0 and not cell.round):
+        raise CellError(f"size = {size_um} um: need a finite length {least}")
+    if size_um == 0:
+        return
+    for layer, grow in sections_with_growth(cell):
+        for end, share in (("foot", -0.5), ("top", 0.5)):
+            width = layer.grow_um + grow + share * width_slope(cell) * layer.height_um
+            if cell.round and size_um + width < -_ROUNDING:
+                raise CellError(
+                    f"diameter {size_um:g} um: the wall of {cell.sidewall_rad:.4g} rad "
+                    f"closes the pillar below its {end}; need at least {-width:.6g} um"
+                )
+            if cell.round:
+                overlaps = size_um + width > cell.pitch_um + _ROUNDING
+            else:
+                grown = width + 2 * layer.coat_um
+                overlaps = cell.gap_um(size_um, grow_um=grown) <= 0
+            if overlaps:
+                raise CellError(
+                    f"{cell.described}, size {size_um:g} um: pillars overlap, the "
+                    f"{end} of a section, {width:+.4g} um wider, touches its neighbour "
+                    f"on a pitch of {cell.pitch_um:g} um; need a smaller size or a "
+                    "larger pitch"
+                )
+
+
+def symmetry_classes(
+    cell: Cell, size_um: float, light: TangentialWave
+) -> tuple[tuple[Operation, ...], ...]:
+    """Symmetry operations of the fields: one set for all polarisations, or one for each.
+
+    Args:
+        cell, size_um: the pillar, whose mirrors count. light: its direction.
+    """
+    outline = cell.outline(size_um or cell.pitch_um / 2)
+    flip_x = light.kx == 0 and outline.keeps(-1, 1)
+    flip_y = light.ky == 0 and outline.keeps(1, -1)
+    if flip_x and flip_y:
+        return tuple(
+            (IDENTITY, FLIP_X[axis], FLIP_Y[axis], HALF_TURN) for axis in ("x", "y")
+        )
+    if flip_x or flip_y:
+        table = FLIP_X if flip_x else FLIP_Y
+        return tuple((IDENTITY, table[axis]) for axis in ("x", "y"))
+    if light.normal and outline.keeps(-1, -1):
+        return ((IDENTITY, HALF_TURN),)
+    return ((IDENTITY,),)
+
+
+def polarization_column(light: Incidence) -> int:
+    """Place of a polarisation in Jones matrices: 0 for x or s, 1 for y or p.
+
+    Args:
+        light: at normal incidence p lies along the axis that its azimuth is nearest to.
+
+    Raises:
+        CellError: a field along x or y in a plane of incidence off both axes.
+    """
+    wave = tangential_wave(light.wavelength_um, light.angle_rad, light.azimuth_rad)
+    if wave.normal:
+        if light.polarization in ("x", "y"):
+            return ("x", "y").index(light.polarization)
+        turned = round(light.azimuth_rad / (math.pi / 2)) % 2
+        return turned if light.polarization == "p" else 1 - turned
+    if light.polarization in ("s", "p"):
+        return ("s", "p").index(light.polarization)
+    along_x = abs(math.sin(light.azimuth_rad)) < _STRAIGHT
+    if not along_x and abs(math.cos(light.azimuth_rad)) >= _STRAIGHT:
+        raise CellError(
+            f"polarization = {light.polarization!r} at angle_rad = {light.angle_rad}, "
+            f"azimuth_rad = {light.azimuth_rad}: ambiguous off the axes; need 's' or 'p'"
+        )
+    return int(along_x == (light.polarization == "x"))
+
+
+def solve(
+    cell: Cell,
     diameter_um: float,
-    stages: int,
-    moved: Moved | None,
-) -> ScatteredAmplitudes:
-    """One pillar with a tilted wall."""
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    polarization: Polarization = "x",
+    tolerance: float = 1e-3,
+    harmonics: int | None = None,
+) -> Response:
+    """Zero-order transmission and reflection of a pillar by RCWA, at the smallest
+    truncation that meets the tolerance.
 
-    def sample(share: float) -> tuple[Array, Array]:
-        wide = np.array([diameter_um + (share - 0.5) * taper_um(this.cell)])
-        here = disc_operators(
-            ways,
-            moved(wide) if moved else wide,
-            this.cell.pitch_um,
-            this.pillar,
-            this.between,
-        )
-        return here[0][0], here[1][0]
+    Args:
+        cell: pillar of any shape, lattice, layers and films.
+        diameter_um: at half height, 0 (no pillar) to the pitch (touching pillars); of
+            another shape its size.
+        wavelength_um: in vacuum.
+        angle_rad: of the light outside, in vacuum: its tangential wave vector is k0
+            sin(angle_rad).
+        azimuth_rad: of the plane of incidence, from +x to +y.
+        polarization: s or p; x and y where the plane of incidence contains an axis.
+        tolerance: wanted bound of |t - exact|; beyond what the largest truncation
+            reaches, the result comes with its larger ``t_error`` and ``converged``
+            False.
+        harmonics: fix the largest truncation instead, and take the estimate there.
 
-    whole = [wall.TiltedWall(sample, this.cell.height_um * this.k0)]
-    between = functools.partial(wall.match_walls, whole, stages=stages)
-    return scatter_zero_order(ways, this.media, [], zero, between=between)
+    Returns:
+        Co-polarised amplitudes with their error estimate.
 
+    Raises:
+        CellError: an impossible diameter, angle, polarisation or tolerance.
+        MaterialError: a wavelength outside the range of a material.
 
-def film_response(this: DiscCase, index: complex) -> TruncatedResponse:
-    """The exact response of a cell whose pillar layer is a film, for one entry."""
-    ways, zero = case_waves(this, 0)
-    whole = (index, this.cell.height_um * this.k0)
-    media = dataclasses.replace(this.media, over=(whole, *this.media.over), heights=())
-    result = scatter_zero_order(ways, media, [], zero)
-    energy = np.abs(result.t[zero]) ** 2 + np.abs(result.r[zero]) ** 2
-    return TruncatedResponse(
-        result.t[zero : zero + 1], result.r[zero : zero + 1], np.array([energy])
+    Accuracy: ``t_error`` follows from the change between truncations. Lossless energy
+        and reciprocity hold to rounding.
+    """
+    check_tolerance(tolerance)
+    light = Incidence(
+        float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
+    )
+    problem = cell_problem(
+        cell,
+        float(diameter_um),
+        light.wavelength_um,
+        light.angle_rad,
+        light.azimuth_rad,
+    )
+    column = polarization_column(light)
+    if _is_square(problem):
+        column = 0
+    problem = dataclasses.replace(problem, columns=(column,))
+    found = _refine(problem, tolerance, harmonics)
+    return Response(
+        complex(found.t[column, column]),
+        complex(found.r[column, column]),
+        found.t_error,
+        found.orders,
+        float(found.energy[column]),
+        "film" if found.orders == 1 else "rcwa",
+        found.converged,
+        found.reason,
     )
 
 
-def solve_case(
-    this: DiscCase, diameter_um: Array, *, tolerance: float, harmonics: int | None
+def solve_many(
+    cell: Cell, diameter_um: Iterable[float], wavelength_um: float, **options: object
 ) -> list[Response]:
-    """Responses for (d,) diameters, each at the least truncation that meets the
+    """RCWA of several pillars, one after another: :func:`solve` of a ``cell`` for each
+    ``diameter_um`` at one ``wavelength_um``, with its other ``options``.
+    """
+    return [solve(cell, d, wavelength_um, **options) for d in diameter_um]  # type: ignore[arg-type]
+
+
+def jones(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    tolerance: float = 1e-3,
+    harmonics: int | None = None,
+) -> JonesResponse:
+    """Jones matrices of a unit cell by RCWA, at the smallest truncation that meets the
     tolerance.
+
+    Args:
+        cell: pillar of any shape, lattice, layers and films.
+        size_um: of the shape (what other stages call the diameter).
+        wavelength_um: in vacuum.
+        angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of
+            incidence, from +x to +y.
+        tolerance: wanted bound of |t - exact| and |r - exact|.
+        harmonics: fix the largest truncation instead (orders as on a square lattice of
+            the same area).
+
+    Raises:
+        CellError: pillars that touch or lose their outline, an impossible angle or
+            tolerance, no zero order, less than one harmonic.
+        MaterialError: a wavelength outside the range of a material.
+
+    Accuracy: ``t_error`` is 3 (from 13 harmonics on) to 7 times the largest change from
+        the four truncations before the last (six where pillar or gap is narrow), and
+        what the collocation of a tilted wall leaves. Corners and high contrast converge
+        slowly: 1e-2 is usual.
     """
-    empty = film_response(this, this.between)
-    rounding = _ROUNDING * (1 + this.k0 * this.cell.height_um)  # of the phase
-    done = {
-        int(i): _exact(empty, rounding)
-        for i in np.flatnonzero(is_homogeneous(this, diameter_um))
-    }
-    left = np.array([i for i in range(len(diameter_um)) if i not in done], int)
-    stages, cut = wall_stages(this, diameter_um[left], tolerance)
-    share = diameter_um / this.cell.pitch_um
-    lags = compared_truncations(np.minimum(share, 1 - share))
-    before = int(lags[left].max(initial=_COMPARED))
-    ladder = _ladder(this, harmonics, before)
-    history: list[Array] = []
-    for reach in ladder:
-        if not len(left):
-            break
-        wide = diameter_um[left]
-        found = solve_truncated(this, wide, reach, stages)
-        history.append(found.both)
-        if len(history) <= before and reach != ladder[-1]:
-            continue
-        change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
-        crowded = gap_factor(this.cell.pitch_um - wide, this.cell.pitch_um)
-        estimate = crowded * _estimate(np.array(history), reach, lags[left])
-        error = np.minimum(
-            _blur(this, wide, reach, change, estimate) + cut, largest_error(found.both)
+    check_tolerance(tolerance)
+    problem = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
+    return _refine(problem, tolerance, harmonics)
+
+
+def solve_truncation(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    harmonics: int,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    stages: int = 6,
+    normals_of: tuple[Cell, float] | None = None,
+) -> JonesResponse:
+    """Jones matrices at one truncation, without an error estimate.
+
+    Args:
+        cell, size_um, wavelength_um, angle_rad, azimuth_rad: as for :func:`jones`.
+        harmonics: of the truncation.
+        stages: Gauss points of each panel of a tilted wall.
+        normals_of: cell and size with as many sections, whose normal field is taken.
+            Between pillars that differ little it cancels the noise of the sampling; the
+            limit of many harmonics is the same.
+    """
+    problem = cell_problem(cell, size_um, wavelength_um, angle_rad, azimuth_rad)
+    if normals_of:
+        other, size = normals_of
+        normals = tuple(
+            pillar_section(other, layer, size, wavelength_um).outlines
+            for layer in other.sections
         )
-        settled = (error <= tolerance) | (reach == ladder[-1])
-        chosen = np.flatnonzero(settled)
-        found = TruncatedResponse(
-            found.t[chosen], found.r[chosen], found.energy[chosen]
-        )
-        for row, place in enumerate(chosen):
-            done[int(left[place])] = _response(
-                found, row, reach, float(error[place]), tolerance
-            )
-        history = [both[:, ~settled] for both in history]
-        left = left[~settled]
-    return [done[i] for i in range(len(diameter_um))]
+        problem = dataclasses.replace(problem, normals=normals)
+    found = solve_problem(problem, harmonics, stages if cell.sidewall_rad else 0)
+    return _response(problem, harmonics, found, math.inf, False, "one truncation")
 
 
-def largest_error(both: Array) -> Array:
-    """Most that t and r along the first axis may be wrong by: the true ones of a
-    passive cell are 1 at most.
+@dataclass(frozen=True, slots=True)
+class TruncationSequence:
+    """Truncations to try, how many earlier ones the error estimate compares, and a
+    factor on it for gaps and walls that none resolves.
+
+    The first truncation that may be the last one has ``compared`` below it, but where
+    few are asked for.
     """
-    return np.asarray(1 + np.maximum(1.0, np.abs(both).max(0)))
+
+    reaches: range
+    compared: int
+    factor: float
 
 
-_FIRST = 4  # orders of the first truncation, too few for any use but to see t move
-_LAST = {"x": 16, "p": 12, "s": 12, "none": 8}  # about a second a solve
-_COMPARED, MOST_COMPARED = 4, 6  # truncations before, that an error looks at
-_SWING = (
-    0.75  # of the swing of truncations with the number of orders in the narrowest width
-)
-_SAFETY = 3.0  # from _ENOUGH orders on
-_MORE, _ENOUGH = 0.6, 13  # and so much more for each order below
-_CUSPS, NARROWEST = (
-    5.0,
-    0.02,
-)  # more for pillars that touch, and the share of the pitch below which gaps count
-_COARSE = 4  # orders that suffice to see what the collocation of a tilted wall leaves
+def truncation_sequence(
+    problem: CellProblem, harmonics: int | None, *, tilted: bool = False
+) -> TruncationSequence:
+    """Truncations of one cell and light.
 
+    Args:
+        problem: cell and light.
+        harmonics: the largest truncation; None: one that takes about a second.
+        tilted: whether walls are collocated.
 
-def _ladder(this: DiscCase, harmonics: int | None, before: int) -> range:
-    """Truncations to try; the first that may be the last one has ``before`` below it."""
-    if harmonics is None:
-        return range(_FIRST + _COMPARED - before, _LAST[this.symmetry] + 1)
-    return range(max(harmonics - before, 1), harmonics + 1)
-
-
-def compared_truncations(width: float | Array) -> Array:
-    """How many truncations before the last are looked at, by the narrower of pillar and
-    gap (in pitches): 4 to 6.
-
-    Errors swing with the orders that fit into it, once in 1 / width of them. Of discs
-    of 0.1 to 0.2 pitches, and of
-    gaps so narrow, four truncations see a part of a swing alone: at 8 to 11 orders the
-    error was up to 8.5 times the
-    farthest of four (5 of 380 above its bar), and up to twice the farthest of so many.
-    Below a fiftieth of the pitch
-    :func:`gap_factor` stands for it, and discs so thin are not resolved.
+    Raises:
+        CellError: less than one harmonic.
     """
-    width = np.asarray(width)
-    swing = np.clip(
-        np.ceil(_SWING / np.maximum(width, NARROWEST)), _COMPARED, MOST_COMPARED
+    if harmonics is not None and harmonics < 1:
+        raise CellError(f"harmonics = {harmonics}: need at least 1")
+    cell, size_um = problem.cell, problem.size_um
+    if not size_um:
+        return TruncationSequence(range(1, 2), 0, 1.0)
+    pitch = cell.pitch_um
+    if cell.round:
+        gap, spans = max(0.0, pitch - size_um), np.array([size_um / pitch])
+    else:
+        gap = cell.gap_um(size_um)
+        spans = np.array(cell.outline(size_um).spans_um) / pitch
+    compared = max(
+        compared_truncations(gap / pitch),
+        *(compared_truncations(max(float(span), NARROWEST)) for span in spans),
     )
-    return np.where(width < NARROWEST, _COMPARED, swing).astype(int)
+    last = _last(problem.classes, tilted) if harmonics is None else harmonics
+    first = _FIRST + _COMPARED if harmonics is None else harmonics
+    thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST)
+    near = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST * pitch))
+    return TruncationSequence(
+        range(max(1, first - compared), last + 1), compared, max(thin, near)
+    )
+
+
+def compared_truncations(width: float) -> int:
+    """How many earlier truncations the error estimate compares, 4 to 6.
+
+    Args:
+        width: narrowest of pillar, walls, holes and gaps, in pitches. Errors oscillate
+            once in 1 / width orders; below ``NARROWEST`` a factor stands for it.
+    """
+    if width < NARROWEST:
+        return _COMPARED
+    return int(np.clip(math.ceil(_OSCILLATION / width), _COMPARED, MOST_COMPARED))
 
 
 def safety_factor(reach: int) -> float:
-    """How many times the farthest of the truncations before an error may be, at this
-    many orders.
+    """Factor from the largest change between truncations to the error bar, at ``reach``
+    harmonics.
     """
-    return _SAFETY + _MORE * max(0, _ENOUGH - reach)
+    return 3.0 + 0.6 * max(0, 13 - reach)
 
 
-def gap_factor(gap_um: float | Array, pitch_um: float) -> Array:
-    """Factor on :func:`safety_factor` for pillars that all but touch: fields between
-    them are
-    seen late by any order.
+def _refine(
+    problem: CellProblem, tolerance: float, harmonics: int | None
+) -> JonesResponse:
+    """The result of the smallest truncation that meets the tolerance, or of the last."""
+    tilted = bool(problem.cell.sidewall_rad)
+    sequence = truncation_sequence(problem, harmonics, tilted=tilted)
+    empty = _film_response(problem)
+    if _is_homogeneous(problem):
+        k0 = 2 * math.pi / problem.light.wavelength_um
+        rounding = _ROUNDING * (1 + k0 * problem.cell.height_um)
+        return _response(
+            problem, 0, empty, rounding, True, "a homogeneous layer: exact"
+        )
+    stages, left = 0, 0.0
+    if tilted:
+        coarse = min(sequence.reaches[-1], _COARSE)
+        stages, left = choose_stage_count(
+            lambda count: solve_problem(problem, coarse, count).both, tolerance
+        )
+    history: list[Array] = []
+    for reach in sequence.reaches:
+        found = solve_problem(problem, reach, stages)
+        history.append(found.both)
+        error = left + sequence.factor * estimate_error(
+            history, reach, sequence.compared
+        )
+        if reach * problem.size_um < problem.cell.pitch_um:
+            # orders that do not resolve the pillar say nothing of its effect
+            error = max(error, float(np.abs(found.both - empty.both).max()))
+        if len(history) > sequence.compared and error <= tolerance:
+            break
+    largest = 1 + max(1.0, float(np.abs(found.both).max()))  # exact ones are passive
+    error = min(error, largest)
+    met = error <= tolerance
+    reason = (
+        f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance "
+        f"{tolerance:.3g}"
+    )
+    before = [both[0] for both in history[-1 - sequence.compared : -1]]
+    earlier = before[:1] * (MOST_COMPARED - sequence.compared) + before
+    response = _response(problem, reach, found, error, met, reason)
+    return dataclasses.replace(
+        response, earlier=np.array(earlier, complex).reshape(-1, 2, 2)
+    )
 
-    Gaps of 40 pm in a pitch of 0.4 um: at 14 orders the error is 15 times the farthest
-    truncation. The factor is 1
-    from a fiftieth of the pitch on.
+
+def estimate_error(history: list[Array], reach: int, compared: int) -> float:
+    """Error estimate of the last truncation: :func:`safety_factor` times the largest
+    change from the truncations before it.
+
+    Errors fall at least as 1 / reach^2, so that of a change from m to n harmonics
+    m^2 / (n^2 - m^2) may be left (all of it at most).
+
+    Args:
+        history: results of successive truncations. reach: harmonics of the last.
+        compared: how many earlier ones count.
     """
-    return np.asarray(
-        1 + _CUSPS * np.clip(1 - np.asarray(gap_um) / (NARROWEST * pitch_um), 0, 1)
-    )
+    earlier = history[-1 - compared : -1][::-1]
+    shares = [
+        min(1.0, (reach - k) ** 2 / (reach**2 - (reach - k) ** 2))
+        for k in range(1, len(earlier) + 1)
+    ]
+    changes = [
+        share * float(np.abs(history[-1] - both).max())
+        for share, both in zip(shares, earlier, strict=True)
+    ]
+    return safety_factor(reach) * max(changes, default=1.0) + _ROUNDING
 
 
-def _estimate(t: Array, reach: int, lags: Array) -> Array:
-    """Error of the last of the results, t and r (rungs, 2, d): some times the farthest
-    of the truncations before.
+def most_harmonics(
+    cell: Cell, size_um: float, *, angle_rad: float = 0.0, azimuth_rad: float = 0.0
+) -> int:
+    """Largest truncation that :func:`jones` takes by itself: less without mirrors, and
+    where walls are tilted.
 
-    lags: (d,) how many, see :func:`compared_truncations`. Truncation errors fall as
-    reach^-2 and
-    swing with the number of orders
-    that fit across the disc; a swing takes up to four rungs where nothing is narrow.
-    For 52 diameters in three cells
-    at 8 to 16 orders, and for 86 random cells (pitch, height, index, absorption,
-    wavelength, diameter), the true error
-    was 0.4 of the farthest distance in the median and 2.7 of it at most. With few
-    orders it is more: up to 4.8 of it
-    below 8, and with a factor of 3 at 8 to 10 orders 3 of 200 cells (``python -m
-    benchmarks engines``) lay apart from
-    the modal method by up to 1.5 times both bars. Hence :func:`safety_factor`: 6 at 8
-    orders,
-    3 from 13 on.
+    Args:
+        cell, size_um: the pillar. angle_rad, azimuth_rad: direction of the light.
     """
-    if len(t) < 2:
-        return np.full(t.shape[2], np.inf)
-    moved = np.abs(t[-1] - t[:-1]).max(axis=1)
-    age = np.arange(len(moved), 0, -1)[:, None]
-    return np.asarray(
-        safety_factor(reach) * np.where(age <= lags, moved, 0.0).max(axis=0) + _ROUNDING
+    light = tangential_wave(1.0, angle_rad, azimuth_rad)
+    return _last(symmetry_classes(cell, size_um, light), bool(cell.sidewall_rad))
+
+
+def _last(classes: tuple[tuple[Operation, ...], ...], tilted: bool) -> int:
+    table = _LAST_TILTED if tilted else _LAST
+    return table[min(len(operations) for operations in classes)]
+
+
+def _is_square(problem: CellProblem) -> bool:
+    """Whether x and y are alike: both mirrors and a quarter turn, at normal incidence."""
+    return (
+        len(problem.classes) == 2
+        and len(problem.classes[0]) == 4
+        and problem.light.normal
+        and problem.cell.lattice.kind == "square"
+        and problem.cell.alike
     )
 
 
-def _blur(
-    this: DiscCase, diameter_um: Array, reach: int, change: Array, error: Array
-) -> Array:
-    """Where the orders do not resolve the pillar, none of its effect (d,) is believed."""
-    return np.where(
-        reach * diameter_um < this.cell.pitch_um, np.maximum(error, change), error
-    )
+def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
+    """t and r of the wanted polarisations at one truncation.
 
-
-def wall_stages(
-    this: DiscCase, diameter_um: Array, tolerance: float
-) -> tuple[int, float]:
-    """Stages of a tilted wall and the error they leave, the same at all orders; (0, 0)
-    where it is upright.
+    Args:
+        problem: cell and light. reach: harmonics.
+        stages: Gauss points of a tilted wall, 0 for an upright one.
     """
-    if not (len(diameter_um) and this.cell.sidewall_rad):
-        return 0, 0.0
-    return wall.choose_stage_count(
-        lambda stages: solve_truncated(this, diameter_um, _COARSE, stages).both,
-        tolerance,
+    cell, size_um, light = problem.cell, problem.size_um, problem.light
+    both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
+    square = problem.columns == (0, 1) and _is_square(problem)
+    columns = (0,) if square else problem.columns
+    for operations in problem.classes:
+        space = reduced_orders(reach, lattice_frame(cell, operations))
+        waves = plane_waves(space, cell, light)
+        if not set(columns) & set(waves.zero):
+            continue
+
+        def operators(
+            section: PillarSection,
+            i: int,
+            space: ReducedOrders = space,
+            waves: PlaneWaves = waves,
+        ) -> tuple[Array, Array]:
+            normals = problem.normals[i] if problem.normals else None
+            return section_operators(space, waves, section, cell, normals=normals)
+
+        walls = wall_sections(cell, size_um, light.wavelength_um, operators)
+        media, layers, match = problem.media, [], None
+        if stages:
+            match = functools.partial(match_walls, walls, stages=stages)
+        else:
+            symmetric = cell.outline(size_um).keeps(-1, -1)
+            layers = [
+                solve_eigenmodes(*wall.sample(0.5), symmetric=symmetric)
+                for wall in walls
+            ]
+            heights = tuple(wall.reduced_height for wall in walls)
+            media = dataclasses.replace(media, heights=heights)
+        for column, (place, sign) in waves.zero.items():
+            if column not in columns:
+                continue
+            found = scatter_zero_order(waves, media, layers, place, match=match)
+            energy[column] = found.energy
+            for row, (leaving, other) in waves.zero.items():
+                both[0, row, column] = sign * other * found.t[leaving]
+                both[1, row, column] = sign * other * found.r[leaving]
+    if square:
+        both[:, 1, 1], energy[1] = both[:, 0, 0], energy[0]
+    return Truncation(both, energy)
+
+
+def _film_response(problem: CellProblem) -> Truncation:
+    """Exact response of the cell with films of the surroundings in place of the pillar."""
+    cell, media, light = problem.cell, problem.media, problem.light
+    k0 = 2 * math.pi / light.wavelength_um
+    size_um = problem.size_um or cell.pitch_um / 2
+    films = []
+    for layer in cell.sections:
+        section = pillar_section(cell, layer, size_um, light.wavelength_um)
+        films.append((complex(np.sqrt(section.outside)), layer.height_um * k0))
+    media = dataclasses.replace(media, over=(*films, *media.over))
+    space = reduced_orders(0, lattice_frame(cell, (IDENTITY,)))
+    waves = plane_waves(space, cell, light)
+    both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
+    for column in problem.columns:
+        place, _ = waves.zero[column]
+        found = scatter_zero_order(waves, media, [], place)
+        both[:, column, column] = found.t[place], found.r[place]
+        energy[column] = abs(found.t[place]) ** 2 + abs(found.r[place]) ** 2
+    return Truncation(both, energy)
+
+
+def _is_homogeneous(problem: CellProblem) -> bool:
+    """Whether every layer is a film to rounding."""
+    cell, wavelength_um = problem.cell, problem.light.wavelength_um
+    if not problem.size_um:
+        return True
+    share = cell.outline(problem.size_um).area_um2 / cell.lattice.area_um2(
+        cell.pitch_um
     )
-
-
-def is_homogeneous(this: DiscCase, diameter_um: Array) -> Array:
-    """Where the pillar layer is a film to rounding: (d,) truth values."""
-    share = math.pi / 4 * (diameter_um / this.cell.pitch_um) ** 2
-    effect = (
-        share * abs(this.pillar**2 - this.between**2) * this.k0 * this.cell.height_um
-    )
-    return np.asarray(effect < _ROUNDING)
-
-
-def _exact(exact: TruncatedResponse, rounding: float) -> Response:
-    reason = "a homogeneous layer: exact"
-    return Response(
-        complex(exact.t[0]),
-        complex(exact.r[0]),
-        rounding,
-        1,
-        float(exact.energy[0]),
-        "film",
-        True,
-        reason,
-    )
+    effect = 0.0
+    for layer in cell.sections:
+        section = pillar_section(cell, layer, problem.size_um, wavelength_um)
+        contrast = max(abs(inner - section.outside) for inner in section.inside)
+        effect += share * contrast * 2 * math.pi / wavelength_um * layer.height_um
+    return effect < _ROUNDING
 
 
 def _response(
-    result: TruncatedResponse, place: int, reach: int, error: float, tolerance: float
-) -> Response:
-    met = error <= tolerance
-    reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    t, r, energy = result.t[place], result.r[place], result.energy[place]
-    return Response(
-        complex(t),
-        complex(r),
-        error,
-        _disc_orders(reach),
-        float(energy),
-        "rcwa",
-        met,
-        reason,
-    )
-
-
-def _disc_orders(reach: int) -> int:
+    problem: CellProblem,
+    reach: int,
+    found: Truncation,
+    error: float,
+    converged: bool,
+    reason: str,
+) -> JonesResponse:
+    names = ("x", "y") if problem.light.normal else ("s", "p")
     m = np.arange(-reach, reach + 1)
-    return int(np.count_nonzero(m[:, None] ** 2 + m**2 <= reach**2))
+    count = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
+    t, r = found.both
+    return JonesResponse(names, t, r, error, found.energy, count, converged, reason)

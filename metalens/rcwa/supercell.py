@@ -21,12 +21,18 @@ from metalens.cell.shapes import Outline
 from metalens.cell.shapes.outline import EllipseArc
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
-from metalens.rcwa import pattern
-from metalens.rcwa.layer import solve_eigenmodes
-from metalens.rcwa.orders import mirrors
-from metalens.rcwa.orders.waves import normal_component
-from metalens.rcwa.problem import stack_media, tangential_wave, waves_of
-from metalens.rcwa.stack import scatter_zero_order
+from metalens.rcwa.basis import (
+    FLIP_Y,
+    IDENTITY,
+    lattice_frame,
+    normal_component,
+    plane_waves,
+    reduced_orders,
+    tangential_wave,
+)
+from metalens.rcwa.permittivity import PillarSection, section_operators
+from metalens.rcwa.smatrix import scatter_zero_order, solve_eigenmodes
+from metalens.rcwa.solver import stack_media
 
 _MIRRORED = ((1, 1), (1, -1))  # rows are mirror symmetric in y
 
@@ -134,35 +140,34 @@ def solve_row(
     inside, around = (
         materials.index(one, wavelength_um) ** 2 for one in (cell.pillar, cell.fill)
     )
-    slab = pattern.PillarSection((Outline(tuple(discs)),), (inside,), around)
+    slab = PillarSection((Outline(tuple(discs)),), (inside,), around)
     light = tangential_wave(wavelength_um, 0.0, 0.0)
-    operations = (mirrors.IDENTITY, mirrors.FLIP_Y[polarization])
+    operations = (IDENTITY, FLIP_Y[polarization])
     radius = (2 * harmonics + 1) / math.sqrt(math.pi)
-    space = mirrors.reduced_orders(
+    space = reduced_orders(
         radius * math.sqrt(blocks) * block.width_um / cell.pitch_um,
-        pattern.lattice_frame(supercell, operations),
+        lattice_frame(supercell, operations),
     )
-    ways, places = waves_of(space, supercell, light)
-    operators = pattern.section_operators(space, ways, slab, supercell, flips=_MIRRORED)
+    waves = plane_waves(space, supercell, light)
+    operators = section_operators(space, waves, slab, supercell, flips=_MIRRORED)
     stack = replace(
         stack_media(cell, light),
         heights=(2 * math.pi / wavelength_um * cell.height_um,),
     )
-    zero, sign = places["xy".index(polarization)]
+    zero, sign = waves.zero["xy".index(polarization)]
     found = scatter_zero_order(
-        ways, stack, [solve_eigenmodes(*operators, symmetric=False)], zero
+        waves, stack, [solve_eigenmodes(*operators, symmetric=False)], zero
     )
-    energy = float((np.abs(found.t) ** 2).sum() + (np.abs(found.r) ** 2).sum())
-
     # in the plane of the row, light along x is p and light along y is s
-    is_p = np.arange(len(ways.m)) < ways.p_count
-    kept = np.flatnonzero((ways.n == 0) & (is_p == (polarization == "x")))
-    kept = kept[np.argsort(ways.m[kept])]
+    kept = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
+    kept = kept[np.argsort(waves.m[kept])]
     cover = stack.cover.real
-    cosine = normal_component(ways.kappa[kept], cover).real / cover
+    cosine = normal_component(waves.kappa[kept], cover).real / cover
     factor = np.sqrt(cosine if polarization == "x" else _inverse(cosine))
-    direction = np.where(ways.m[kept] == 0, sign, ways.along[0, kept])
-    return RowResponse(ways.m[kept], sign * direction * factor * found.t[kept], energy)
+    direction = np.where(waves.m[kept] == 0, sign, waves.along[0, kept])
+    return RowResponse(
+        waves.m[kept], sign * direction * factor * found.t[kept], found.energy
+    )
 
 
 def _inverse(cosine: Array) -> Array:

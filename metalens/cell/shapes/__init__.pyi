@@ -1,4 +1,3 @@
-from . import motion as motion
 from .every import Shape as Shape
 from .outline import EllipseArc as EllipseArc
 from .outline import Outline as Outline

@@ -9,19 +9,11 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index, Layer
-from metalens.cell.shapes import Circle, Ellipse, Rectangle
-from metalens.fabrication import (
-    ResponseError,
-    lacking,
-    named,
-    own,
-    own_rates,
-    perturbations,
-    response,
-)
+from metalens.cell.shapes import Circle, Rectangle
+from metalens.fabrication import ResponseError, lacking, named, own, own_rates, response
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
-from metalens.rcwa import jones, pattern
+from metalens.rcwa import jones, solve_truncation
 
 WAVE, SIZE, RATIO, ANGLE = 0.85, 0.23, 0.62, 0.2
 CELL = Cell(
@@ -60,16 +52,8 @@ def lens(cell=CELL, *, hand="", tilted_light=False):
 
 @pytest.fixture
 def few_orders(monkeypatch):
-    """Three orders, and one field of normals for all: any has the same limit, and the
-    usual one moves with its rim.
-    """
-    own_tables, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
-    monkeypatch.setattr(
-        pattern,
-        "normal_tables",
-        lambda outlines, cell, reach, *_: own_tables(fixed, cell, reach),
-    )
-    monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
+    """Three harmonics, where a solve takes milliseconds."""
+    monkeypatch.setattr(own, "_TRUNCATIONS", (2, 3))
 
 
 def changed(name, x):
@@ -150,32 +134,47 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
         assert found.by_edges(at) is None
 
 
+@pytest.fixture(scope="module")
+def changed_jones():
+    """Jones matrices of pillars 2 nm, 2 mrad or 2e-3 of index to either side of the
+    design, at nine harmonics: finer than the derivatives' own, normals sampled anew.
+    """
+    step, ends = 2e-3, {}
+    for name in ("height_nm", "index", "turn_deg", "width_nm", "length_nm"):
+        ends[name] = [changed(name, x) for x in (step, -step)]
+    ends["grown"] = [
+        (dataclasses.replace(CELL, layers=(Layer(CELL.height_um, x),)), SIZE)
+        for x in (step, -step)
+    ]
+    ends["wider"] = [(CELL, SIZE + x) for x in (step, -step)]
+    return step, {
+        name: [solve_truncation(*end, WAVE, harmonics=9).t for end in both]
+        for name, both in ends.items()
+    }
+
+
 @pytest.mark.parametrize("light", SEEN)
 def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(
-    light, few_orders
+    light, changed_jones
 ):
-    """Central differences over 0.1 nm, mrad, 1e-4: their order leaves 1e-6."""
+    """Truncation leaves 4 % between seven and nine harmonics; sampled normals 0.1."""
     about, seen = SEEN[light]
     found = own_rates(lens(**about), np.array([0.17, SIZE]))
+    step, ends = changed_jones
 
-    def slope(at):
-        more, less = (
-            np.log(seen(jones(*at(x), WAVE, harmonics=3).t)) for x in (1e-4, -1e-4)
-        )
-        return (more - less) / 2e-4
+    def slope(name):
+        more, less = (np.log(seen(t)) for t in ends[name])
+        return (more - less) / (2 * step)
 
     for name in ("height_nm", "index", "turn_deg", "width_nm", "length_nm"):
-        want = slope(lambda x, name=name: changed(name, x))
-        assert found.rates[ROWS.index(name), 1] == pytest.approx(want, rel=1e-4), name
-    grown = slope(
-        lambda x: (dataclasses.replace(CELL, layers=(Layer(CELL.height_um, x),)), SIZE)
-    )
-    wider = slope(lambda x: (CELL, SIZE + x))
-    assert found.edges[1] == pytest.approx(grown - wider, rel=1e-4)
-    assert abs(found.edges[1]) > 0.1 * abs(wider)
+        within = 0.06 * abs(slope(name)) + 0.1
+        assert abs(found.rates[ROWS.index(name), 1] - slope(name)) < within, name
+    want = slope("grown") - slope("wider")
+    assert abs(found.edges[1] - want) < 0.06 * abs(want) + 0.15
+    assert abs(found.edges[1]) > 0.1 * abs(slope("wider"))
 
 
-@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (1e-5, 6), (0.004, 7)])
+@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (0.004, 7)])
 def test_the_error_is_the_largest_change_from_the_coarser_truncation(
     angle, rows, monkeypatch, few_orders
 ):
@@ -185,7 +184,7 @@ def test_the_error_is_the_largest_change_from_the_coarser_truncation(
     straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
     sizes = np.array([0.17, SIZE, 0.26])
     fine = own_rates(straight, sizes)
-    monkeypatch.setattr(own, "_UPRIGHT", (1, 2))
+    monkeypatch.setattr(own, "_TRUNCATIONS", (1, 2))
     coarse = own_rates(straight, sizes)
     pairs = zip(
         *(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True
@@ -197,25 +196,6 @@ def test_the_error_is_the_largest_change_from_the_coarser_truncation(
     ]
     assert len(moved) == rows
     assert fine.error == pytest.approx(max(moved), rel=1e-9)
-
-
-def test_a_cause_of_which_no_number_tells_goes_by_differences(few_orders, monkeypatch):
-    """Over 10 nm and 0.02 of index: their second order leaves 2 %."""
-    about, sizes = SEEN["left"][0], np.array([SIZE])
-    exact = own_rates(lens(**about), sizes)
-    untold = tuple(
-        dataclasses.replace(row, acts=dataclasses.replace(row.acts, numbers=None))
-        if isinstance(row.acts, ResponseError) else row for row in perturbations.PERTURBATIONS
-    )  # fmt: skip
-    monkeypatch.setattr(perturbations, "PERTURBATIONS", untold)
-    found = own_rates(lens(**about), sizes)
-    for name in ("height_nm", "index"):
-        assert found.rates[ROWS.index(name)] == pytest.approx(
-            exact.rates[ROWS.index(name)], rel=0.02
-        ), name
-    assert not found.rates[
-        [ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]
-    ].any()
 
 
 def test_round_pillars_keep_their_form_as_their_edges_move(few_orders):

@@ -164,14 +164,14 @@ def test_loading_a_library_needs_neither_torch_nor_matplotlib():
     )
 
 
-def test_films_go_to_both_solvers_and_other_shapes_to_rcwa():
+def test_films_go_to_the_modal_solver_and_other_shapes_to_rcwa():
     coated = dataclasses.replace(DEFAULT_CELL, over=(Film(Index(1.45), 0.1),))
     assert engines.choose_engine(coated) == "modal"
     assert (
         engines.solve_to_tolerance(
             coated, Incidence(0.85), tolerance=5e-2, engine="modal"
         )(0.1).engine
-        == "anchored"
+        == "modal"
     )
     square = dataclasses.replace(DEFAULT_CELL, shape=Square())
     small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12), engine="modal")

@@ -12,7 +12,7 @@ from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Incidence, Index, Lattice
 from metalens.cell.shapes import Rectangle, Ring
 from metalens.core.errors import CellError
-from metalens.rcwa import FieldGrid, near, near_field, near_fields
+from metalens.rcwa import FieldGrid, near_field, near_fields
 
 WAVELENGTH = 0.81
 K0 = 2 * math.pi / WAVELENGTH
@@ -385,31 +385,6 @@ def test_the_error_bar_holds_against_more_orders():
     assert rough.error == pytest.approx(
         min(2.0, 7.8 * farthest / np.linalg.norm(rough.e))
     )
-
-
-def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypatch):
-    """Told at three orders, and added to 7.8 times the farthest of four truncations; of
-    four steps here, not twelve.
-    """
-    monkeypatch.setattr(near, "_STEPS", 4)
-    cell = dataclasses.replace(ROUND, pillar=Index(1.7), sidewall_rad=0.12)
-    grid = {
-        "x_um": _middles(4, 0.36),
-        "y_um": [0.02],
-        "z_um": np.linspace(-0.1, 0.6, 6),
-    }
-    runs = [
-        near_field(cell, SIZE, Incidence(WAVELENGTH), **grid, harmonics=n)
-        for n in (1, 2, 3, 4, 5)
-    ]
-    monkeypatch.setattr(near, "_STEPS", 2)
-    half = near_field(cell, SIZE, Incidence(WAVELENGTH), **grid, harmonics=3)
-    cut = np.linalg.norm(half.e - runs[2].e) / np.linalg.norm(runs[2].e)
-    farthest = max(
-        np.linalg.norm(run.e - runs[4].e) for run in runs[:4]
-    ) / np.linalg.norm(runs[4].e)
-    assert cut > 0.01
-    assert runs[4].error == pytest.approx(7.8 * farthest + cut, rel=1e-9)
 
 
 def test_what_cannot_be_computed_is_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index, Lattice
-from metalens.rcwa import pattern
+from metalens.rcwa.permittivity import normal_tables
 
 PITCH, DIAMETER = 0.4, 0.23
 ABOUT = {"height_um": 0.5, "pillar": Index(2.6), "substrate": Index(1.45)}
@@ -24,7 +24,7 @@ def test_tables_of_a_disc_are_those_of_its_rays(ratio):
     cell = Cell(PITCH, **ABOUT, lattice=lattice)
     wide, high = lattice.periods_um(PITCH)
     reach = (2, 3)
-    found = pattern.normal_tables((cell.outline(DIAMETER),), cell, reach)
+    found = normal_tables((cell.outline(DIAMETER),), cell, reach)
     counts = [int(np.ceil(192 * edge / PITCH)) for edge in (wide, high)]
     x, y = ((np.arange(n) / n + 0.5) % 1 - 0.5 for n in (c + c % 2 for c in counts))
     x, y = np.meshgrid(x * wide, y * high, indexing="ij")

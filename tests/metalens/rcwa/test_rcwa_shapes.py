@@ -12,7 +12,6 @@ from metalens.cell import Cell, Film, Incidence, Index, Lattice, Layer
 from metalens.cell.orders import check_subwavelength
 from metalens.cell.shapes import (
     Circle,
-    Cross,
     Ellipse,
     Polygon,
     Rectangle,
@@ -20,8 +19,6 @@ from metalens.cell.shapes import (
     Ring,
 )
 from metalens.core.errors import CellError
-from metalens.rcwa.any_shape import truncation_sequence
-from metalens.rcwa.problem import cell_problem
 
 ABOUT = {
     "height_um": 0.5,
@@ -91,50 +88,6 @@ def test_a_quarter_turn_exchanges_x_and_y(shape):
     assert np.abs(second.t - swap(first.t)).max() < 1e-9
     assert np.abs(second.r - swap(first.r)).max() < 1e-9
     assert np.abs(first.t[0, 0] - first.t[1, 1]) > 1e-2  # they do differ
-
-
-@pytest.mark.parametrize(
-    ("shape", "size_um", "before", "factor"),
-    [
-        (Rectangle(0.9), 0.3, 4, 1.0),
-        (
-            Ring(0.5),
-            0.32,
-            5,
-            1.0,
-        ),  # walls and hole of 0.16 and 0.32 pitches: 0.75 / 0.16
-        (Ring(0.75), 0.32, 6, 1.0),  # walls of 0.08
-        (Cross(0.15), 0.35, 6, 1.0),  # bars of 0.105
-        (
-            Ring(0.99),
-            0.45,
-            6,
-            2 - 0.0045 / 0.02,
-        ),  # walls of 0.0045, below a fiftieth: up to twice
-        (
-            Cross(0.01),
-            0.46,
-            6,
-            2 - 0.0092 / 0.02,
-        ),  # the gap of 0.08 is seen beside bars too thin to resolve
-    ],
-    ids=lambda v: getattr(v, "kind", None),
-)
-def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(
-    shape, size_um, before, factor
-):
-    """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are
-    wide.
-    """
-    this = cell_problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0)
-    found = truncation_sequence(this, None)
-    assert found.before == before
-    assert found.reaches == range(
-        7 - before, 16
-    )  # seven orders may be the last ones; 15 of four mirrors
-    assert truncation_sequence(this, 9).reaches == range(9 - before, 10)
-    assert truncation_sequence(this, 4).reaches == range(1, 5)
-    assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
 
 
 def test_one_truncation_alone_is_told_as_knowing_nothing():
@@ -235,11 +188,7 @@ def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
 
 def test_a_hole_is_the_pillar_with_materials_exchanged():
     hole = Cell(0.35, **ABOUT, shape=Circle(hole=True))
-    swapped = Cell(
-        0.35,
-        **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}),
-        lattice=RECTANGULAR,
-    )
+    swapped = Cell(0.35, **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}))
     one, other = (rcwa.jones(c, 0.2, WAVE, harmonics=5) for c in (hole, swapped))
     assert np.abs(one.t - other.t).max() < 1e-12
 

@@ -1,0 +1,500 @@
+"""Near field of a unit cell: E and H at any points, from the eigenmodes of every slab.
+
+Films and sections are slabs alike. With the amplitudes a of the upward modes at the
+foot of a slab of height h and b of the downward ones at its top, lengths over k0,
+
+    u = (Ex, Ey) = W (e^(iqz) a + e^(iq(h-z)) b),
+    w = (Hy, -Hx) = V (e^(iqz) a - e^(iq(h-z)) b),
+    Ez = -[eps]^-1 K^T w,   Hz = R^T u,   D = Q u + R R^T u.                      (1)
+
+At a wall the normal part of E jumps, and the sum of its orders rings; that of D does
+not. With the unit normal n of the nearest boundary and a weight N that is 1 there,
+
+    E = E_sum + N n n^T (D_sum / eps - E_sum)                                     (2)
+
+takes the normal part from D near boundaries, and jumps where eps does.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.cell import Cell, Incidence, check_tolerance
+from metalens.core.arrays import Array
+from metalens.core.errors import CellError
+from metalens.rcwa.basis import (
+    EZ,
+    Operation,
+    OrderSet,
+    PlaneWaves,
+    ReducedOrders,
+    half_space,
+    lattice_frame,
+    normal_component,
+    plane_waves,
+    reduced_orders,
+    toeplitz_matrix,
+)
+from metalens.rcwa.permittivity import (
+    PillarSection,
+    normals_at,
+    permittivity_at,
+    permittivity_coefficients,
+    pillar_section,
+    section_operators,
+)
+from metalens.rcwa.sidewall import staircase_layers
+from metalens.rcwa.smatrix import (
+    FourierModes,
+    TangentialFields,
+    film_modes,
+    match_layers,
+    outgoing_amplitudes,
+    solve_eigenmodes,
+)
+from metalens.rcwa.solver import (
+    CellProblem,
+    cell_problem,
+    polarization_column,
+    safety_factor,
+    truncation_sequence,
+)
+
+MOST_POINTS = 4_000_000  # of one call: 1 GB with the truncations that are compared
+# factor on the largest change from an earlier truncation, from so many harmonics on
+_SAFETY, _ENOUGH = 2.5, 7
+_STEPS = 12  # of a tilted wall, as a staircase; half as many tell what they leave
+_ON = 1e-12  # of the height: a point so little below an interface lies on it
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FieldGrid:
+    """Points (z, y, x) of three axes; a cut takes one value of an axis.
+
+    x_um (nx,), y_um (ny,): from the middle of the pillar; z_um (nz,): from its foot,
+    light goes along +z.
+    """
+
+    x_um: Sequence[float] | Array
+    y_um: Sequence[float] | Array
+    z_um: Sequence[float] | Array
+
+    def __post_init__(self) -> None:
+        for name in ("x_um", "y_um", "z_um"):
+            axis = np.asarray(getattr(self, name), float)
+            if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
+                raise CellError(
+                    f"{name} has shape {axis.shape}: need a list of finite lengths, at "
+                    "least one"
+                )
+            object.__setattr__(self, name, axis)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(nz, ny, nx)."""
+        return len(self.z_um), len(self.y_um), len(self.x_um)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NearField:
+    """Fields of one plane wave from the substrate on the points of a grid, exp(-iwt).
+
+    e: (3, nz, ny, nx) Ex, Ey, Ez for an incident wave of electric amplitude 1, whose
+        phase is 0 above the origin at the foot of the pillar (with films under it: at
+        their outer face). h: likewise, times the impedance of vacuum. On an interface
+        across z both are those just above it.
+    index: (nz, ny, nx) refractive index there.
+    error: estimate of the root-mean-square error of e over all the points, relative to
+        e.
+    orders: of the truncation. converged: whether ``error`` meets the tolerance.
+    """
+
+    grid: FieldGrid
+    e: Array
+    h: Array
+    index: Array
+    error: float
+    orders: int
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Slab:
+    """A film (an index alone), a section, or a half-space; height times k0."""
+
+    index: complex
+    section: PillarSection | None
+    height: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Stack:
+    """Slabs between the half-spaces, and where they meet.
+
+    slabs: foot first. ends: (slabs + 1,) interfaces times k0, 0 at the pillar's foot.
+    """
+
+    problem: CellProblem
+    slabs: list[_Slab]
+    ends: Array
+
+    @property
+    def k0(self) -> float:
+        return 2 * math.pi / self.problem.light.wavelength_um
+
+    def indices(self, z_um: Array) -> Array:
+        """(nz,) 0 for the substrate, then the slabs, last the cover."""
+        on = _ON * (self.ends[-1] - self.ends[0])
+        return np.searchsorted(self.ends, self.k0 * z_um + on, side="right")
+
+    def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
+        """For substrate, slabs and cover: eps (ny, nx), and N n n^T of (2) as (xx, yy,
+        xy), None where it is homogeneous.
+        """
+        cell, media = self.problem.cell, self.problem.media
+        y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
+        found: list[tuple[Array, Array | None]] = []
+        ends = _Slab(media.substrate, None, 0.0), _Slab(media.cover, None, 0.0)
+        for slab in (ends[0], *self.slabs, ends[1]):
+            if slab.section is None:
+                found.append((np.full(x.shape, slab.index**2, complex), None))
+                continue
+            normal = normals_at(slab.section.outlines, cell, x, y)
+            found.append((permittivity_at(slab.section, cell, x, y), normal))
+        return found
+
+
+def _stack(problem: CellProblem, steps: int) -> _Stack:
+    """Films under the pillar, sections from the foot up, films over it; a tilted wall
+    in equal steps.
+    """
+    cell, wavelength_um = problem.cell, problem.light.wavelength_um
+    k0, media = 2 * math.pi / wavelength_um, problem.media
+    sections = [
+        _Slab(
+            0j,
+            pillar_section(cell, layer, problem.size_um, wavelength_um),
+            k0 * layer.height_um,
+        )
+        for layer in staircase_layers(cell, steps)
+    ]
+    under, over = (
+        [_Slab(index, None, height) for index, height in films]
+        for films in (media.under, media.over)
+    )
+    slabs = [*under, *sections, *over]
+    foot = sum(slab.height for slab in under)
+    return _Stack(
+        problem, slabs, np.cumsum([0.0, *(slab.height for slab in slabs)]) - foot
+    )
+
+
+def near_fields(
+    cell: Cell,
+    size_um: float,
+    light: Incidence,
+    grids: Sequence[FieldGrid],
+    *,
+    tolerance: float = 0.05,
+    harmonics: int | None = None,
+) -> list[NearField]:
+    """Near field by RCWA: E and H of a cell of any shape, lattice, layers and films.
+
+    Other polarisations are sums: that of a circular wave is x + iy.
+
+    Args:
+        cell: the pillar.
+        size_um: of the shape (what other stages call the diameter).
+        light: polarisation x or y: E (its tangential part) along that axis; p: along
+            the plane of incidence, s: along z x k.
+        grids: points of each result.
+        tolerance: of the relative root-mean-square error over the points of any grid.
+        harmonics: fix the largest truncation instead.
+
+    Raises:
+        CellError: as :func:`metalens.rcwa.jones`; too many points.
+        MaterialError: a wavelength outside the range of a material.
+
+    Accuracy: ``error`` is 2.5 times the largest change from the four truncations before
+        the last (six where something is narrow), more below seven harmonics. Within a
+        few nm of an edge along z the field has no bound and no truncation is near. A
+        tilted wall is a staircase of twelve steps; half as many tell what it leaves.
+    """
+    check_tolerance(tolerance)
+    count = sum(math.prod(grid.shape) for grid in grids)
+    if not 0 < count <= MOST_POINTS:
+        raise CellError(
+            f"{count} points: need 1 to {MOST_POINTS} in one call; take cuts, or fewer "
+            "samples"
+        )
+    problem = cell_problem(
+        cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad
+    )
+    sequence = truncation_sequence(problem, harmonics)
+    steps = _STEPS if cell.sidewall_rad else 1
+    stack, left = _stack(problem, steps), np.zeros(len(grids))
+    if steps > 1:
+        coarse = min(sequence.reaches[-1], sequence.reaches[0] + 2)
+        half = _fields(_stack(problem, steps // 2), light, grids, coarse)
+        left = _differences(half, _fields(stack, light, grids, coarse))
+    history: list[list[tuple[Array, Array]]] = []
+    for reach in sequence.reaches:
+        found = _fields(stack, light, grids, reach)
+        changes = [_differences(one, found) for one in history]
+        largest = np.max(changes or [np.ones(len(grids))], axis=0)
+        factor = _SAFETY if reach >= _ENOUGH else safety_factor(reach)
+        error = np.minimum(sequence.factor * factor * largest + left, 2.0)
+        if len(history) >= sequence.compared and error.max() <= tolerance:
+            break
+        history = [*history, found][-sequence.compared :]
+    m = np.arange(-reach, reach + 1)
+    orders = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
+    results = []
+    for grid, (e, h), bar in zip(grids, found, error.tolist(), strict=True):
+        points = stack.points(grid)
+        eps = np.stack([points[i][0] for i in stack.indices(np.asarray(grid.z_um))])
+        results.append(
+            NearField(grid, e, h, np.sqrt(eps), bar, orders, bar <= tolerance)
+        )
+    return results
+
+
+def near_field(
+    cell: Cell,
+    size_um: float,
+    light: Incidence,
+    *,
+    x_um: Sequence[float] | Array,
+    y_um: Sequence[float] | Array,
+    z_um: Sequence[float] | Array,
+    tolerance: float = 0.05,
+    harmonics: int | None = None,
+) -> NearField:
+    """Near field by RCWA on one grid, see :func:`near_fields`.
+
+    Args:
+        cell, size_um, light, tolerance, harmonics: as there.
+        x_um, y_um, z_um: axes of the grid; ``y_um=[0.0]`` gives a cut along x and z.
+    """
+    grid = FieldGrid(x_um, y_um, z_um)
+    return near_fields(
+        cell, size_um, light, [grid], tolerance=tolerance, harmonics=harmonics
+    )[0]
+
+
+def _differences(
+    some: list[tuple[Array, Array]], others: list[tuple[Array, Array]]
+) -> Array:
+    """For every grid the root-mean-square difference of e, over that of the second."""
+    return np.array(
+        [
+            np.linalg.norm(one - other) / np.linalg.norm(other)
+            for (one, _), (other, _) in zip(some, others, strict=True)
+        ]
+    )
+
+
+def _fields(
+    stack: _Stack, light: Incidence, grids: Sequence[FieldGrid], reach: int
+) -> list[tuple[Array, Array]]:
+    """(3, nz, ny, nx) e and h of every grid, at one truncation."""
+    problem = stack.problem
+    found = [
+        tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
+    ]
+    for operations in problem.classes:
+        one = _solve_class(stack, light, reach, operations)
+        if one is None:
+            continue
+        for grid, fields in zip(grids, found, strict=True):
+            sums = _PointSums(problem, operations, one.space.reach, grid)
+            orders = one.orders_at(np.asarray(grid.z_um))
+            for field, components in zip(fields, orders, strict=True):
+                for i, (order_set, amplitude) in enumerate(components):
+                    field[i] += sums(order_set, amplitude)
+    for grid, (e, _, d) in zip(grids, found, strict=True):
+        points = stack.points(grid)
+        for i, place in enumerate(stack.indices(np.asarray(grid.z_um))):
+            eps, normal = points[place]
+            if normal is not None:
+                xx, yy, xy = normal
+                x, y = d[:, i] / eps - e[:2, i]
+                e[:2, i] += np.stack([xx * x + xy * y, xy * x + yy * y])
+    return [(e, h) for e, h, _ in found]
+
+
+Components = list[tuple[OrderSet, Array]]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _SolvedClass:
+    """One symmetry class: its waves, the modes of every slab and 1/eps for Ez, incident
+    amplitudes (n,), matched fields.
+    """
+
+    stack: _Stack
+    space: ReducedOrders
+    waves: PlaneWaves
+    layers: list[FourierModes]
+    inverse_z: list[Array]
+    incident: Array
+    fields: TangentialFields
+
+    def orders_at(self, z_um: Array) -> tuple[Components, Components, Components]:
+        """Components of E, H (times the impedance of vacuum) and D (x and y), each an
+        order set with amplitudes (nz, k), by (1).
+        """
+        waves, space, media = self.waves, self.space, self.stack.problem.media
+        u, w = self._tangential(z_um)
+        ez, d = np.zeros((len(z_um), len(space.ez.m)), complex), np.zeros_like(u)
+        p = slice(waves.bare, waves.p_count)
+        curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
+        for i, place in enumerate(self.stack.indices(z_um)):
+            along = waves.kappa[p] * w[i, p]
+            if 0 < place <= len(self.layers):
+                ez[i] = -self.inverse_z[place - 1] @ along
+                d[i] = self.layers[place - 1].Q @ u[i] + curl * u[i]
+            else:
+                ez[i] = -along / (media.cover if place else media.substrate) ** 2
+        hz = (waves.kappa * u)[:, len(waves.kappa) - len(space.hz.m) :]
+        e, h, d = (values @ waves.fold.T for values in (u, w, d))
+        count = len(space.ex.m)
+        return (
+            [(space.ex, e[:, :count]), (space.ey, e[:, count:]), (space.ez, ez)],
+            [(space.ey, -h[:, count:]), (space.ex, h[:, :count]), (space.hz, hz)],
+            [(space.ex, d[:, :count]), (space.ey, d[:, count:])],
+        )
+
+    def _tangential(self, z_um: Array) -> tuple[Array, Array]:
+        """(nz, n) amplitudes u and w of the waves at every height."""
+        ends = self.stack.ends
+        u, w = (np.zeros((len(z_um), len(self.incident)), complex) for _ in range(2))
+        places = self.stack.indices(z_um)
+        for i, (place, z) in enumerate(zip(places, self.stack.k0 * z_um, strict=True)):
+            if 0 < place <= len(self.layers):
+                modes, foot = self.layers[place - 1], ends[place - 1]
+                rise = np.exp(1j * modes.q * max(z - foot, 0.0))
+                fall = np.exp(1j * modes.q * (ends[place] - z))
+                up = rise * self.fields.up[place - 1]
+                down = fall * self.fields.down[place - 1]
+                u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
+            elif place:
+                u[i], w[i] = self._in_cover(max(z - ends[-1], 0.0))
+            else:
+                u[i], w[i] = self._in_substrate(z - ends[0])
+        return u, w
+
+    def _in_cover(self, height: float) -> tuple[Array, Array]:
+        index = self.stack.problem.media.cover
+        U, V = half_space(self.waves, index)
+        kz = normal_component(self.waves.kappa, index)
+        up = outgoing_amplitudes((U, V), self.fields.u_top, self.fields.w_top)
+        up = up * np.exp(1j * kz * height)
+        return U * up, V * up
+
+    def _in_substrate(self, height: float) -> tuple[Array, Array]:
+        index, incident = self.stack.problem.media.substrate, self.incident
+        U, V = half_space(self.waves, index)
+        kz = normal_component(self.waves.kappa, index)
+        up = incident.copy()
+        places = np.flatnonzero(incident)
+        up[places] *= np.exp(1j * kz[places] * height)
+        fields = self.fields
+        back = outgoing_amplitudes(
+            (U, V), fields.u - U * incident, V * incident - fields.w
+        )
+        down = back * np.exp(-1j * kz * height)
+        return U * (up + down), V * (up - down)
+
+
+def _solve_class(
+    stack: _Stack, light: Incidence, reach: int, operations: tuple[Operation, ...]
+) -> _SolvedClass | None:
+    """Waves, modes and fields of one symmetry class; None where the light has no part
+    in it.
+    """
+    problem, cell = stack.problem, stack.problem.cell
+    space = reduced_orders(reach, lattice_frame(cell, operations))
+    waves = plane_waves(space, cell, problem.light)
+    incident = np.zeros(len(waves.kappa), complex)
+    for column, (place, sign) in waves.zero.items():
+        incident[place] = sign * _incident_amplitudes(light)[column]
+    if not incident.any():
+        return None
+    symmetric = cell.outline(problem.size_um).keeps(-1, -1)
+    layers, inverse_z = [], []
+    for slab in stack.slabs:
+        if slab.section is None:
+            layers.append(film_modes(waves, slab.index, symmetric=symmetric))
+            inverse_z.append(np.eye(len(space.ez.m)) / slab.index**2)
+            continue
+        P, Q = section_operators(space, waves, slab.section, cell)
+        layers.append(solve_eigenmodes(P, Q, symmetric=symmetric))
+        eps, _ = permittivity_coefficients(slab.section, cell, space.reach)
+        inverse_z.append(np.linalg.inv(toeplitz_matrix(space, eps, EZ)))
+    below, above = (
+        half_space(waves, index)
+        for index in (problem.media.substrate, problem.media.cover)
+    )
+    heights = tuple(slab.height for slab in stack.slabs)
+    source = 2 * below[0] * below[1] * incident
+    fields = match_layers(layers, heights, above, below, source)
+    return _SolvedClass(stack, space, waves, layers, inverse_z, incident, fields)
+
+
+def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
+    """Amplitudes of the incident wave along x and y at normal incidence, of s and p
+    else.
+    """
+    c, s = math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
+    polarization = light.polarization
+    if light.angle_rad == 0:
+        amplitudes = {"x": (1.0, 0.0), "y": (0.0, 1.0), "p": (c, s), "s": (-s, c)}
+        return amplitudes[polarization]
+    column = polarization_column(light)
+    amplitude = 1.0
+    if polarization in ("x", "y"):  # the field along +x or +y, not against it
+        directions = {"x": (-s, c), "y": (c, s)}  # of the unit vectors of s and p
+        amplitude = math.copysign(1.0, directions[polarization][column])
+    return (0.0, amplitude) if column else (amplitude, 0.0)
+
+
+class _PointSums:
+    """Sums of orders on the points of a grid: amplitudes (nz, k), unfolded by the
+    symmetries, to (nz, ny, nx).
+    """
+
+    def __init__(
+        self,
+        problem: CellProblem,
+        operations: tuple[Operation, ...],
+        reach: tuple[int, int],
+        grid: FieldGrid,
+    ) -> None:
+        light, cell = problem.light, problem.cell
+        k0 = 2 * math.pi / light.wavelength_um
+        self.operations, self.reach = operations, reach
+        axes = np.asarray(grid.x_um), np.asarray(grid.y_um)
+        tangential, periods = (
+            (light.kx, light.ky),
+            cell.lattice.periods_um(cell.pitch_um),
+        )
+        self.along, self.across = (
+            np.exp(
+                1j
+                * (k0 * k + 2 * np.pi / period * np.arange(-r, r + 1))
+                * axis[:, None]
+            )
+            for k, period, r, axis in zip(tangential, periods, reach, axes, strict=True)
+        )
+
+    def __call__(self, orders: OrderSet, amplitude: Array) -> Array:
+        mx, my = self.reach
+        table = np.zeros((len(amplitude), 2 * my + 1, 2 * mx + 1), complex)
+        for (sx, sy, _), sign in zip(self.operations, orders.signs, strict=True):
+            table[:, sy * orders.n + my, sx * orders.m + mx] = (
+                sign * amplitude / np.sqrt(orders.size)
+            )
+        return np.asarray(self.across @ table @ self.along.T)

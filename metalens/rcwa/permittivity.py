@@ -1,0 +1,398 @@
+"""Operators P and Q of a patterned layer: permittivity from the exact Fourier factors
+of its outlines, and a field of unit normals from its boundary.
+
+The tangential field is split at the boundary into a normal part, where D is
+continuous, and a tangential part, where E is (Li, J. Opt. Soc. Am. A 13, 1870 (1996);
+Popov and Neviere, J. Opt. Soc. Am. A 18, 2886 (2001)):
+
+    E = [eps] - (Delta N + N Delta) / 2,   Delta = [eps] - [1/eps]^-1,   N = w n n^T.
+
+n is the normal of the nearest boundary point and w a weight that is 1 there; the limit
+of many orders is the same for any smooth N.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import j0, jv
+
+from metalens.cell import Cell, Layer, materials
+from metalens.cell.shapes import Outline
+from metalens.cell.shapes.outline import EllipseArc
+from metalens.core.arrays import Array
+from metalens.rcwa.basis import (
+    EX,
+    EY,
+    EZ,
+    MIXED,
+    PlaneWaves,
+    ReducedOrders,
+    toeplitz_matrix,
+)
+
+Flips = tuple[tuple[int, int], ...]
+FLIPS: Flips = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_GRID = 192  # points along the pitch on which normals are sampled
+_KEPT = 32  # coefficients of normals are kept for a multiple of so many orders
+# share of the largest distance to a boundary at which the weight w falls to 1/2
+_FAR = 0.5
+_TIE = 1e-9  # relative difference of distances that are equal
+
+
+@dataclass(frozen=True, slots=True)
+class PillarSection:
+    """A section that is homogeneous along z.
+
+    outlines: from the inside out. inside: permittivity within each, down to the next
+    smaller one. outside: permittivity around them.
+    """
+
+    outlines: tuple[Outline, ...]
+    inside: tuple[complex, ...]
+    outside: complex
+
+
+def pillar_section(
+    cell: Cell,
+    layer: Layer,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    grow_um: float = 0.0,
+) -> PillarSection:
+    """Outlines and permittivities of one layer of a pillar; a hole swaps the materials.
+
+    Args:
+        cell, layer: the pillar and one of its sections. size_um: of the shape.
+        wavelength_um: in vacuum.
+        grow_um: additional width along every pair of edges.
+    """
+
+    def eps(material: object) -> complex:
+        return materials.index(material, wavelength_um) ** 2  # type: ignore[arg-type]
+
+    pillar = eps(cell.pillar if layer.material is None else layer.material)
+    around = eps(cell.fill if layer.between is None else layer.between)
+    if cell.shape.hole:
+        pillar, around = around, pillar
+    width = layer.grow_um + grow_um
+    wall = cell.outline(size_um, grow_um=width)
+    if layer.coat is None:
+        return PillarSection((wall,), (pillar,), around)
+    side = -2 if cell.shape.hole else 2  # the coat of a hole lies inside the opening
+    coated = cell.outline(size_um, grow_um=width + side * layer.coat_um)
+    outlines = (coated, wall) if cell.shape.hole else (wall, coated)
+    return PillarSection(outlines, (pillar, eps(layer.coat)), around)
+
+
+def permittivity_coefficients(
+    section: PillarSection, cell: Cell, reach: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Fourier coefficients of eps and 1/eps, exact for every outline.
+
+    Args:
+        section: of the pillar. cell: its lattice.
+        reach: orders (m, n); the tables run from -2 reach to 2 reach.
+
+    Returns:
+        Two (4 reach_x + 1, 4 reach_y + 1) tables, real where they can be.
+    """
+    periods = cell.lattice.periods_um(cell.pitch_um)
+    gx, gy = (
+        2 * np.pi / period * np.arange(-2 * r, 2 * r + 1)
+        for period, r in zip(periods, reach, strict=True)
+    )
+    area = cell.lattice.area_um2(cell.pitch_um)
+    direct = np.zeros((len(gx), len(gy)), complex)
+    inverse = direct.copy()
+    centre = 2 * reach[0], 2 * reach[1]
+    direct[centre], inverse[centre] = section.outside, 1 / section.outside
+    beyond = (*section.inside[1:], section.outside)
+    steps = zip(section.outlines, section.inside, beyond, strict=True)
+    for outline, inner, outer in steps:
+        factor = outline.fourier(gx[:, None], gy) / area
+        direct += (inner - outer) * factor
+        inverse += (1 / inner - 1 / outer) * factor
+    return without_rounding(direct), without_rounding(inverse)
+
+
+def normal_tables(
+    outlines: tuple[Outline, ...],
+    cell: Cell,
+    reach: tuple[int, int],
+    flips: Flips | None = None,
+) -> tuple[Array, Array, Array]:
+    """Fourier coefficients of the normal field: w nx nx, w ny ny and w nx ny.
+
+    Args:
+        outlines: whose boundaries count. cell: its lattice.
+        reach: orders (m, n); the tables run from -2 reach to 2 reach.
+        flips: mirrors (sx, sy) that outlines and lattice share; None: those that the
+            outlines have.
+    """
+    if _is_centred_disc(outlines, cell):
+        return _disc_normal_tables(
+            outlines[0].parts[0].half_x_um / cell.pitch_um, reach
+        )  # type: ignore[union-attr]
+    most = tuple(_KEPT * math.ceil(2 * r / _KEPT) for r in reach)
+    rows, columns = (
+        slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True)
+    )
+    tables = _sampled_normals(outlines, cell, (most[0], most[1]), flips)
+    xx, yy, xy = (without_rounding(table[rows, columns]) for table in tables)
+    return xx, yy, xy
+
+
+def _is_centred_disc(outlines: tuple[Outline, ...], cell: Cell) -> bool:
+    """Whether the section is one disc on a square lattice."""
+    if len(outlines) > 1 or len(outlines[0].parts) > 1:
+        return False
+    part = outlines[0].parts[0]
+    return (
+        cell.lattice.kind == "square"
+        and isinstance(part, EllipseArc)
+        and part.half_x_um == part.half_y_um
+        and part.centre_um == (0.0, 0.0)
+    )
+
+
+def _disc_normal_tables(
+    radius: float, reach: tuple[int, int]
+) -> tuple[Array, Array, Array]:
+    """Normal field of a disc in closed form: N = n n^T of the radial unit vector n at
+    the boundary and outside, (r/R)^2 n n^T inside, where it is smooth at the centre.
+
+    (1 - r^2/R^2) n n^T within the disc has the coefficients a + b cos 2f, b sin 2f,
+    a - b cos 2f with Bessel functions a, b of |G| R; f is the direction of G.
+
+    Args:
+        radius: of the disc, in pitches. reach: orders (m, n).
+    """
+    even, odd = _radial_field(2 * reach[0])
+    m = np.arange(-2 * reach[0], 2 * reach[0] + 1)
+    mx, my = np.meshgrid(m, m, indexing="ij")
+    square = mx**2 + my**2
+    x = 2 * np.pi * radius * np.sqrt(square)
+    small = x < 0.01
+    y = np.where(small, 1.0, x)
+    share = np.pi * radius**2
+    second = jv(2, y)
+    a = share * np.where(small, 0.25 - x**2 / 48, 2 * second / y**2)
+    b = -share * np.where(small, x**2 / 96, (2 - 2 * j0(y) - 4 * second) / y**2)
+    cos2, sin2 = (
+        part / np.where(square == 0, 1, square) for part in (mx**2 - my**2, 2 * mx * my)
+    )
+    whole = even[np.abs(mx), np.abs(my)]
+    mixed = odd[np.abs(mx), np.abs(my)] * np.sign(mx) * np.sign(my)
+    return whole - a - b * cos2, whole.T - a + b * cos2, mixed - b * sin2
+
+
+@lru_cache(maxsize=32)
+def _radial_field(most: int) -> tuple[Array, Array]:
+    """Fourier coefficients of x^2/r^2 and x y/r^2 over the unit cell, orders 0 to
+    ``most`` on both axes.
+
+    Each eighth of the cell is mapped to a square (x = s, y = s v), where the field
+    depends on v alone and the integrand is smooth: Gauss-Legendre is exact to rounding.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(3 * most // 2 + 30)
+    s, ws = (nodes + 1) / 4, weights / 4
+    v, wv = (nodes + 1) / 2, weights / 2
+    angle = 2 * np.pi * np.arange(most + 1)
+    along = angle[:, None] * s
+    across = angle[:, None, None] * (s[:, None] * v)
+    area = 4 * ws * s
+    near, far = wv / (1 + v * v), wv * v * v / (1 + v * v)  # x > y, and y > x
+    even = (np.cos(along) * area) @ (np.cos(across) @ near).T + (
+        np.cos(across) @ far
+    ) @ (np.cos(along) * area).T
+    mixed = (np.sin(along) * area) @ (np.sin(across) @ (wv * v / (1 + v * v))).T
+    return even, -(mixed + mixed.T)
+
+
+@lru_cache(maxsize=64)
+def _sampled_normals(
+    outlines: tuple[Outline, ...],
+    cell: Cell,
+    most: tuple[int, int],
+    flips: Flips | None,
+) -> tuple[Array, Array, Array]:
+    """As :func:`normal_tables` by samples, over m, n from -most to most."""
+    x, y = cell.lattice.periods_um(cell.pitch_um)
+    counts = [
+        max(2 * m + 2, math.ceil(_GRID * edge / min(x, y) - 1e-6))
+        for m, edge in zip(most, (x, y), strict=True)
+    ]
+    counts = [count + count % 2 for count in counts]
+    px, py = np.meshgrid(
+        np.arange(counts[0]) * (x / counts[0]),
+        np.arange(counts[1]) * (y / counts[1]),
+        indexing="ij",
+    )
+    px, py = px - x * (px > x / 2), py - y * (py > y / 2)
+    products, distance = _nearest(outlines, cell, px, py)
+    weight = 1 / (1 + (distance / (_FAR * distance.max())) ** 4)
+    kept = flips or [
+        flip for flip in FLIPS if all(outline.keeps(*flip) for outline in outlines)
+    ]
+
+    def table(values: Array, *, odd: bool = False) -> Array:
+        spectrum = np.fft.fft2(values) / values.size
+        m, k = (np.arange(-reach, reach + 1) for reach in most)
+        whole = spectrum[m[:, None] % counts[0], k % counts[1]]
+        images = [(sx * sy if odd else 1) * whole[::sx, ::sy] for sx, sy in kept]
+        return np.asarray(np.mean(images, axis=0))
+
+    xx, yy, xy = weight * products
+    return table(xx), table(yy), table(xy, odd=True)
+
+
+def _nearest(
+    outlines: tuple[Outline, ...], cell: Cell, px: Array, py: Array
+) -> tuple[Array, Array]:
+    """(3, ...) nx nx, ny ny, nx ny of the nearest boundary point of any pillar, the mean
+    over points that are equally near, and (...) its distance; points in the middle
+    rectangle.
+    """
+    sites = _sites(cell)
+    parts = [part for outline in outlines for part in outline.parts]
+    if all(isinstance(p, EllipseArc) and p.half_x_um == p.half_y_um for p in parts):
+        radii = np.repeat([part.half_x_um for part in parts], len(sites))  # type: ignore[union-attr]
+        centres = [part.centre_um + sites for part in parts]  # type: ignore[union-attr]
+        return _nearest_circle(np.concatenate(centres), radii, px, py)
+    from scipy.spatial import cKDTree
+
+    step_um = min(cell.lattice.periods_um(cell.pitch_um)) / 200
+    found = [outline.boundary(step_um) for outline in outlines]
+    points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
+    copies = (points[None] + sites[:, None]).reshape(-1, 2)
+    near, place = cKDTree(copies).query(np.stack([px, py], axis=-1), k=2)
+    nx, ny = np.tile(normals, (len(sites), 1))[place].transpose(3, 0, 1, 2)
+    products = np.stack([nx**2, ny**2, nx * ny])
+    tie = near[..., 1] - near[..., 0] < _TIE * cell.pitch_um
+    mean = np.where(tie, products.mean(axis=-1), products[..., 0])
+    return mean, np.asarray(near[..., 0])
+
+
+def _nearest_circle(
+    centres: Array, radii: Array, px: Array, py: Array
+) -> tuple[Array, Array]:
+    """As :func:`_nearest`, for circles (k, 2) and (k,): normals lie on their radii."""
+    least = np.full(px.shape, np.inf)
+    total, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
+    for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True):
+        dx, dy = px - x, py - y
+        square = dx**2 + dy**2
+        distance = np.abs(np.sqrt(square) - radius)
+        nearer = distance < least - _TIE * radius
+        near = distance < least + _TIE * radius
+        total, count = np.where(nearer, 0.0, total), np.where(nearer, 0.0, count)
+        middle = square < (_TIE * radius) ** 2  # no direction is preferred there
+        scale = np.where(middle, 1.0, square)
+        products = np.stack([dx * dx, dy * dy, dx * dy]) / scale
+        products[:2, middle] = 0.5
+        total, count = total + near * products, count + near
+        least = np.minimum(least, distance)
+    return total / count, least
+
+
+def _sites(cell: Cell) -> Array:
+    """(n, 2) the site at the origin and those around it that reach into the middle
+    rectangle.
+    """
+    steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
+    most = 1.6 * max(cell.lattice.periods_um(cell.pitch_um))
+    return np.asarray(steps[np.abs(steps).max(axis=1) < most])
+
+
+def _wrapped(cell: Cell, x_um: Array, y_um: Array) -> tuple[Array, Array]:
+    """Points moved by whole periods into the middle rectangle."""
+    px, py = cell.lattice.periods_um(cell.pitch_um)
+    return x_um - px * np.round(x_um / px), y_um - py * np.round(y_um / py)
+
+
+def normals_at(
+    outlines: tuple[Outline, ...], cell: Cell, x_um: Array, y_um: Array
+) -> Array:
+    """(3, ...) sampled normal field w nx nx, w ny ny, w nx ny.
+
+    Args:
+        outlines: whose boundaries count. cell: its lattice.
+        x_um, y_um: (...) points.
+    """
+    edges = cell.lattice.periods_um(cell.pitch_um)
+    axes = (
+        np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / min(edges)))
+        for edge in edges
+    )
+    far = _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
+    products, distance = _nearest(outlines, cell, *_wrapped(cell, x_um, y_um))
+    return np.asarray(products / (1 + (distance / far) ** 4))
+
+
+def permittivity_at(
+    section: PillarSection, cell: Cell, x_um: Array, y_um: Array
+) -> Array:
+    """(...) permittivity of a ``section`` on the lattice of a ``cell`` at the points
+    ``x_um``, ``y_um``.
+    """
+    x, y = _wrapped(cell, x_um, y_um)
+    eps = np.full(x.shape, section.outside, complex)
+    pairs = zip(reversed(section.outlines), reversed(section.inside), strict=True)
+    for outline, inner in pairs:
+        for site in _sites(cell):
+            eps[outline.inside(x - site[0], y - site[1])] = inner
+    return eps
+
+
+def without_rounding(values: Array) -> Array:
+    """``values`` without their imaginary part where it is rounding."""
+    rounding = 1e-12 * np.abs(values).max()
+    real = np.abs(values.imag).max() <= rounding
+    return np.asarray(values.real if real else values)
+
+
+def section_operators(
+    space: ReducedOrders,
+    waves: PlaneWaves,
+    section: PillarSection,
+    cell: Cell,
+    flips: Flips | None = None,
+    normals: tuple[Outline, ...] | None = None,
+) -> tuple[Array, Array]:
+    """Operators P and Q (see :mod:`metalens.rcwa.basis`) of a section, (n, n) each.
+
+    Args:
+        space, waves: reduced orders, and the waves made of them.
+        section: outlines and permittivities. cell: its lattice.
+        flips: as in :func:`normal_tables`.
+        normals: outlines of the normal field; None: those of the section.
+    """
+    direct, inverse = permittivity_coefficients(section, cell, space.reach)
+    outlines = section.outlines if normals is None else normals
+    xx, yy, xy = normal_tables(outlines, cell, space.reach, flips)
+    laurent = [toeplitz_matrix(space, direct, link) for link in (EX, EY)]
+    delta = [
+        part - np.linalg.inv(toeplitz_matrix(space, inverse, link))
+        for part, link in zip(laurent, (EX, EY), strict=True)
+    ]
+    nx, ny, mixed = (
+        toeplitz_matrix(space, table, link)
+        for table, link in ((xx, EX), (yy, EY), (xy, MIXED))
+    )
+    top = laurent[0] - (delta[0] @ nx + nx @ delta[0]) / 2
+    bottom = laurent[1] - (delta[1] @ ny + ny @ delta[1]) / 2
+    side = -(delta[0] @ mixed + mixed @ delta[1]) / 2
+    back = mixed.conj().T
+    under = -(delta[1] @ back + back @ delta[0]) / 2
+    Q = waves.fold.T @ np.block([[top, side], [under, bottom]]) @ waves.fold
+    s = np.arange(waves.p_count, len(waves.kappa))
+    Q[s, s] -= waves.kappa[s] ** 2
+    P = np.eye(len(waves.kappa), dtype=Q.dtype)
+    z = slice(waves.bare, waves.p_count)
+    kappa = waves.kappa[z]
+    upright = np.linalg.inv(toeplitz_matrix(space, direct, EZ))
+    P[z, z] -= kappa[:, None] * upright * kappa
+    return P, Q

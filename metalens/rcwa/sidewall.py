@@ -1,0 +1,213 @@
+"""Tilted walls: u' = i P(z) w, w' = i Q(z) u by Gauss collocation, of high order in z.
+
+On a panel of height h with Gauss points c_j the derivative is a polynomial through its
+values there, so with a_jk = int_0^c_j l_k and b_k = int_0^1 l_k (Hairer, Norsett,
+Wanner, Solving Ordinary Differential Equations I, II.7)
+
+    u_j = u_0 + i h sum a_jk P_k w_k,    w_j = w_0 + i h sum a_jk Q_k u_k,
+    (u, w)_1 = (u, w)_0 + h sum b_k (i P_k w_k, i Q_k u_k),
+
+of order 2 m for m points. Stiff waves decay at foot and top, where panels are short.
+P and Q stay symmetric and Gauss collocation keeps quadratic invariants: power and
+reciprocity hold to rounding. (The error of a staircase falls as 1/steps only, and grows
+with the number of harmonics.)
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from metalens.cell import Cell, Layer
+from metalens.core.arrays import Array
+from metalens.rcwa.permittivity import PillarSection, pillar_section
+from metalens.rcwa.smatrix import Pair, TangentialFields
+
+Sample = Callable[[float], tuple[Array, Array]]
+# ends of the panels as shares of the height: shorter towards foot and top
+EDGES = (0.0, 0.025, 0.09, 0.26, 0.5, 0.74, 0.91, 0.975, 1.0)
+FEWEST, MOST = 4, 10  # Gauss points: 4 leave 2e-3 of t, each more a hundredth of that
+_NODES = 8  # cross-sections whose polynomial stands for a tilted section
+
+
+@dataclass(frozen=True, slots=True)
+class WallSection:
+    """One section of a pillar.
+
+    sample: P and Q at a share of its height, 0 at its foot. reduced_height: times k0.
+    """
+
+    sample: Sample
+    reduced_height: float
+
+
+def wall_sections(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    operators: Callable[[PillarSection, int], tuple[Array, Array]],
+) -> list[WallSection]:
+    """Sections of a pillar, foot first; of tilted ones P and Q are polynomials through
+    Chebyshev points of the height.
+
+    Args:
+        cell, size_um: the pillar. wavelength_um: in vacuum.
+        operators: P and Q of a cross-section, and the number of its section.
+    """
+
+    def section(i: int, layer: Layer, grow_um: float) -> WallSection:
+        def sample(share: float) -> tuple[Array, Array]:
+            width = grow_um + (share - 0.5) * width_slope(cell) * layer.height_um
+            here = pillar_section(cell, layer, size_um, wavelength_um, grow_um=width)
+            return operators(here, i)
+
+        height = layer.height_um * 2 * math.pi / wavelength_um
+        return WallSection(
+            _interpolated(sample) if cell.sidewall_rad else sample, height
+        )
+
+    return [section(i, *one) for i, one in enumerate(sections_with_growth(cell))]
+
+
+def _interpolated(sample: Sample) -> Sample:
+    """P and Q from polynomials through their values at Chebyshev points."""
+    chebvander = np.polynomial.chebyshev.chebvander
+    nodes = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
+
+    @functools.cache
+    def values() -> tuple[Array, Array]:
+        P, Q = zip(*(sample((1 + float(x)) / 2) for x in nodes), strict=True)
+        return np.stack(P), np.stack(Q)
+
+    def at(share: float) -> tuple[Array, Array]:
+        weights = (chebvander(np.array([2 * share - 1]), _NODES - 1) @ inverse)[0]
+        P, Q = (np.tensordot(weights, part, 1) for part in values())
+        return P, Q
+
+    return at
+
+
+def width_slope(cell: Cell) -> float:
+    """Change of width for each um of height of a ``cell`` with tilted walls."""
+    return -2 * math.tan(cell.sidewall_rad)
+
+
+def sections_with_growth(cell: Cell) -> list[tuple[Layer, float]]:
+    """Sections of a ``cell``, foot first, with the widening at the middle of each by the
+    tilted wall, um.
+    """
+    found, foot = [], -cell.height_um / 2
+    for layer in cell.sections:
+        found.append((layer, width_slope(cell) * (foot + layer.height_um / 2)))
+        foot += layer.height_um
+    return found
+
+
+def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
+    """Staircase approximation: the sections of a ``cell``, each of a tilted wall cut
+    into ``steps`` upright ones of equal height.
+    """
+    count = steps if cell.sidewall_rad else 1
+    found = []
+    for layer, grow in sections_with_growth(cell):
+        step_um = layer.height_um / count
+        for i in range(count):
+            lift = (i + 0.5 - count / 2) * step_um * width_slope(cell)
+            width = layer.grow_um + grow + lift
+            found.append(replace(layer, height_um=step_um, grow_um=width))
+    return found
+
+
+@functools.lru_cache(maxsize=8)
+def gauss_collocation(stages: int) -> tuple[Array, Array, Array]:
+    """Gauss points c (m,), weights b (m,) and integrals a (m, m) of the Lagrange
+    polynomials on [0, 1], for m = ``stages``.
+    """
+    x, w = np.polynomial.legendre.leggauss(stages)
+    c = (x + 1) / 2
+    powers = np.arange(stages)
+    integrals = c[:, None] ** (powers + 1) / (powers + 1)
+    return c, w / 2, np.linalg.solve(np.vander(c, increasing=True).T, integrals.T).T
+
+
+def panel_transfer(section: WallSection, low: float, high: float, stages: int) -> Array:
+    """(2 n, 2 n) transfer matrix of (u, w) from the upper to the lower end of a panel.
+
+    Args:
+        section: of the wall. low, high: ends of the panel, shares of the height.
+        stages: number of Gauss points.
+    """
+    c, b, a = gauss_collocation(stages)
+    samples = [section.sample(float(high - x * (high - low))) for x in c]
+    P, Q = (np.stack(part) for part in zip(*samples, strict=True))
+    step = -1j * section.reduced_height * (high - low)
+    n = P.shape[-1]
+
+    def integrated(part: Array) -> Array:
+        blocks = a[:, None, :, None] * part.transpose(1, 0, 2)[None]
+        return np.asarray(blocks.reshape(stages * n, stages * n))
+
+    p, q = integrated(P), integrated(Q)
+    start = np.tile(np.eye(n), (stages, 1))
+    # u = u_0 + step p w with w = w_0 + step q u put in
+    given = np.concatenate([start, step * (p @ start)], axis=1)
+    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), given)
+    w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
+    transfer = np.eye(2 * n, dtype=complex)
+    for rows, part, field in ((slice(n), P, w), (slice(n, None), Q, u)):
+        inner = field.reshape(stages, n, -1)
+        transfer[rows] += step * np.einsum(
+            "k,kij,kjl->il", b, part, inner, optimize=True
+        )
+    return transfer
+
+
+def match_walls(
+    sections: Sequence[WallSection],
+    top: Pair,
+    foot: Pair,
+    source: Array,
+    *,
+    stages: int,
+) -> TangentialFields:
+    """As :func:`metalens.rcwa.smatrix.match_layers`, for tilted walls.
+
+    Args:
+        sections: foot first. top, foot: diagonal pairs above and below.
+        source: (n,). stages: Gauss points of every panel.
+    """
+    n = len(source)
+    pair = np.concatenate([np.diag(side) for side in top])
+    scales = []
+    for section in reversed(sections):
+        for low, high in zip(EDGES[-2::-1], EDGES[:0:-1], strict=True):
+            transfer = panel_transfer(section, low, high, stages)
+            pair, scale = np.linalg.qr(transfer @ pair)
+            scales.append(scale)
+    U, V = pair[:n], pair[n:]
+    a = np.linalg.solve(foot[1][:, None] * U + foot[0][:, None] * V, source)
+    u, w = U @ a, V @ a
+    for scale in reversed(scales):
+        a = np.linalg.solve(scale, a)
+    return TangentialFields(u, w, top[0] * a, top[1] * a, [], [])
+
+
+def choose_stage_count(
+    respond_at: Callable[[int], Array], tolerance: float
+) -> tuple[int, float]:
+    """Gauss points that leave less than a tenth of the tolerance, and the error they
+    leave: the change by the last one.
+
+    Args:
+        respond_at: t and r with this many points. tolerance: of t and r.
+    """
+    stages, t = FEWEST, respond_at(FEWEST)
+    while True:
+        finer = respond_at(stages + 1)
+        left = float(np.abs(finer - t).max())
+        stages, t = stages + 1, finer
+        if left <= tolerance / 10 or stages >= MOST:
+            return stages, left

@@ -1,0 +1,297 @@
+"""Eigenmodes of layers, and the scattering of a whole stack: half-spaces, films and
+patterned layers, matched without growing exponentials.
+
+Fields at a plane that only upward-radiating waves can make form a pair (U, V): u = U a,
+w = V a. A pair passes from the top of a layer to its foot by one linear solve with
+decaying factors only. P and Q are symmetric where every section has a half turn; then
+two solutions keep u1^T w2 - w1^T u2 from plane to plane.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.core.arrays import Array
+from metalens.rcwa.basis import PlaneWaves, half_space, normal_component
+
+Pair = tuple[Array, Array]
+_TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincide
+_FADED = 41.0  # exp(-41) = 1.6e-18: waves that do not reach the other end of a layer
+
+
+@dataclass(frozen=True, slots=True)
+class StackMedia:
+    """Refractive indices and thicknesses at one wavelength (exp(-iwt)); lengths in
+    units of 1/k0.
+
+    under, over: (index, thickness) of the films, in the order that the light meets
+        them. heights: of the patterned layers, foot first.
+    """
+
+    substrate: complex
+    cover: complex
+    under: tuple[tuple[complex, float], ...] = ()
+    over: tuple[tuple[complex, float], ...] = ()
+    heights: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FourierModes:
+    """Eigenmodes of one layer, u' = i P w, w' = i Q u.
+
+    Q: (n, n). q: (n,) propagation constants over k0, imaginary part >= 0, the
+        longest-lived first.
+    W, V: (n, n) columns u and w of the upward modes (u, -w: downward).
+    symmetric: whether P and Q are.
+    """
+
+    Q: Array
+    q: Array
+    W: Array
+    V: Array
+    symmetric: bool = True
+
+
+def solve_eigenmodes(P: Array, Q: Array, *, symmetric: bool = True) -> FourierModes:
+    """Eigenmodes of a layer: P Q W = W q^2, V = Q W / q.
+
+    Args:
+        P, Q: (n, n) operators. symmetric: whether they are symmetric matrices.
+    """
+    square, W = np.linalg.eig(P @ Q)
+    q = np.sqrt(square.astype(complex))
+    downward = (q.imag < 0) | ((np.abs(q.imag) <= 1e-13 * np.abs(q)) & (q.real < 0))
+    q = np.where(downward, -q, q)
+    q = np.where(np.abs(q) < _TINY, _TINY, q)
+    order = np.argsort(q.imag, kind="stable")
+    q, W = q[order], W[:, order]
+    return FourierModes(Q, q, W, (Q @ W) / q, symmetric)
+
+
+def film_modes(
+    waves: PlaneWaves, index: complex, *, symmetric: bool = True
+) -> FourierModes:
+    """Plane ``waves`` as modes of a homogeneous layer of this ``index``.
+
+    symmetric: whether the operators of all layers of the stack are.
+    """
+    kz = normal_component(waves.kappa, index)
+    kz = np.where(np.abs(kz) < _TINY, _TINY, kz)
+    Q = np.where(waves.is_p, index**2, kz**2)
+    order = np.argsort(kz.imag, kind="stable")
+    W, V = np.eye(len(kz))[:, order], np.diag(Q / kz)[:, order]
+    return FourierModes(np.diag(Q), kz[order], W, V, symmetric)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ScatteredAmplitudes:
+    """Power-normalised amplitudes (n,) of every order for unit incident power in the
+    zero order.
+
+    t, r: of the outgoing waves in cover and substrate, 0 where a wave carries no power.
+    """
+
+    t: Array
+    r: Array
+
+    @property
+    def energy(self) -> float:
+        """Transmitted plus reflected power of all orders."""
+        return float((np.abs(self.t) ** 2).sum() + (np.abs(self.r) ** 2).sum())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TangentialFields:
+    """Tangential fields of one incident wave.
+
+    u, w: (n,) at the foot of the lowest layer; u_top, w_top: at the top of the highest.
+    up, down: for each layer, (n,) amplitudes of its upward modes at its foot and
+        downward modes at its top.
+    """
+
+    u: Array
+    w: Array
+    u_top: Array
+    w_top: Array
+    up: list[Array]
+    down: list[Array]
+
+
+Matcher = Callable[[Pair, Pair, Array], TangentialFields]
+
+
+def scatter_zero_order(
+    waves: PlaneWaves,
+    media: StackMedia,
+    layers: list[FourierModes],
+    zero: int,
+    *,
+    match: Matcher | None = None,
+) -> ScatteredAmplitudes:
+    """Transmitted and reflected orders of a stack for the zero order from the substrate.
+
+    Args:
+        waves: of the basis. media: half-spaces, films and heights.
+        layers: modes of the patterned layers, foot first; none: a stack of films.
+        zero: place of the incident wave.
+        match: what matches the fields in place of the layers, given the pairs above and
+            below and the source.
+    """
+    below, above = half_space(waves, media.substrate), half_space(waves, media.cover)
+    top, lift = _through_films(waves, above, tuple(reversed(media.over)))
+    foot, drop = _through_films(waves, below, media.under)
+    source = np.zeros(len(waves.kappa), complex)
+    source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
+    fields = (
+        match(top, foot, source)
+        if match
+        else match_layers(layers, media.heights, top, foot, source)
+    )
+    incident = power_flux(below)[zero]
+    t = outgoing_amplitudes(top, fields.u_top, fields.w_top) * lift
+    r = _reflected(waves, media, foot, drop, fields, zero)
+    return ScatteredAmplitudes(
+        t * np.sqrt(power_flux(above) / incident),
+        r * np.sqrt(power_flux(below) / incident),
+    )
+
+
+def outgoing_amplitudes(pair: Pair, u: Array, w: Array) -> Array:
+    """Amplitudes a of a diagonal ``pair`` (U, V) with u = U a, w = V a, from whichever
+    of the two is large.
+    """
+    norm = np.abs(pair[0]) ** 2 + np.abs(pair[1]) ** 2
+    return np.asarray((np.conj(pair[0]) * u + np.conj(pair[1]) * w) / norm)
+
+
+def match_layers(
+    layers: list[FourierModes],
+    heights: tuple[float, ...],
+    top: Pair,
+    foot: Pair,
+    source: Array,
+) -> TangentialFields:
+    """Fields that radiate into ``top`` above the layers, and whose incident part gives
+    foot V u + U w = source.
+
+    Args:
+        layers: modes, foot first. heights: of the layers.
+        top, foot: diagonal pairs above and below. source: (n,).
+    """
+    if not layers:
+        a = source / (foot[1] * top[0] + foot[0] * top[1])
+        return TangentialFields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
+    pair, passes = top, []
+    for modes, height in zip(reversed(layers), reversed(heights), strict=True):
+        back, fade = _layer_reflection(modes, height, pair)
+        passes.append((back, fade))
+        pair = _foot_pair(modes, back, fade)
+    a = np.linalg.solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
+    u, w = pair[0] @ a, pair[1] @ a
+    u_top, w_top, ups, downs = u, w, [], []
+    for i, (modes, (back, fade)) in enumerate(
+        zip(layers, reversed(passes), strict=True)
+    ):
+        if i:
+            a = (np.linalg.solve(modes.W, u_top) + np.linalg.solve(modes.V, w_top)) / 2
+        kept = len(fade)
+        down = back @ a[:kept]
+        up = np.concatenate([fade * a[:kept], np.zeros_like(a[kept:])])
+        u_top, w_top = modes.W @ (up + down), modes.V @ (up - down)
+        ups.append(a)
+        downs.append(down)
+    return TangentialFields(u, w, u_top, w_top, ups, downs)
+
+
+def _layer_reflection(
+    modes: FourierModes, height: float, pair: Pair
+) -> tuple[Array, Array]:
+    """Downward amplitudes at the top for each upward one at the foot, of the modes that
+    reach the top at all; their factors exp(iqh).
+    """
+    exponent = modes.q * height
+    kept = int(np.count_nonzero(exponent.imag < _FADED))
+    fade = np.exp(1j * exponent[:kept])
+    if not modes.symmetric:
+        # up + down = W^-1 U a and up - down = V^-1 V' a of the pair (U, V') above
+        U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
+        total, difference = np.linalg.solve(modes.W, U), np.linalg.solve(modes.V, V)
+        back = (total - difference) @ np.linalg.inv(total + difference)
+        return back[:, :kept] * fade, fade
+    wv, vw = (
+        _transposed_product(pair[0], modes.V),
+        _transposed_product(pair[1], modes.W),
+    )
+    return np.linalg.solve(wv + vw, (wv - vw)[:, :kept] * fade), fade
+
+
+def _foot_pair(modes: FourierModes, back: Array, fade: Array) -> Pair:
+    """The upward-radiating pair at the foot of a layer; its columns are the upward
+    modes there.
+    """
+    kept = len(fade)
+    U, V = modes.W.astype(complex), modes.V.astype(complex)
+    trip = fade[:, None] * back[:kept]
+    U[:, :kept] += modes.W[:, :kept] @ trip
+    V[:, :kept] -= modes.V[:, :kept] @ trip
+    return U, V
+
+
+def _through_films(
+    waves: PlaneWaves, pair: Pair, films: tuple[tuple[complex, float], ...]
+) -> tuple[Pair, Array]:
+    """An outgoing pair seen through films, nearest to its half-space first, and the
+    decay of its waves on the way.
+    """
+    u, w = pair
+    fade = np.ones(len(waves.kappa), complex)
+    for index, thickness in films:
+        kz = normal_component(waves.kappa, index)
+        once = np.exp(1j * kz * thickness)
+        cosine = (1 + once**2) / 2
+        safe = np.where(kz == 0, 1, kz)
+        sine = np.where(kz == 0, thickness, np.expm1(2j * kz * thickness) / (2j * safe))
+        alpha = np.where(waves.is_p, index**2, kz**2)
+        beta = np.where(waves.is_p, kz**2 / index**2, 1.0)
+        u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
+        fade = fade * once
+    return (u, w), fade
+
+
+def _reflected(
+    waves: PlaneWaves,
+    media: StackMedia,
+    foot: Pair,
+    drop: Array,
+    fields: TangentialFields,
+    zero: int,
+) -> Array:
+    """Reflected amplitudes in the substrate, from the fields above the films under the
+    pillar.
+
+    Without the pillar the films would pass the incident wave on into a medium like the
+    substrate; what the fields differ from that comes from above, and radiates downwards.
+    """
+    U, V = half_space(waves, media.substrate)
+    (u, w), fade = _through_films(waves, (U, V), tuple(reversed(media.under)))
+    whole = V[zero] * u[zero] + U[zero] * w[zero]
+    passed = np.zeros(len(U), complex)
+    passed[zero] = fade[zero] * 2 * U[zero] * V[zero] / whole
+    back = drop * outgoing_amplitudes(
+        foot, fields.u - U * passed, V * passed - fields.w
+    )
+    back[zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / whole
+    return np.asarray(back)
+
+
+def power_flux(pair: Pair) -> Array:
+    """(n,) power along z, Re(u w*), of outgoing waves of unit amplitude with fields
+    ``pair`` = (u, w); 0 for waves that decay.
+    """
+    power = (pair[0] * np.conj(pair[1])).real
+    return np.where(power > 1e-12 * np.abs(pair[0] * pair[1]), power, 0.0)
+
+
+def _transposed_product(left: Array, matrix: Array) -> Array:
+    return left[:, None] * matrix if left.ndim == 1 else left.T @ matrix
