@@ -69,8 +69,6 @@ class AsBuilt:
     degeneracies: what cannot be told apart, in words. cautions: everything that was put
     right or assumed.
     trusted: every check passed; problems: those that did not.
-    residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty
-    where none was kept.
     low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no
     parabola.
     within: the same within the model, narrower.
@@ -105,7 +103,6 @@ class AsBuilt:
     degeneracies: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
-    residual_modes: Array = field(default_factory=lambda: np.empty(0))
     low: Array = field(default_factory=lambda: np.empty(0))
     high: Array = field(default_factory=lambda: np.empty(0))
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -233,10 +230,7 @@ class AsBuilt:
         wave-front errors included.
         """
         return made.as_built_transmission(
-            self.design,
-            self.response,
-            self.parameters(value),
-            modes=self.residual_modes,
+            self.design, self.response, self.parameters(value)
         )
 
     def psf(self) -> "psfs.PsfStack":
@@ -286,11 +280,7 @@ class AsBuilt:
             float(x[PLACE[name]] - best[PLACE[name]])
             for name in ("decentre_x_um", "decentre_y_um")
         )
-        more: dict[str, Any] = {
-            "modes": self.residual_modes,
-            "offset_um": (dx, dy),
-            "tolerance": tolerance,
-        }
+        more: dict[str, Any] = {"offset_um": (dx, dy), "tolerance": tolerance}
         return made.psf_stack(self.design, self.response, x, view, **more)
 
     def psf_posterior(self, view: "psfs.View", *, draws: int = 8) -> float:

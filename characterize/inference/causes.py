@@ -125,8 +125,7 @@ def systematic_changes(
             sizes,
             frees,
         )
-    if not len(task.model.modes):
-        yield from _of_phase(task, x, image, slopes)
+    yield from _of_phase(task, x, image, slopes)
 
 
 def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:

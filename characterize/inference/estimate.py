@@ -10,14 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.captures import Capture, SensorNoise, to_electrons
-from characterize.inference import (
-    knowable,
-    missing,
-    multistart,
-    residual,
-    uncertainty,
-    verdict,
-)
+from characterize.inference import knowable, missing, multistart, uncertainty, verdict
 from characterize.inference.arrange import (
     FrameArrangement,
     find_arrangement,
@@ -53,7 +46,6 @@ from characterize.model import (
     KnownValue,
     log_response_slopes,
     parameter_vector,
-    thinplate,
     unfitted_sizes,
     usual_parameters,
 )
@@ -159,25 +151,6 @@ def _fit(
     )
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
-    if frames.gain.known and verdict.left_over(ends[0]):
-        rest = residual.fit_residual_phase(
-            task.model,
-            task.data,
-            task.names,
-            ends[0].value,
-            base=start,
-            prior=task.prior,
-        )
-        if rest is not None:
-            task = dataclasses.replace(
-                task,
-                model=task.model.with_residual(rest.modes, thinplate.thin_plate_basis),
-            )
-            ends, looked = [rest.solution], None
-            cautions.append(
-                f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
-                f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
-            )
     _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
     posterior = uncertainty.explore_posterior(task, ends)
     if looked is None or posterior.best is not looked[0]:
@@ -370,7 +343,6 @@ def _result(
         pixel_um=capture.pixel_um,
         measured=data.electrons,
         predicted=solution.image,
-        residual_modes=model.modes,
         nominal=_nominal(task, fitted),
         residual_sigma=solution.residual_sigma,
         chi2_per_dof=solution.chi2_per_dof,
@@ -437,8 +409,7 @@ def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
         for k, v in fitted.items()
         if k.startswith(("log_gain", "background", "decentre", "crosstalk"))
     }
-    plain = task.model.with_residual(np.empty(0), thinplate.thin_plate_basis)
-    return plain.images(with_values(task.start, bench))[0]
+    return task.model.images(with_values(task.start, bench))[0]
 
 
 def _verdicts(
@@ -535,11 +506,6 @@ def _problems(
         problems.insert(
             0,
             f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter",
-        )
-    left = float(np.linalg.norm(task.model.modes))
-    if left > residual.MOST_RAD:
-        problems.append(
-            f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens"
         )
     return problems
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from characterize.captures import relative_orientation
-from characterize.inference import leastsquares, residual
+from characterize.inference import leastsquares
 from characterize.inference.arrange import FrameArrangement, few_frames
 from characterize.inference.leastsquares import (
     FitImages,
@@ -91,12 +91,10 @@ class SearchTask:
         """Images of all frames, or roughly of some."""
         model = self.model if frames is None else self.model.only(frames)
         if self.left_out is None:
-            return residual.residual_phase_problem(
+            return named_images(
                 model if frames is None else model.quick(), self.names, self.start
             )
-        return self.left_out.added(
-            residual.residual_phase_problem(model, self.names, self.start), frames
-        )
+        return self.left_out.added(named_images(model, self.names, self.start), frames)
 
     def posed(self, frames: Array | None = None) -> FitProblem:
         """The least-squares problem of all frames, or of those of index ``frames`` with
@@ -110,6 +108,22 @@ class SearchTask:
         return with_values(
             self.start, dict(zip(self.names, value.tolist(), strict=True))
         )
+
+
+def named_images(
+    model: ForwardModel, names: Sequence[str], base: Array
+) -> leastsquares.Model:
+    """Images of ``model`` as a function of the parameters ``names``; the others as in
+    ``base`` (all parameters).
+    """
+    place = [PLACE[name] for name in names]
+
+    def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
+        x = base.copy()
+        x[place] = values
+        return model.images(x, names if jacobian else None)
+
+    return images
 
 
 def correct_surrogate(task: SearchTask, at: FitSolution) -> SearchTask:

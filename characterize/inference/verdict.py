@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from characterize.captures import SensorNoise
-from characterize.inference import residual
 from characterize.inference.leastsquares import (
     FitProblem,
     FitSolution,
@@ -20,9 +19,9 @@ from characterize.inference.leastsquares import (
     SolverSettings,
 )
 from characterize.inference.missing import ResidualFinding, UnmodelledShifts
-from characterize.inference.multistart import WAVES_RAD, SearchTask
+from characterize.inference.multistart import WAVES_RAD, SearchTask, named_images
 from characterize.inference.uncertainty import Posterior
-from characterize.model import FitParameter, ForwardModel, KnownValue, thinplate
+from characterize.model import FitParameter, ForwardModel, KnownValue
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import coarser
@@ -84,13 +83,6 @@ def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
 def _allowed(solution: FitSolution, gain: SensorNoise) -> float:
     chance = 4 * math.hypot(chance_of(solution), gain.gain_sigma_e / gain.gain_e)
     return max(MISFIT - 1, min(chance, 0.5))
-
-
-def left_over(solution: FitSolution) -> bool:
-    """Whether the frames hold more than noise, but not so much that they are of
-    something else.
-    """
-    return 3 * chance_of(solution) < solution.chi2_per_dof - 1 < 30
 
 
 def chance_of(solution: FitSolution) -> float:
@@ -378,11 +370,7 @@ def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     there = dataclasses.replace(
         s, angle_rad=np.broadcast_to(angle_rad, s.angle_rad.shape)
     )
-    return (
-        ForwardModel(model.lens, there, model.response)
-        .about(model.grid.middle_um)
-        .with_residual(model.modes, thinplate.thin_plate_basis)
-    )
+    return ForwardModel(model.lens, there, model.response).about(model.grid.middle_um)
 
 
 def _shown(task: SearchTask, found: Posterior) -> Array:
@@ -400,7 +388,7 @@ def _shown(task: SearchTask, found: Posterior) -> Array:
 
 def _spread(task: SearchTask, model: ForwardModel, best: Array, values: Array) -> float:
     """Rms over draws of |image - best| / |best|, each as bright as the best, without its background."""
-    images = residual.residual_phase_problem(model, task.names, task.start)
+    images = named_images(model, task.names, task.start)
     dark = [i for i, name in enumerate(task.names) if name.startswith("background")]
 
     def light(x: Array) -> Array:
@@ -462,18 +450,16 @@ def _unseen(
 ) -> tuple[float, int]:
     """(chi-square, pixels) of the second frames by what the first say."""
     seen, hidden = halves
-    images = residual.residual_phase_problem(
-        task.model.only(seen), task.names, task.start
-    )
+    images = named_images(task.model.only(seen), task.names, task.start)
     problem = FitProblem(images, task.data.planes(seen), task.prior)
     settings = SolverSettings(
         iterations=6, step_tolerance=0.3, secant=True, near=math.inf, finish=False
     )
     part = problem.fit(mode.value, settings, mode.slopes[:, seen])
     rest = task.data.planes(hidden)
-    image = residual.residual_phase_problem(
-        task.model.only(hidden), task.names, task.start
-    )(part.value, False)[0]
+    image = named_images(task.model.only(hidden), task.names, task.start)(
+        part.value, False
+    )[0]
     keep = rest.usable & ~rest.saturated
     slopes = mode.slopes[:, hidden][:, keep]
     known_e2 = np.einsum("iN,ij,jN->N", slopes, part.covariance, slopes, optimize=True)

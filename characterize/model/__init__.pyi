@@ -1,6 +1,5 @@
 from . import detector as detector
 from . import made as made
-from . import thinplate as thinplate
 from .detector import required_oversampling as required_oversampling
 from .forward import ForwardModel as ForwardModel
 from .glass import FilmStack as FilmStack

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from characterize.model import thinplate
 from characterize.model.parameters import PLACE, process_state_of
 from characterize.model.pillars import incidence_rad
 from metalens.core import legendre
@@ -42,7 +41,6 @@ def as_built_transmission(
     *,
     noise_um: Array | float = 0.0,
     angle_rad: float = 0.0,
-    modes: Array | None = None,
 ) -> Array:
     """(y, x) complex transmission of every as-built pillar: diameter, process and
     wave-front aberrations.
@@ -51,7 +49,6 @@ def as_built_transmission(
         x: all parameters, in the order of ``parameters.NAMES``.
         noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence,
             where the proxy knows angles.
-        modes: of a residual phase (:mod:`thinplate`).
 
     Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9
     for 50 rad/um.
@@ -64,10 +61,6 @@ def as_built_transmission(
         t = _of_one_size(lens, response, x, bias, angle_rad)
     if made.bends():
         t = t * np.exp(1j * _on_pillars(d, made.phase_rad))
-    if modes is not None and len(modes):
-        t = t * np.exp(
-            1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um)
-        )
     return np.asarray(
         np.where(
             d.diameter_um > 0,
@@ -157,7 +150,6 @@ def psf_stack(
     x: Array,
     view: "View",
     *,
-    modes: Array | None = None,
     offset_um: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-4,
 ) -> "PsfStack":
@@ -175,7 +167,7 @@ def psf_stack(
     parts = []
     for angle in view.angles_rad:
         t = as_built_transmission(
-            lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes
+            lens, response, x, angle_rad=incidence_rad(lens.proxy, angle)
         )
         parts.append(
             psf.psf_stack(

@@ -2,14 +2,20 @@
 they are quick, else slopes.
 """
 
-from collections.abc import Container, Mapping, Sequence
+import functools
+import hashlib
+import os
+from collections.abc import Callable, Container, Sequence
+from importlib import import_module
+from pathlib import Path
 
+import joblib
 import numpy as np
+import scipy
 from numpy.polynomial import chebyshev
 
-from characterize.model import kept, solving
+from characterize.model import solving
 from metalens.cell import Cell, index
-from metalens.core import records
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
@@ -28,15 +34,15 @@ from metalens.lens import Lens
 
 _NODES, _MOST = 25, 14
 _SOURCES = (
-    *(
-        "metalens.cell",
-        "metalens.modal",
-        "metalens.rcwa",
-        "metalens.fabrication",
-        "metalens.library",
-    ),
-    *("characterize.model.solving", "characterize.model.pillar_slopes"),
+    "metalens.cell",
+    "metalens.modal",
+    "metalens.rcwa",
+    "metalens.fabrication",
+    "metalens.library",
+    "characterize.model.solving",
+    "characterize.model.pillar_slopes",
 )
+_KEPT = 64  # lenses whose slopes are kept on disk
 
 
 def log_response_slopes(
@@ -62,10 +68,11 @@ def log_response_slopes(
     shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
     lens.
 
-    What was solved once is kept in the user's cache folder
-    (:mod:`characterize.model.kept`).
+    What was solved once is kept in the user's cache folder, ``metalens`` in
+    $XDG_CACHE_HOME or ~/.cache.
 
     Args:
+        lens: its cell, its diameters and its light. tolerance: of the slopes, relative.
         wanted: names of causes that a table lacks (the sidewall) and that are wanted
             all the same; zero without.
 
@@ -82,14 +89,7 @@ def log_response_slopes(
         lens, tolerance, [row.name for row in _unknown() if row.name in wanted]
     )
     try:
-        return _unpacked(
-            kept.cached_arrays(
-                "pillars",
-                about,
-                _SOURCES,
-                lambda: _packed(_solve(lens, tolerance, wanted)),
-            )
-        )
+        return _cached(about, lambda: _solve(lens, tolerance, wanted))
     except (CellError, MaterialError):
         if not lens.cell.round:
             raise
@@ -109,11 +109,44 @@ def _of_pairs(lens: Lens) -> Sensitivity:
             repr(kinds.length_um.tolist()),
         ],
     )
+    return _cached(
+        about, lambda: Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light])
+    )
 
-    def solve() -> dict[str, Array]:
-        return _packed(Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light]))
 
-    return _unpacked(kept.cached_arrays("pillars", about, _SOURCES, solve))
+def _cached(about: str, make: Callable[[], Sensitivity]) -> Sensitivity:
+    """What ``make`` returns, from disk where it was made before of the same ``about``,
+    the same sources and the same libraries; a folder that cannot be written costs time
+    alone.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    try:
+        memory = joblib.Memory(Path(base) / "metalens", verbose=0)
+    except OSError:
+        return make()
+    call = memory.cache(_call, ignore=["make"])
+    key = f"{about} {_source_digest()} {np.__version__} {scipy.__version__}"
+    known = call.check_call_in_cache(key, make)
+    found: Sensitivity = call(key, make)
+    if not known:
+        memory.reduce_size(items_limit=_KEPT)
+    return found
+
+
+def _call(key: str, make: Callable[[], Sensitivity]) -> Sensitivity:
+    return make()
+
+
+@functools.cache
+def _source_digest() -> str:
+    """SHA-256 of every source file that the slopes come from."""
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        home = Path(str(import_module(name).__file__))
+        package = home.name == "__init__.py"
+        for file in sorted(home.parent.rglob("*.py")) if package else [home]:
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
@@ -142,18 +175,6 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
             wanted,
         )
     )
-
-
-def _packed(found: Sensitivity) -> dict[str, Array]:
-    """As named arrays."""
-    arrays, numbers = records.flatten_record(found)
-    return arrays | {name: np.array(value) for name, value in numbers.items()}
-
-
-def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
-    """From named arrays."""
-    numbers = {name: each.item() for name, each in arrays.items() if not each.ndim}
-    return records.build_record(Sensitivity, arrays, numbers, where="kept slopes")
 
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:

@@ -10,24 +10,13 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-from scipy.interpolate import BSpline, RectBivariateSpline
+from scipy.interpolate import BSpline
 
 from metalens.core.arrays import Array
 from metalens.fabrication import WavefrontError, maps
 
 MODES, KNOTS, EXPECTED_RAD = 24, 9, 0.3
 _GRID = 61
-
-
-def phase_rad(modes: Array, u: Array, v: Array) -> Array:
-    """(len(v), len(u)) phase of ``modes`` (m,) on a grid of lens places over the
-    radius; 1e-5 of its size.
-    """
-    t = np.linspace(-1, 1, 129)
-    coarse = np.tensordot(modes, thin_plate_basis(*np.meshgrid(t, t), len(modes)), 1)
-    return np.asarray(
-        RectBivariateSpline(t, t, coarse)(np.clip(v, -1, 1), np.clip(u, -1, 1))
-    )
 
 
 def thin_plate_basis(u: Array, v: Array, count: int = MODES) -> Array:
