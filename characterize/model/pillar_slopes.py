@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import solving
 from metalens.cell import Cell, index
+from metalens.core import records
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
