@@ -4,6 +4,7 @@ from . import retrained as retrained
 from . import sure as sure
 from . import train as train
 from .reading import bootstrap_interval as bootstrap_interval
+from .reading import bootstrap_ratio as bootstrap_ratio
 from .settings import RetrainConfig as RetrainConfig
 from .source import FinishedRun as FinishedRun
 from .source import lens_file as lens_file

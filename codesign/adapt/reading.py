@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 from torch import Tensor
 
 from codesign.train import Predictions, SensorFrames
@@ -80,7 +81,32 @@ def measure_accuracy(answers: Predictions, seen: SensorFrames) -> NetworkAccurac
 def bootstrap_interval(
     values: Array, *, draws: int = 1000, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % interval of the mean of (n,) values."""
-    rows = np.random.default_rng(seed).integers(0, len(values), (draws, len(values)))
-    low, high = np.quantile(np.asarray(values)[rows].mean(1), [0.025, 0.975])
-    return float(low), float(high)
+    """95 % percentile interval of the mean of (n,) values by the bootstrap.
+
+    Args:
+        values: to average. draws: resamples. seed: of them.
+    """
+    ends = stats.bootstrap(
+        (values,), np.mean, n_resamples=draws, method="percentile", rng=seed
+    ).confidence_interval
+    return float(ends.low), float(ends.high)
+
+
+def bootstrap_ratio(
+    values: Array, reference: Array, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float, float]:
+    """Ratio of two means and its 95 % percentile interval by the paired bootstrap.
+
+    Args:
+        values, reference: (n,) of the same n subjects or scenes. draws: resamples.
+            seed: of them.
+    """
+
+    def ratio(one: Array, other: Array, axis: int = -1) -> Array:
+        return np.asarray(one.mean(axis) / other.mean(axis))
+
+    ends = stats.bootstrap(
+        (values, reference), ratio, n_resamples=draws, paired=True,
+        method="percentile", rng=seed,
+    ).confidence_interval  # fmt: skip
+    return float(ratio(values, reference)), float(ends.low), float(ends.high)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import FinishedRun, bootstrap_interval, retrained
+from codesign.adapt import FinishedRun, bootstrap_interval, bootstrap_ratio, retrained
 from codesign.commands.options.experiment import Options
 from codesign.evaluate import (
     AXIAL,
@@ -154,7 +154,7 @@ def experiment_summary(
             "slip_mm",
             "slip_axial_mm",
         ):
-            value, low, high = subject_ratio(per[0][quantity], means[quantity])
+            value, low, high = bootstrap_ratio(per[0][quantity], means[quantity])
             ratios.append({
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
                 "goal": GOALS.get(quantity, ""),
@@ -234,15 +234,6 @@ def _per_subject(result: RunResult) -> dict[str, Any]:
         "slip_rest_mm": result.per_subject(result.slip_rest_mm.mean(1)),
         "iou": result.per_subject(result.iou),
     }
-
-
-def subject_ratio(
-    one: Any, other: Any, *, draws: int = 2000, seed: int = 0
-) -> tuple[float, float, float]:
-    """Ratio of means over subjects with its 95 % interval, by a paired bootstrap."""
-    rows = np.random.default_rng(seed).integers(0, len(one), (draws, len(one)))
-    low, high = np.quantile(one[rows].mean(1) / other[rows].mean(1), [0.025, 0.975])
-    return float(one.mean() / other.mean()), float(low), float(high)
 
 
 def _finer_words(row: dict[str, Any]) -> str:

@@ -1,3 +1,4 @@
+from . import error_budget as error_budget
 from . import experiment_plots as experiment_plots
 from . import field_page as field_page
 from . import gaze_experiment as gaze_experiment

@@ -308,6 +308,12 @@ def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
     )
 
 
+def rows_of_trial(trial: ExperimentTrials, rows: Array) -> ExperimentTrials:
+    """Some of the frames; ``rows``: their numbers."""
+    parts = (getattr(trial, name)[rows] for name in ExperimentTrials.__slots__)
+    return ExperimentTrials(*parts)
+
+
 def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
     if not sources:
         raise ConfigError("no run to evaluate; give one run folder or more")

@@ -15,11 +15,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from codesign.adapt import bootstrap_interval
 from codesign.batches import (
     EXPERIMENT,
     TEST,
@@ -146,10 +146,7 @@ class ReaderResult:
         """The numbers by name, axial with its 95 % interval by a bootstrap over the
         frames.
         """
-        rows = np.random.default_rng(0).integers(
-            0, len(self.axial_mm), (1000, len(self.axial_mm))
-        )
-        low, high = np.quantile(self.axial_mm.numpy()[rows].mean(1), [0.025, 0.975])
+        low, high = bootstrap_interval(self.axial_mm.numpy())
         return {
             "axial_mm": float(self.axial_mm.mean()), "axial_low_mm": float(low), "axial_high_mm": float(high),
             "lateral_mm": float(self.lateral_mm.mean()), "window_mm": float(self.window_mm.mean()),

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from codesign.adapt import bootstrap_ratio
 from codesign.evaluate.optics import AxialInformation, ResolvedSettings, SceneEnergy
 from metalens.core.report import Table
 
@@ -27,19 +27,6 @@ PAPER_AXIAL = {  # Table 3, averaged over 16-26 mm
 }
 
 
-def scene_ratio(
-    values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0
-) -> tuple[float, float, float]:
-    """Ratio of means over scenes and its 95 % interval, by a paired bootstrap over the
-    scenes.
-    """
-    rng = np.random.default_rng(seed)
-    a, b = values.double().numpy(), reference.double().numpy()
-    rows = rng.integers(0, len(a), (draws, len(a)))
-    low, high = np.quantile(a[rows].mean(1) / b[rows].mean(1), [0.025, 0.975])
-    return float(a.mean() / b.mean()), float(low), float(high)
-
-
 def lens_ratios(
     scenes: Mapping[str, SceneEnergy],
 ) -> dict[str, dict[str, tuple[float, float, float]]]:
@@ -47,7 +34,7 @@ def lens_ratios(
     first = next(iter(scenes.values()))
     return {
         name: {
-            kind: scene_ratio(getattr(energy, kind), getattr(first, kind))
+            kind: bootstrap_ratio(*(getattr(e, kind).numpy() for e in (energy, first)))
             for kind in KINDS
         }
         for name, energy in scenes.items()

@@ -1,6 +1,7 @@
 """Frames of eyes: radiance and coverage of two sheets, depth, pupil masks and labels."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -89,6 +90,15 @@ class RenderedFrames:
     frames: Frames
     pupil: Tensor
     labels: FrameLabels
+
+    def rows(self, rows: Tensor) -> "RenderedFrames":
+        """Some of the frames with their labels; ``rows``: their numbers."""
+
+        def of(record: Any) -> Any:
+            parts = (getattr(record, name)[rows] for name in type(record).__slots__)
+            return type(record)(*parts)
+
+        return RenderedFrames(of(self.frames), self.pupil[rows], of(self.labels))
 
     def pinhole(self) -> Tensor:
         """(n, y, x) what a perfect lens would show."""

@@ -6,15 +6,5 @@ from .built import posterior_parameters as posterior_parameters
 from .built import psf_error as psf_error
 from .lens_errors import LensError as LensError
 from .lens_errors import LensErrors as LensErrors
-from .numerics import ImageWindow as ImageWindow
-from .numerics import OpticsNumerics as OpticsNumerics
-from .numerics import TabulatedLens as TabulatedLens
-from .numerics import pixel_kernels as pixel_kernels
-from .numerics import psf_difference as psf_difference
 from .stack import OpticsConfig as OpticsConfig
 from .stack import PixelPsfStack as PixelPsfStack
-from .true_lens import ImagingDevice as ImagingDevice
-from .true_lens import PillarCells as PillarCells
-from .true_lens import gather_lens_plane as gather_lens_plane
-from .true_lens import image_difference as image_difference
-from .true_lens import make_device as make_device

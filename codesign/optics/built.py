@@ -8,7 +8,8 @@ over a few micrometres.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -19,7 +20,6 @@ from torch import Tensor
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, parameter_vector, process_state_of
 from codesign.optics.stack import OpticsConfig, PixelPsfStack
-from codesign.optics.true_lens import PillarCells
 from metalens.core.arrays import Array
 from metalens.core.paths import path_difference, sensor_path, source_path
 from metalens.design import Focus, profiles
@@ -34,6 +34,7 @@ from metalens.image import (
     Field,
     Optics,
     Pupil,
+    SmoothWave,
     amplitude,
     aperture_light,
     cell_um,
@@ -71,6 +72,75 @@ def psf_error(one: PixelPsfStack, other: PixelPsfStack) -> float:
         for s in (one, other)
     )
     return float((a - b).norm() / b.norm())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PillarCells:
+    """A lens plane of given pillars: mean of t exp(-i focus) over cells of a few
+    micrometres, interpolated to the rays.
+
+    cells: (2, y, x) real and imaginary part. half_um, centre_um: (x, y) half width of
+    the cells, and their middle.
+    pillars: gives (y, x) the complex t of each, 0 where there is none, pitch_um apart
+    about the axis.
+    added_rad: (x_um, y_um) to a phase that bends the wave front as a whole; None for
+    none.
+    """
+
+    focus: Focus
+    radius_um: float
+    cells: Tensor
+    half_um: tuple[float, float]
+    pitch_um: float
+    pillars: Callable[[], Tensor]
+    centre_um: tuple[float, float] = (0.0, 0.0)
+    added_rad: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """The hyperbolic phase that the design aims at."""
+        return SmoothWave(self.focus, self.radius_um).carrier_rad(x_um, y_um)
+
+    def factor(
+        self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
+    ) -> Tensor | None:
+        """The cells at the rays; pillars answer as at the design wavelength and
+        straight on.
+        """
+        at = (
+            (v - c) / h
+            for v, c, h in zip((x_um, y_um), self.centre_um, self.half_um, strict=True)
+        )
+        place = torch.stack(list(at), -1).to(self.cells)
+        found = torch.nn.functional.grid_sample(
+            self.cells[None],
+            place.reshape(1, 1, -1, 2),
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=False,
+        )
+        return self._bent(
+            torch.complex(*found.reshape(2, *x_um.shape).unbind(0)), x_um, y_um
+        )
+
+    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex t of every pillar, by which the error of gathering them is
+        told.
+        """
+        t = self.pillars()
+        y, x = (
+            (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * self.pitch_um
+            for n in t.shape
+        )
+        return self._bent(t, *torch.meshgrid(x, y, indexing="xy"))
+
+    def _bent(self, t: Tensor, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """With the added phase at these places."""
+        if self.added_rad is None:
+            return t
+        added = torch.remainder(self.added_rad(x_um, y_um), 2 * math.pi).to(
+            torch.float32
+        )
+        return t * torch.polar(torch.ones_like(added), added)
 
 
 class MadeLens:
@@ -127,10 +197,11 @@ class MadeLens:
         pupil, tangents = self._pupil(distance), self._field.tangents
         seen = view(pupil, self._field, self.design.source_distance_um)
         x_um, y_um = seen.x_um.numpy(), seen.y_um.numpy()
-        cells = self._gathered(process_state_of(known))
+        made = process_state_of(known)
+        cells = self._gathered(made)
         field = torch.from_numpy(self._on_nodes(cells, x_um, y_um))
         phase = profiles.hyperbolic_phase(x_um, y_um, self.focus)
-        phase = phase + self._aberration(process_state_of(known), x_um, y_um)
+        phase = phase + self._aberration(made, x_um, y_um)
         centre = tangents[0] * distance, tangents[1] * distance
         k = 2 * math.pi / pupil.wavelength_um
         inward = torch.from_numpy(phase) + k * sensor_path(
@@ -145,7 +216,7 @@ class MadeLens:
         return PixelPsfStack(
             light,
             self.settings.depths_um,
-            Optics(self._plane(known, cells), self.design.layers, distance),
+            Optics(self._plane(made, cells), self.design.layers, distance),
         )
 
     def wave(self, x: Array | None = None) -> Array:
@@ -175,9 +246,23 @@ class MadeLens:
         """The same for a lens of other diameters."""
         return MadeLens(lens, self.settings, response=self.response)
 
-    def _plane(self, known: Array, cells: Array) -> PillarCells:
-        """The lens plane as rays of any direction see it."""
-        d, filled, made = self.design.diameters, _filled(cells), process_state_of(known)
+    def plane(self, made: State, *, factor: Array | None = None) -> PillarCells:
+        """The lens plane of a process state, as rays of any direction meet it.
+
+        Args:
+            factor: (y, x) complex, of every pillar beside the state.
+        """
+        return self._plane(made, self._gathered(made, factor=factor), factor)
+
+    def pillars(self, made: State, *, factor: Array | None = None) -> Tensor:
+        """(y, x) complex t of every pillar in a process state, 0 where there is none."""
+        alone = self._gathered(made, 1, factor=factor)
+        return torch.from_numpy(alone * self._carrier.conj())
+
+    def _plane(
+        self, made: State, cells: Array, factor: Array | None = None
+    ) -> PillarCells:
+        d, filled = self.design.diameters, _filled(cells)
         step = self._block * d.pitch_um
         half = filled.shape[1] * step / 2, filled.shape[0] * step / 2
         centre = tuple(
@@ -188,16 +273,16 @@ class MadeLens:
         def added(x_um: Tensor, y_um: Tensor) -> Tensor:
             return torch.from_numpy(self._aberration(made, x_um.numpy(), y_um.numpy()))
 
-        parts = torch.from_numpy(np.stack([filled.real, filled.imag])).float()
-        bent = added if made.bends() else None
-        plane = self.focus, self._rim_um + d.pitch_um / 2, parts, half, d.pitch_um
         return PillarCells(
-            *plane, lambda: self._pillars(made), (centre[0], centre[1]), bent
+            self.focus,
+            self._rim_um + d.pitch_um / 2,
+            torch.from_numpy(np.stack([filled.real, filled.imag])).float(),
+            half,
+            d.pitch_um,
+            lambda: self.pillars(made, factor=factor),
+            (centre[0], centre[1]),
+            added if made.bends() else None,
         )
-
-    def _pillars(self, known: State) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none."""
-        return torch.from_numpy(self._gathered(known, 1) * self._carrier.conj())
 
     def _aberration(self, known: State, nodes_x: Array, nodes_y: Array) -> Array:
         rim = self._rim_um
@@ -216,7 +301,9 @@ class MadeLens:
             max(64, math.ceil(width * rough.edge / d.wavelength_um) * 2),
         )
 
-    def _gathered(self, known: State, block: int | None = None) -> Array:
+    def _gathered(
+        self, known: State, block: int | None = None, *, factor: Array | None = None
+    ) -> Array:
         """(cells, cells) mean of t exp(-i phase of the focus) over the pillars of each
         cell, 0 where there is none;
         block: pillars along a cell in place of the window's own."""
@@ -235,6 +322,7 @@ class MadeLens:
         )
         edges = self.response.by_edges(grid)
         u, v = d.x_um / self._rim_um, d.y_um / self._rim_um
+        carrier = self._carrier if factor is None else self._carrier * factor
         table = (
             t.astype(np.complex64),
             np.empty(0, complex) if edges is None else edges,
@@ -244,7 +332,7 @@ class MadeLens:
         return np.asarray(
             _gather(
                 self._diameter_um,
-                self._carrier,
+                carrier.astype(np.complex64),
                 *table,
                 u,
                 v,

@@ -122,7 +122,8 @@ def _made(settings: OpticsConfig, made: PixelPsfStack, there: There) -> Imager:
             "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
             "use a run of optics.image = 'uniform' for it"
         )
-    return _through(settings, made.plane, there)
+    frame, margin, device = there
+    return imager_through(settings, made.plane, frame, margin=margin, device=device)
 
 
 @functools.lru_cache(maxsize=3)
@@ -140,13 +141,29 @@ def _formed(
     error: LensError | None,
 ) -> Imager:
     wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
-    return _through(settings, _in_place(settings, wave), there)
+    frame, margin, device = there
+    plane = _in_place(settings, wave)
+    return imager_through(settings, plane, frame, margin=margin, device=device)
 
 
 @torch.no_grad()
-def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
-    """The image through a lens plane in its surroundings, in the settings' light."""
-    frame, margin, device = there
+def imager_through(
+    settings: OpticsConfig,
+    plane: Optics,
+    frame: int,
+    *,
+    margin: int,
+    device: torch.device | str = "cpu",
+) -> Imager:
+    """The image through a lens plane in its surroundings, in the settings' light.
+
+    Args:
+        plane: wave, films and distance. frame: samples along a side, ``margin``
+            included. device: where frames are imaged.
+
+    Raises:
+        SceneError, PropagationError: as :func:`metalens.image.imager`.
+    """
     whole = field_imager(
         plane.wave,
         grid_of(settings, frame, margin),

@@ -48,9 +48,8 @@ class LensErrors(_Entries):  # type: ignore[misc]
     correlation: (k,
     k) between the first k of them,
     rows one after the other; empty for none.
-    bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of
-    the bias from axis to rim,
-    along an axis and in all directions. index: of the pillars. sidewall_deg: lean of
+    bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm: of
+    the bias from edge to edge. bow_nm: from axis to rim. index: of the pillars. sidewall_deg: lean of
     their walls.
     width_nm, length_nm: of all pillars along x and y alone. turn_deg, pedestal_nm,
     cap_nm: refused, since plain round

@@ -305,13 +305,16 @@ def _budget(files: ChainFiles) -> ChainStage:
         if files.run
         else ("lens.h5", "--library", "library.h5")
     )
+    total = ("gaze_error_deg", "deg of gaze from all links together")
+    if not files.run:
+        total = ("psf_error", "relative error of the PSFs from all links together")
     return ChainStage(
         "Error budget",
         "Every link from pillar to answered gaze, each changed or switched off alone on the frames of the virtual "
-        "experiment, and their sum beside the error that the experiment measures there. Without a network the gaze is "
-        "read by the linear estimator of least variance, which knows the population but not the subject.",
+        "experiment, and their sum beside the error that the experiment measures there. Without a network nothing reads "
+        "gaze: phase and PSF alone have errors.",
         ("budget", *lens, "--process", "process.toml", "-o", "budget.h5"),
-        ("gaze_error_deg", "deg of gaze from all links together"),
+        total,
         (("budget.png", "Gaze error of each link, log scale."),),
     )
 

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterize.inference import asbuilt
-from codesign.budget.links import BudgetEntry
 from codesign.commands import budget as command_budget
+from codesign.evaluate.error_budget import BudgetEntry
 from codesign.eye import dataset
 from codesign.gaze import people_file
 from codesign.gaze.shared import MixedModel, PopulationPrior

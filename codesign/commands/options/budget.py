@@ -29,9 +29,6 @@ class Options(CommonOptions):
         frames: subjects, stimuli, slippage states, calibration: those of the
             experiment.
         led_fwhm_nm: width of the diode; 0 for that of the run.
-        depths: number of PSFs over depth. wavelengths: over the diode's line.
-        tolerance: of the PSF engine. kernels: of the kernels that images are formed
-            with.
     """
 
     lens: tyro.conf.Positional[Path]
@@ -44,7 +41,3 @@ class Options(CommonOptions):
         default_factory=lambda: ExperimentConfig(subjects=5)
     )
     led_fwhm_nm: float = 0.0
-    depths: int = 24
-    wavelengths: int = 3
-    tolerance: float = 1e-4
-    kernels: float = 3e-3

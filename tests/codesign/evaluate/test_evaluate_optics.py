@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from codesign.adapt.reading import bootstrap_ratio
 from codesign.commands.evaluate_optics import tuned_like
 from codesign.evaluate import optics as evaluate
 from codesign.evaluate.optics import MeasurementSettings, SensitivityScenes
-from codesign.evaluate.tables import scene_ratio
 from codesign.eye import dataset
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
@@ -112,7 +112,7 @@ def test_scene_energies_tell_lenses_apart():
         lenses, states, SensitivityScenes(pixels=32, pitch_um=24.0, window_um=96.0)
     )
     assert 0 < plain.image_error < 0.2  # of the true image: its own estimate
-    assert scene_ratio(plain.slip, plain.slip) == (1.0, 1.0, 1.0)
+    assert bootstrap_ratio(plain.slip.numpy(), plain.slip.numpy()) == (1.0, 1.0, 1.0)
     assert not torch.allclose(helix.gaze, plain.gaze, rtol=1e-3)
     assert bool((plain.separability > 0).all())
     assert bool(
@@ -143,7 +143,7 @@ def test_bootstrap_interval_covers_the_true_ratio():
             torch.from_numpy(shared * level * rng.lognormal(0, 0.2, 40))
             for level in (1.5, 1.0)
         )
-        _, low, high = scene_ratio(a, b, draws=400, seed=k)
+        _, low, high = bootstrap_ratio(a, b, draws=400, seed=k)
         covered += low <= 1.5 <= high
     assert (
         85 <= covered <= 100
