@@ -6,7 +6,6 @@ scenes."""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,11 +19,10 @@ from codesign.eye import (
     SeparabilityTriplets,
     render_triplets,
 )
-from codesign.optics import formed
 from metalens.core.errors import ConfigError, SceneError
-from metalens.image import Grid, Imager, Normalisation, axial_information, imager, scene
+from metalens.image import Grid, Imager, Normalisation, axial_information, imager
 from metalens.lens import Lens, reach
-from metalens.psf import View, from_lens, integrate_pixels, passed_um2
+from metalens.psf import View, from_lens, passed_um2
 
 WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 
@@ -128,11 +126,7 @@ class SensitivityScenes:
     paper's kind of step).
     pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the
     light within it.
-    image: "true", every part of the image through the PSFs of its own field angle; or
-    "uniform", the PSF on axis for
-        the whole image, an approximation whose error is printed. image_tolerance: of
-        the true image, relative L2 of a
-        texture.
+    image_tolerance: of the image, relative L2 of a texture.
     """
 
     count: int = 24
@@ -142,7 +136,6 @@ class SensitivityScenes:
     pitch_um: float = 12.0
     pixels: int = 120
     window_um: float = 288.0
-    image: Literal["true", "uniform"] = "true"
     image_tolerance: float = field(default=0.015, metadata={"above": 0})
 
     def __post_init__(self) -> None:
@@ -263,9 +256,7 @@ class SceneEnergy:
     light: least share of the light through the lens that the PSFs' window holds, over
     the depths of the scenes; of the
     true image, of its mean over the field.
-    image_error: of the images, relative L2 of a texture: the true image's own estimate,
-    or how far the uniform image is
-    from it; nan where it is not known.
+    image_error: of the images, relative L2 of a texture; nan where it is not known.
     maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared
     difference of gaze and slip (Fig. 5).
     above: why the error of the true image is above what it aims at; empty where it is
@@ -315,22 +306,11 @@ def scene_energies(
     views = scene_views(states, settings, sensor_distance_um=distance)
     out = []
     for lens in lenses:
-        rendered = (views.anchor, views.gaze, views.slip)
-        true = lens_imager(lens, rendered, settings)
-        if settings.image == "true":
-            light = 1 - true.parts["outside"]
-            found = energies_of(true, views, light=light, image_error=true.error)
-            out.append(replace(found, above=true.above(settings.image_tolerance)))
-            continue
-        basis, light = lens_basis(
-            lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um
+        whole = lens_imager(lens, (views.anchor, views.gaze, views.slip), settings)
+        found = energies_of(
+            whole, views, light=1 - whole.parts["outside"], image_error=whole.error
         )
-        one = scene.uniform_imager(basis, (settings.pixels, settings.pixels))
-        out.append(
-            energies_of(
-                one, views, light=light, image_error=formed.difference(one, true)
-            )
-        )
+        out.append(replace(found, above=whole.above(settings.image_tolerance)))
     return out
 
 
@@ -368,7 +348,7 @@ def scene_views(
 
 
 def energies_of(
-    optics: scene.UniformImager | Imager,
+    optics: Imager,
     views: SeparabilityTriplets,
     *,
     light: float = 1.0,
@@ -376,10 +356,7 @@ def energies_of(
 ) -> SceneEnergy:
     """Table 1 of any PSFs, see :func:`scene_energies`."""
     seen = [v.frames for v in (views.anchor, views.gaze, views.slip)]
-    images = [
-        optics(f) if isinstance(optics, Imager) else scene.image(f, optics)
-        for f in seen
-    ]
+    images = [optics(f) for f in seen]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
     maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
     sums = [m.sum((1, 2)) for m in maps]
@@ -391,41 +368,3 @@ def energies_of(
         image_error,
         torch.stack([anchor[0], maps[0][0], maps[2][0]]),
     )
-
-
-def lens_basis(
-    lens: Lens,
-    views: Sequence[RenderedFrames],
-    *,
-    pitch_um: float,
-    window_um: float = 288.0,
-    tolerance: float = 1e-3,
-) -> tuple[scene.PsfBasis, float]:
-    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few
-    kernels of sum 1.
-
-    Also the least share of the light through the lens that the window holds: what lies
-    outside is left out of the
-    images, where a real sensor would show it as haze.
-    """
-    low, high = depths_of(views)
-    count = max(
-        2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1
-    )  # 0.5 mm at the pupil, more beyond
-    depths = 1 / torch.linspace(1 / high, 1 / low, count, dtype=torch.float64).flip(0)
-    fine, window = (
-        max(1, math.ceil(pitch_um / 0.85)),
-        2 * math.ceil(window_um / (2 * pitch_um)),
-    )
-    view = View(tuple(depths.tolist()), ((0.0, 0.0),), window * pitch_um, window * fine)
-    stack = from_lens(lens, view, tolerance=1e-3)
-    intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
-    pixels = integrate_pixels(
-        intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1)
-    )  # odd: centred
-    light = float(
-        (stack.energy_um2[0] / passed_um2(lens, (0.0, 0.0), depths.tolist())).min()
-    )
-    return scene.basis(
-        pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance
-    ), min(light, 1.0)

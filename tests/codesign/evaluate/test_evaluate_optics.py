@@ -120,20 +120,6 @@ def test_scene_energies_tell_lenses_apart():
     )  # triangle inequality
 
 
-def test_one_psf_for_the_whole_image_says_how_far_from_the_true_image_it_is():
-    """300 um at 0.6 mm, scenes over 52 degrees: coma and field curvature of a
-    hyperbolic lens rule off the axis.
-    """
-    states, lens = dataset.states_at(torch.arange(2), 2), _lens(20e3)
-    small = SensitivityScenes(
-        pixels=48, pitch_um=12.0, window_um=96.0, image_tolerance=0.2
-    )
-    (true,) = evaluate.scene_energies([lens], states, small)
-    (one,) = evaluate.scene_energies([lens], states, replace(small, image="uniform"))
-    assert true.image_error < 0.2 < one.image_error
-    assert float((one.gaze / true.gaze - 1).abs().max()) > 0.1
-
-
 def test_bootstrap_interval_covers_the_true_ratio():
     rng = np.random.default_rng(0)
     covered = 0
