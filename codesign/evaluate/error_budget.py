@@ -211,7 +211,7 @@ class NetworkReading:
         self.scenes = source.run.scenes(EXPERIMENT)
         self.sensor = experiment.experiment_sensors([source], config)[0]
         self.subjects: list[RenderedFrames] = []
-        trials, known = [], []
+        trials = []
         for subject in range(config.subjects):
             states, trial = experiment.states_of(config, subject, self.scenes)
             self.subjects.append(

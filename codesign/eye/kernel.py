@@ -31,7 +31,8 @@ _inlined = numba.njit(forceinline=True, **SETTINGS)
 COLUMNS, ROWS = 16, 4  # of a tile: vector registers, and independent work to fill them
 LANES = ROWS * COLUMNS
 SAMPLES = 4  # textures that one pass samples, at most
-Parameters = namedtuple("Parameters", model.NAMES)  # vectors are tuples of three
+# vectors are tuples of three
+Parameters: Any = namedtuple("Parameters", model.NAMES)  # type: ignore[misc]
 
 # first lane of every quantity in a tile; three quantities for a vector
 (
