@@ -59,7 +59,11 @@ class Options(DistributedOptions):
     """Options of ``metalens library``.
 
     Attributes:
-        config: CELL.toml.
+        config: CELL.toml; or, with ``--cell``, a unit-cell table of another solver
+            (CSV, TSV, NPZ, MAT).
+        cell: CELL.toml of the table's cell; its [proxy] counts, its [sweep] does not,
+            but for the wavelength of a table that has none.
+        columns: names of the table's columns, in place of its header.
         accept_partial_turn: a proxy of less than a turn is no failure (``metalens
             design`` has the same option).
         output: the library file to write; NAME.resume beside it keeps finished curves
@@ -69,12 +73,16 @@ class Options(DistributedOptions):
     config: tyro.conf.Positional[Path]
     output: Output = Path("library.h5")
     accept_partial_turn: bool = False
+    cell: Path | None = None
+    columns: tuple[str, ...] = ()
 
 
 def run(options: Options) -> int:
     """Sweep, fit, write; exit 1 where an error bar misses the tolerance that is stated
     or no full turn is covered.
     """
+    if options.cell is not None:
+        return _import_table(options, options.cell)
     wanted = config.load(options.config, CellFile, empty=False)
     if wanted.sweep.lengths_um is not None:
         axes.check_axes_sweep(wanted.cell, wanted.sweep)
@@ -95,28 +103,54 @@ def run(options: Options) -> int:
         seconds = time.perf_counter() - start
         if wanted.sweep.light == "circular":
             made = library.with_rotations(made)
-        fitted, refusal = _fit(made, wanted.proxy)
-        notes = (
-            (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
-        )
-        about = store.Provenance(config.dumps(wanted), inputs)
-        made = dataclasses.replace(
-            made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about
-        )
-        library.save(draft.path, made)
-        _draw(draft.path, made, fitted)
-    stated = wanted.sweep.tolerance is not None
+        return _finish(options, draft.path, made, wanted, inputs, seconds)
+
+
+def _import_table(options: Options, cell_file: Path) -> int:
+    """The library of a table."""
+    wanted = config.load(cell_file, CellFile, empty=False)
+    made = library.from_table(
+        options.config,
+        wanted.cell,
+        columns=options.columns,
+        wavelength_um=wanted.sweep.wavelengths_um[0],
+    )
+    wanted = dataclasses.replace(wanted, sweep=made.sweep)
+    inputs = _inputs(cell_file, wanted.cell) | {
+        options.config.name: reading.sha256(options.config)
+    }
+    with options.claim(options.output, beside=(".png",)) as draft:
+        return _finish(options, draft.path, made, wanted, inputs, 0.0)
+
+
+def _finish(
+    options: Options,
+    path: Path,
+    made: PillarLibrary,
+    wanted: CellFile,
+    inputs: dict[str, str],
+    seconds: float,
+) -> int:
+    """Fit the proxy, write the library to ``path``, draw and judge it."""
+    fitted, refusal = _fit(made, wanted.proxy)
+    notes = made.notes + (
+        (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
+    )
+    about = store.Provenance(config.dumps(wanted), inputs)
+    made = dataclasses.replace(
+        made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about
+    )
+    library.save(path, made)
+    _draw(path, made, fitted)
     failures = _failures(
         made,
         fitted,
         refusal,
-        stated=stated,
+        stated=wanted.sweep.tolerance is not None,
         accept_partial_turn=options.accept_partial_turn,
     )
-    values, text = (
-        _values(made, fitted, seconds),
-        _text(target, made, fitted, seconds, failures),
-    )
+    values = _values(made, fitted, seconds)
+    text = _text(options.output, made, fitted, seconds, failures)
     return options.console.judged(values, text, failures)
 
 
@@ -241,12 +275,17 @@ def _text(
     failures: list[str],
 ) -> str:
     each = 1e3 * seconds / max(1, made.solves)
+    effort = (
+        f"  sweep    {made.solves:4d} solves ({made.engine}, {each:.0f} ms each)   {seconds:6.1f} s    "
+        if made.engine != "table"
+        else "  table                                                 "
+    )
     lines = [
         f"{target}: {made.t.size} entries, {len(made.resonances)} poles near the real diameters",
+        *(f"  {note}" for note in made.notes if made.engine == "table"),
         "",
         "  what     effort                          time        error",
-        f"  sweep    {made.solves:4d} solves ({made.engine}, {each:.0f} ms each)   {seconds:6.1f} s    "
-        f"t within {made.t_error.max():.1e} (median {np.median(made.t_error):.1e})",
+        f"{effort}t within {made.t_error.max():.1e} (median {np.median(made.t_error):.1e})",
     ]
     if fitted is not None:
         lines += [

@@ -24,4 +24,5 @@ from .record import save as save
 from .study import CellStudy as CellStudy
 from .sweeping import sweep as sweep
 from .sweeping import with_rotations as with_rotations
+from .tables import from_table as from_table
 from .workers import SweepJournal as SweepJournal
