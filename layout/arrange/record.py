@@ -202,14 +202,15 @@ class Floorplan:
             raise ProcessError(
                 "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
             )
-        taken = [
-            self.name,
-            *(part.name for part in self.lens),
-            *(part.name for part in self.cell),
-        ]
+        taken = [self.name, *(part.name for part in self.parts)]
         if self.die is not None:
             taken.append("DIE")
         names.check_distinct_names(taken)
+
+    @property
+    def parts(self) -> list[LensPart | CellPart]:
+        """Lenses, then cells."""
+        return [*self.lens, *self.cell]
 
     def furnished(self, part: LensPart) -> bool:
         """Whether a lens brings marks, label and test structures of its own."""

@@ -39,7 +39,7 @@ def run(options: Options) -> int:
     not read back as planned.
     """
     record = config.load(options.lens, Floorplan)
-    named = [part.file for part in (*record.lens, *record.cell)]
+    named = [part.file for part in record.parts]
     process = (
         processes.Process()
         if options.process is None
@@ -359,7 +359,7 @@ def _sheet(work: FloorplanWork, made: MaskLibrary, fields: int) -> list[str]:
         "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; "
         "+y up):",
     ]
-    for part in (*work.record.lens, *work.record.cell):
+    for part in work.record.parts:
         for at in part.at:
             copies = at.columns * at.rows
             many = f", {at.columns} x {at.rows} copies" if copies > 1 else ""

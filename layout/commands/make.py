@@ -241,9 +241,8 @@ def _read_back(job: LayoutJob, path: Path, read: Callable[..., MaskLibrary]) -> 
 
 
 def _is_verifiable(job: LayoutJob) -> bool:
-    """Whether the Gaussians of the exposure are known, and pillars are written."""
-    exposure = job.process.exposure
-    return exposure.known and exposure.csv is None and job.process.tone == "positive"
+    """Whether the point exposure is known, and pillars are written."""
+    return job.process.exposure.known and job.process.tone == "positive"
 
 
 def _verified(

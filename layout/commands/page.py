@@ -135,9 +135,9 @@ def _rules(found: DrcReport) -> Section:
         )
     ]
     if found.worst:
-        head = ("rule", "layer", "cell", "count", "worst", "limit")
-        rows = [[entry[key] for key in head] for entry in found.worst[:_LISTED]]
-        items.append(Table(head, rows, "Violations by rule, layer and cell."))
+        keys = ("rule", "layer", "cell", "count", "worst", "limit")
+        rows = [[entry[key] for key in keys] for entry in found.worst[:_LISTED]]
+        items.append(Table(keys, rows, "Violations by rule, layer and cell."))
         places = [
             [v.rule, "({:.0f}, {:.0f})".format(*v.centre), v.value, v.limit, v.text]
             for v in found.violations[:_LISTED]
@@ -185,10 +185,9 @@ def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
         f"was taken off; that rounds each by at most {job.made.cells.rounding_nm:g} nm. "
         f"Polygons have the area of their circle to {100 * worst:.3f} %."
     )
-    head = ("diameter / nm", "width / nm", "vertices", "shots")
-    head = (*head, "area error / %", "edge error / nm")
+    head = "diameter / nm, width / nm, vertices, shots, area error / %, edge error / nm"
     picture = Figure(shots["diameters.png"], "Pillars of each diameter.", wide=True)
-    return Section("Pillars", text, [picture, Table(head, rows)])
+    return Section("Pillars", text, [picture, Table(head.split(", "), rows)])
 
 
 def _exposure(job: LayoutJob) -> list[Section]:
@@ -200,9 +199,7 @@ def _exposure(job: LayoutJob) -> list[Section]:
         text = (
             "Proximity effect correction of lens, dose test, witness cells, marks and "
             f"label together: relative dose {min(used):.3f} to {max(used):.3f} in "
-            f"{len(solution.ladder.factors)} steps, a datatype each (doses.csv). Every "
-            f"edge of every shape is exposed within {100 * solution.worst:.2g} % of "
-            f"what it should be; known to {100 * solution.error:.2g} %."
+            f"{len(solution.ladder.factors)} steps, a datatype each (doses.csv)."
             f"{_fit_text(job.process.exposure, solution.point)}"
         )
         sections.append(Section("Dose", text))
@@ -371,7 +368,7 @@ def _dose_table(made: MaskLibrary, process: Process) -> Table:
 
 
 def _places(work: FloorplanWork) -> Table:
-    files = {p.name: str(p.file) for p in (*work.record.lens, *work.record.cell)}
+    files = {p.name: str(p.file) for p in work.record.parts}
     rows = [
         [
             one.part.name,
@@ -398,10 +395,10 @@ def _checks(work: FloorplanWork) -> Section:
         verdict = "FAILS" if broken else "passes"
         rows.append([name, f"{found.shapes:,}", *sizes, broken, "", "", verdict])
     rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
-    head = ("part", "shapes", "least gap", "least feature", "broken rules")
-    head = (*head, "exposure", "read back", "verdict")
+    columns = "part, shapes, least gap, least feature, broken rules, exposure, "
+    columns += "read back, verdict"
     caption = "Each lens has a report of its own, in the folder of its name."
-    items = [Table(head, rows, caption)]
+    items = [Table(columns.split(", "), rows, caption)]
     if work.near:
         near = [[v.text, v.value / 1e3, v.limit / 1e3] for v in work.near[:_LISTED]]
         head = ("what", "apart / µm", "needed / µm")

@@ -54,7 +54,7 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
         x, y = np.array([violation.centre for violation in found.violations]).T * scale
         axes.plot(x, y, "x", color="red", ms=4, mew=1, label="violations")
     if axes.get_legend_handles_labels()[0]:
-        place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.09)}
+        place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.09)}
         axes.legend(**place, ncols=6, frameon=False, fontsize=8)
     span = (-1.03 * reach, 1.03 * reach)
     axes.set(xlim=span, ylim=span, aspect="equal", xlabel="x / µm", ylabel="y / µm")
@@ -83,15 +83,19 @@ def plot_pillars(plan: MaskPlan, windows: tuple[DxfWindow, ...]) -> bytes:
                 for corners in plan.classes[k - 1].polygons:
                     shapes.append((corners + np.array([x, y])) * scale)
                     sizes.append(sizes_nm[k - 1])
-        style = {"cmap": "viridis", "edgecolors": "#222", "linewidths": 0.4}
+        style: dict[str, Any] = {
+            "cmap": "viridis",
+            "edgecolors": "#222",
+            "linewidths": 0.4,
+        }
         drawn = PolyCollection(shapes, array=np.array(sizes), **style)
         drawn.set_clim(min(sizes_nm), max(sizes_nm))
         ax.grid(False)
         ax.add_collection(drawn)
-        x, y, half = window.x_um, window.y_um, window.size_um / 2
-        ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
+        u, v, half = window.x_um, window.y_um, window.size_um / 2
+        ax.set(xlim=(u - half, u + half), ylim=(v - half, v + half), aspect="equal")
         ax.set(xlabel="x / µm", ylabel="y / µm")
-        ax.set_title(f"{window.size_um:g} µm at ({x:.6g}, {y:.6g})")
+        ax.set_title(f"{window.size_um:g} µm at ({u:.6g}, {v:.6g})")
     return report.figure_png(figure)
 
 
@@ -177,7 +181,11 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
     for n, (number, shapes) in enumerate(sorted(drawn.items())):
         name, colour = names[number].split("_dose_")[0], _COLOURS[n % len(_COLOURS)]
         fill, edge = (colour, "none") if name in _FILLED else ("none", colour)
-        style = {"facecolors": fill, "edgecolors": edge, "linewidths": 0.8}
+        style: dict[str, Any] = {
+            "facecolors": fill,
+            "edgecolors": edge,
+            "linewidths": 0.8,
+        }
         axes.add_collection(PolyCollection(shapes, **style))
         axes.plot([], [], color=colour, label=f"{name} {number}")
     every = [float(np.abs(p).max()) for shapes in drawn.values() for p in shapes]
@@ -213,7 +221,7 @@ def plot_floorplan(
         for colour, boxes in zip(_COLOURS, one.part.boxes.values(), strict=False):
             shapes = [rectilinear.box_corners(b) for b in one.moved(boxes)]
             corners = [shape / joined.PER_UM for shape in shapes]
-            style = {"facecolors": f"{colour}55", "edgecolors": "none"}
+            style: dict[str, Any] = {"facecolors": f"{colour}55", "edgecolors": "none"}
             axes.add_collection(PolyCollection(corners, **style))
         x, y = one.x / joined.PER_UM, one.y / joined.PER_UM
         axes.annotate(one.part.name, (x, y), fontsize=7, ha="center", va="center")
@@ -239,7 +247,11 @@ def plot_wafer(size: WaferSettings, dies: WaferDies, box_um: Array) -> bytes:
     figure, ax = report.make_figure(size=(6.4, 6.2))
     corner = rectilinear.box_corners(box_um / 1e3)
     shapes = list(dies.place_um[:, None] / 1e3 + corner)
-    style = {"facecolors": "#1f6feb55", "edgecolors": "#355070", "linewidths": 0.4}
+    style: dict[str, Any] = {
+        "facecolors": "#1f6feb55",
+        "edgecolors": "#355070",
+        "linewidths": 0.4,
+    }
     ax.add_collection(PolyCollection(shapes, **style))
     turn, radius = np.linspace(0, 2 * np.pi, 400), size.diameter_mm / 2
     for r, line in ((radius, "-"), (radius - size.edge_exclusion_mm, ":")):

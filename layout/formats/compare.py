@@ -129,13 +129,13 @@ def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:
         every = zip(cell.placed.children, *(v.tolist() for v in cell.sums), strict=True)
         return {(child, None): tuple(sums) for child, *sums in every}
     digests: dict[Who, RunningDigest] = {}
-    for child, turn, *places in dataclasses.replace(cell, pillars=None).instances():
+    for child, turn, x, y in dataclasses.replace(cell, pillars=None).instances():
         who = _rounded(turn)
         digest = digests.setdefault((child, None if merged else who), RunningDigest())
-        zeros = np.zeros(len(places[0]), np.int64)
+        zeros = np.zeros(len(x), np.int64)
         index = QUARTERS.index(who) if who in QUARTERS else len(QUARTERS)
         turned = np.full(len(zeros), index if merged else 0, np.uint8)
-        digest.take(zeros, *places, turned)
+        digest.take(zeros, x, y, turned)
     zero = np.zeros(1, np.int64)
     sums = {
         who: tuple(int(value[0]) for value in digest.of(zero))

@@ -237,16 +237,14 @@ class MaskCell:
             kinds = self.placed.kinds(slice(first, first + _AT_ONCE))
             total += np.bincount(kinds, minlength=len(total))
         for kind in np.flatnonzero(total).tolist():
-            child, turn = divmod(kind, len(self.placed.turns))
-            key = self.placed.children[child], self.placed.turns[turn]
+            number, turn = divmod(kind, len(self.placed.turns))
+            key = self.placed.children[number], self.placed.turns[turn]
             found[key] += int(total[kind])
         for one in self.references:
             found[one.child, one.turn] += one.count
         if self.pillars is not None:
-            number = self.pillars.lattice.counts(len(self.pillars.children))
-            for child, count in zip(
-                self.pillars.children, number[1:].tolist(), strict=True
-            ):
+            n = self.pillars.lattice.counts(len(self.pillars.children))
+            for child, count in zip(self.pillars.children, n[1:].tolist(), strict=True):
                 found[child, QUARTERS[0]] += count
         return {key: count for key, count in found.items() if count}
 
@@ -295,7 +293,8 @@ class MaskCell:
     @property
     def shapes(self) -> int:
         """Number of its own shapes; 1 for a cell that holds nothing at all."""
-        own = sum(map(len, (*self.polygons.values(), *self.circles.values())))
+        own = sum(map(len, self.polygons.values()))
+        own += sum(map(len, self.circles.values()))
         return own or int(not self.children)
 
 

@@ -153,7 +153,8 @@ class PillarArray:
         def source(first: int, end: int) -> Array:
             return classes[first:end]
 
-        return cls(name, *classes.shape, pitch, x0, y0, source, classes)
+        rows, columns = classes.shape
+        return cls(name, rows, columns, pitch, x0, y0, source, classes)
 
     @property
     def down(self) -> int:
@@ -238,10 +239,8 @@ class PillarArray:
         """Left, bottom, right, top of the sites."""
         right = self.x0 + (self.columns - 1) * self.pitch
         bottom = self.y0 - (self.rows - 1) * self.down
-        left, bottom, right, top = (
-            v * self.unit_um for v in (self.x0, bottom, right, self.y0)
-        )
-        return left, bottom, right, top
+        unit = self.unit_um
+        return self.x0 * unit, bottom * unit, right * unit, self.y0 * unit
 
 
 @dataclass(frozen=True, eq=False, slots=True)

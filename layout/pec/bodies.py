@@ -69,6 +69,12 @@ class ExposureTable:
         """(entries,) which occur."""
         return np.asarray(self.count > 0)
 
+    @property
+    def per_own(self) -> Array:
+        """(entries,) area over own; 0 for those that do not occur."""
+        none = np.zeros_like(self.own)
+        return np.divide(self.area_um2, self.own, out=none, where=self.used)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ScatterRanges:

@@ -22,7 +22,7 @@ import numpy as np
 from layout.mask.plan import PillarArray
 from layout.pec import assign, bodies, psf, rects
 from layout.pec.assign import DoseLadder
-from layout.pec.bodies import NONE, ExposedRectangles, ExposureTable, ScatterRanges
+from layout.pec.bodies import ExposedRectangles, ExposureTable, ScatterRanges
 from layout.pec.drawn import DrawnKinds
 from layout.pec.fracture import fracture_boxes
 from layout.pec.nodes import (
@@ -33,8 +33,6 @@ from layout.pec.nodes import (
     interpolate_from_nodes,
 )
 from layout.pec.psf import THRESHOLD, PointExposure
-from layout.pec.sampled import ExposedLattices, exact_edges
-from layout.pec.uniformity import DoseUniformity
 from layout.process.process import ExposureSettings
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
@@ -45,24 +43,19 @@ _SPOTS = 10  # of a piece on the nodes, along the same
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DoseSolution:
-    """Doses of everything on a die; ``before`` and ``after`` uniformity with the best
-    single dose and with these, over the pillars of the first body.
+    """Doses of everything on a die.
 
-    ladder: the doses. pairs: (entries, doses) pillars of each, over all bodies. rects:
-    pieces, and ``rect_class`` (n,)
-    the dose class of each. worst: largest relative exposure error over all pillars and
-    pieces.
+    ladder: the doses.
+    needed: number of doses that the tolerance needs; the writer may hold fewer.
+    pairs: (entries, doses) pillars of each, over all bodies.
+    rect_class: (n,) dose class of each piece of a mark.
+    point: point exposure that was used.
     """
 
     ladder: DoseLadder
     needed: int
     pairs: Array
-    rects: ExposedRectangles
     rect_class: Array
-    before: DoseUniformity
-    after: DoseUniformity
-    worst: float
-    error: float
     point: PointExposure
     _fields: assign.ExposedBodies
 
@@ -116,65 +109,17 @@ def solve_doses(
     return WantedDoses(fields, assign.dose_range(fields, settings), point)
 
 
-def round_doses(
-    wanted: WantedDoses, ladder: DoseLadder, needed: int, *, samples: int = 8
-) -> DoseSolution:
+def round_doses(wanted: WantedDoses, ladder: DoseLadder, needed: int) -> DoseSolution:
     """Every wanted dose rounded to the nearest of a ladder.
 
     Args:
-        ladder, needed: of :func:`layout.pec.assign.dose_ladder`, over all that is
-            written in one job.
-        samples: pillars at which the exposure is summed exactly.
+        wanted: of one die.
+        ladder: of :func:`layout.pec.assign.dose_ladder`, for all that is written in one
+            job.
+        needed: number of doses that its tolerance needs.
     """
-    fields, point = wanted.fields, wanted.point
-    pairs, rect_class, after = assign.assign_dose_classes(fields, ladder)
-    error = _sampled_error(wanted, ladder, after, samples)
-    return DoseSolution(
-        ladder,
-        needed,
-        pairs,
-        fields.rects,
-        rect_class,
-        after.before,
-        after.after,
-        after.worst,
-        error,
-        point,
-        fields,
-    )
-
-
-def _sampled_error(
-    wanted: WantedDoses, ladder: DoseLadder, found: assign.AssignedDoses, samples: int
-) -> float:
-    """Largest |fast - exact| / wanted exposure at sample pillars of the first body."""
-    fields, table = wanted.fields, wanted.fields.table
-    dose = np.zeros(NONE + 1)
-    dose[: len(ladder.factors)] = ladder.factors
-    points, areas, of = fields.spots
-    needed = (THRESHOLD * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
-    scene = ExposedLattices(
-        fields.bodies,
-        table.drawn,
-        table.own + table.area_um2 * float(fields.ranges.far.density(np.array(0.0))),
-        fields.ranges,
-        wanted.point,
-        (points, areas * dose[ladder.nearest(needed)][of]),
-        lambda number, first, block: dose.take(
-            assign.dose_class_map(fields, number, first, block, ladder)
-        ),
-    )
-    rows, columns, exact = exact_edges(scene, samples)
-    worst = 0.0
-    for row, column, edge in zip(
-        rows.tolist(), columns.tolist(), exact.tolist(), strict=True
-    ):
-        block = np.ascontiguousarray(fields.bodies[0].source(row, row + 1))
-        entry = int(block[0, column])
-        near = fields.at(found.far, 0, row, 1, found.near)[0, column]
-        fast = scene.dose_of(0, row, block)[0, column] * table.own[entry] + near
-        worst = max(worst, abs(fast - edge) / (THRESHOLD * table.goal[entry]))
-    return float(worst)
+    pairs, rect_class = assign.assign_dose_classes(wanted.fields, ladder)
+    return DoseSolution(ladder, needed, pairs, rect_class, wanted.point, wanted.fields)
 
 
 def fracture_by_surroundings(
@@ -209,7 +154,7 @@ def _fields(
     ranges: ScatterRanges,
     cut: ExposedRectangles,
 ) -> assign.ExposedBodies:
-    """Backgrounds that belong to the wanted doses, and to dose 1 everywhere."""
+    """Backgrounds that belong to the wanted doses."""
     width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
     grid = NodeGrid.over(_box(parts, cut), width)
     beside = PointExposure(
@@ -220,40 +165,17 @@ def _fields(
     pads = _Pads(
         cut, own, (points, piece), rects.rectangle_samples(cut, width / _SPOTS), grid
     )
-    plain, wanted, goal = _masses(parts, drawn, grid)
-    plain += pads.deposited(np.ones(len(own)))
-    reach = gaussian_convolution(
-        grid.shape,
-        (grid.y.spacing_um, grid.x.spacing_um),
-        point=ranges.far,
-        hollow=False,
-    )
+    masses = _masses(parts, drawn, grid)
+    spacing = grid.y.spacing_um, grid.x.spacing_um
+    reach = gaussian_convolution(grid.shape, spacing, point=ranges.far, hollow=False)
     middles = (
         [middle_convolution(body, ranges) for body in parts]
         if len(ranges.middle.widths_um)
         else []
     )
-    alone = [
-        _times(body, drawn.area_um2, middle)
-        for body, middle in zip(parts, middles, strict=False)
-    ]
-    field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles, pads)
+    field, near = _backgrounds(parts, drawn, grid, reach, masses, middles, pads)
     return assign.ExposedBodies(
-        parts,
-        drawn,
-        ranges,
-        grid,
-        reach,
-        middles,
-        field,
-        reach(plain),
-        near,
-        alone,
-        cut,
-        own,
-        points,
-        piece,
-        pads.spots,
+        parts, drawn, ranges, grid, field, near, cut, own, points, piece
     )
 
 
@@ -295,21 +217,16 @@ class _Pads:
 
 def _masses(
     parts: Sequence[PillarArray], drawn: ExposureTable, grid: NodeGrid
-) -> tuple[Array, Array, Array]:
-    """Node sums of area, area / own, and goal area / own."""
-    per_own = np.divide(
-        drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used
-    )
-    value = np.stack(
-        [np.where(drawn.used, drawn.area_um2, 0.0), per_own, per_own * drawn.goal]
-    )
-    out = np.zeros((3, *grid.shape))
+) -> tuple[Array, Array]:
+    """Node sums of area / own, and goal area / own."""
+    value = np.stack([drawn.per_own, drawn.per_own * drawn.goal])
+    out = np.zeros((2, *grid.shape))
     for body in parts:
         xn, xw = grid.x.at(body.columns_um)
         for first, block in body.blocks():
             yn, yw = grid.y.at(body.rows_um(first, len(block)))
             gather_to_nodes(block, value, yn, yw, xn, xw, out)
-    return out[0], out[1], out[2]
+    return out[0], out[1]
 
 
 def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:
@@ -330,12 +247,6 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
     )
 
 
-def _times(body: PillarArray, value: Array, middle: RadialConvolution) -> Array:
-    """(rows, columns) what pillars that carry ``value`` (entries,) give to each other."""
-    mass = np.concatenate([value.take(block) for _, block in body.blocks()])
-    return middle(mass).astype(np.float32)
-
-
 def _backgrounds(
     parts: Sequence[PillarArray],
     drawn: ExposureTable,
@@ -351,9 +262,6 @@ def _backgrounds(
     wanted, goal = masses
     field = _relaxed(reach, wanted, THRESHOLD * goal, pads=pads)
     near: list[Array] = []
-    per_own = np.divide(
-        drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used
-    )
     for _ in range(12 if middles else 0):
         near, taken = [], np.zeros(grid.shape)
         for body, middle in zip(parts, middles, strict=True):
@@ -362,7 +270,7 @@ def _backgrounds(
             yn, yw = grid.y.at(body.rows_um(0, body.rows))
             far = np.empty(index.shape, np.float32)
             interpolate_from_nodes(field, yn, yw, xn, xw, far)
-            mass = per_own.take(index)
+            mass = drawn.per_own.take(index)
             own = _relaxed(
                 middle,
                 mass,

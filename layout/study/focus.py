@@ -192,35 +192,6 @@ def focus_window(
     return FocusWindow(axis, axis, lens.sensor_distance_um, lens.wavelength_um, depths)
 
 
-def interpolated_peak(psf: Array) -> Array:
-    """(...) largest value between the samples of (..., y, x) intensities that are
-    sampled finely enough.
-
-    Band-limited interpolation to quarter steps, then a parabola along each axis: 1e-4
-    for a focus at Nyquist steps.
-    """
-    from scipy.signal import resample
-
-    fine = np.asarray(psf, float)
-    for axis in (-2, -1):
-        fine = resample(fine, 4 * fine.shape[axis], axis=axis)
-    flat = fine.reshape(-1, *fine.shape[-2:])
-    found = []
-    for image in flat:
-        row, column = np.unravel_index(int(image.argmax()), image.shape)
-        value = image[row, column]
-        rows, columns = image.shape
-        sides = (
-            (image[row - 1, column], image[(row + 1) % rows, column]),
-            (image[row, column - 1], image[row, (column + 1) % columns]),
-        )
-        found.append(
-            value
-            + sum((a - b) ** 2 / (8 * max(2 * value - a - b, 1e-300)) for a, b in sides)
-        )
-    return np.array(found).reshape(psf.shape[:-2])
-
-
 def _count(
     seen: PropagationCase, edge_um: float, reach_um: float, middle: float
 ) -> int:

@@ -13,16 +13,11 @@ import numpy as np
 
 from layout.mask.fields import FieldPlan
 from layout.process.process import Process
-from layout.study.focus import (
-    FocusSums,
-    FocusWindow,
-    focus_window,
-    interpolated_peak,
-    prepare_focus,
-)
+from layout.study.focus import FocusSums, FocusWindow, focus_window, prepare_focus
 from metalens.core.arrays import Array
 from metalens.fabrication import designed
 from metalens.lens import Lens
+from metalens.psf import find_peak
 
 _BAND = 64
 
@@ -87,7 +82,7 @@ def simulate_stitching(
         * 1e3
     )
     worst = int(change.argmax())
-    strehl = interpolated_peak(psf) / interpolated_peak(perfect)
+    strehl = np.array([find_peak(image)[2] for image in psf]) / find_peak(perfect)[2]
     return StitchReport(
         process.write_field.stitching_nm,
         strehl,

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.process.process import Process
-from layout.study.focus import (
-    FocusWindow,
-    focus_window,
-    interpolated_peak,
-    prepare_focus,
-)
+from layout.study.focus import FocusWindow, focus_window, prepare_focus
 from layout.study.sensitivity import LogSensitivities, compute_sensitivities
 from layout.study.spread_model import SpreadModel, reduce_spread, reduction_error
 from metalens.core import executor, threads
@@ -26,6 +21,7 @@ from metalens.fabrication import (
     spread,
 )
 from metalens.lens import Lens, reach
+from metalens.psf import encircled_power, find_peak, fwhm
 
 # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16
 # to 26 mm
@@ -38,7 +34,8 @@ class ToleranceOutcome:
     """What is looked at, for draws of the process; the first axis counts them.
 
     strehl: (draws,) peak at the design depth relative to the nominal lens.
-    efficiency: (draws,) share of the light on the aperture that reaches the window.
+    efficiency: (draws,) focusing efficiency: power within a circle of three FWHM over
+        power on the aperture.
     psf_change: (draws,) relative L2 change of the PSF at the design depth from the
     nominal one.
     information: (draws, depths) axial Fisher information of the normalised PSF (paper
@@ -223,13 +220,20 @@ def _seen(
     design = psf[:, 0]
     unit = psf[:, 1:] / psf[:, 1:].sum((2, 3), keepdims=True)
     steps = (unit[:, 1::2] - unit[:, ::2]) / step_um
+    peaks = [find_peak(image) for image in design]
+    power = [_focused_power(*pair) for pair in zip(design, peaks, strict=True)]
     return (
-        interpolated_peak(design) / interpolated_peak(reference),
-        design.sum((1, 2)) * view.cell_um2 / incident,
+        np.array([top for *_, top in peaks]) / find_peak(reference)[2],
+        np.array(power) * view.cell_um2 / incident,
         np.sqrt(((design - reference) ** 2).sum((1, 2)) / (reference**2).sum()),
         (steps**2).sum((2, 3)),
         design[:, len(view.y_um) // 2] / reference.max(),
     )
+
+
+def _focused_power(light: Array, peak: tuple[float, float, float]) -> float:
+    """Sum of (y, x) samples within a circle of three FWHM about the peak."""
+    return encircled_power(light, peak, 1.5 * fwhm(light, 1.0))
 
 
 def _part(outcome: ToleranceOutcome, rows: slice) -> ToleranceOutcome:

@@ -210,17 +210,6 @@ def test_a_window_without_extent_is_refused():
         )
 
 
-@pytest.mark.parametrize(("x0", "y0"), [(0.0, 0.0), (0.31, -0.44), (0.5, 0.5)])
-def test_the_peak_between_samples_of_an_airy_spot_is_found(x0, y0):
-    # the spot of a square aperture, sinc^2 sinc^2, at its Nyquist step of half a
-    # diffraction width
-    axis = np.arange(-20, 21) * 0.5
-    spot = np.sinc(axis - x0 / 2) ** 2 * np.sinc(axis[:, None] - y0 / 2) ** 2
-    assert focus.interpolated_peak(spot) == pytest.approx(
-        1, abs=1.5e-3
-    )  # cut at 10 widths: tails of 1e-3
-
-
 def test_a_lens_behind_a_stop_is_refused_by_what_it_would_need():
     lens = random_lens()
     behind = dataclasses.replace(lens, layers=Layers(stop=Stop(31.0, 40.0)))

@@ -40,7 +40,8 @@ def lens_map(n=61, pitch=0.4):
 def written(process, furnished=True):
     """The mask as files: the plan, what a reader finds, and its dose table."""
     bare = layout.plan(lens_map(), process, furnished=furnished)
-    plan = layout.correct(bare, process.exposure)
+    known = process.exposure.corrected
+    plan = layout.correct(bare, process.exposure) if known else bare
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
         handover.write_dose_table(plan, process, Path(folder) / "doses.csv")

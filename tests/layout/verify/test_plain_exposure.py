@@ -22,7 +22,9 @@ UNEXPOSED = (2, 7, 10)  # aperture (another step), write fields, outline
 
 def corrected(source, process, **options):
     """The plan of a lens with a dose for every shape."""
-    return layout.correct(layout.plan(source, process, **options), process.exposure)
+    plan = layout.plan(source, process, **options)
+    known = process.exposure.corrected
+    return layout.correct(plan, process.exposure) if known else plan
 
 
 def lens_map(n, pitch, low, high, share):

@@ -50,7 +50,9 @@ NAMES = ("alpha_um", "beta_um", "eta", "gamma_um", "nu")
 
 def corrected(source, process, **options):
     """The plan of a lens with a dose for every shape."""
-    return layout.correct(layout.plan(source, process, **options), process.exposure)
+    plan = layout.plan(source, process, **options)
+    known = process.exposure.corrected
+    return layout.correct(plan, process.exposure) if known else plan
 
 
 def lens(shape, lattice, sizes, turned, empty=0.25):
