@@ -1,0 +1,75 @@
+"""Frames that nobody else uses: streams of calibration, selection and test; pairs with
+the looks of training; a mask that would be worse; a network and loss of one's own.
+"""
+
+import itertools
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from codesign.adapt import correction
+from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
+from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
+from codesign.eye import render
+from codesign.train.ambiguity import ambiguous_pairs
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_no_two_streams_show_the_same_eye():
+    """Intervals are calibrated on a stream that neither training, nor the search's
+    selection, nor the test, nor batch statistics (of training) draw from.
+    """
+    scenes = EyeScenes(SceneConfig(), 9.0, 2000.0, seed=3)
+    streams = (TRAINING, VALIDATION, TEST, CALIBRATION, EXPERIMENT)
+    assert len(set(streams)) == len(streams)
+    seen = [
+        torch.cat([replace(scenes, stream=s).states(step, 6).traits for step in (0, 1)])
+        for s in streams
+    ]
+    for one, other in itertools.combinations(seen, 2):
+        distance = torch.cdist(one, other)
+        assert float(distance.min()) > 1e-6
+
+
+@pytest.mark.parametrize(("variety", "dressed"), [(1.0, False), (3.0, True)])
+def test_pairs_that_only_blur_tells_apart_have_the_looks_of_training(variety, dressed):
+    """Up to a variety of 1 the frames are bare; beyond it spectacles, shadows and
+    reflections change the light of the same states, and the pupil stays in its place.
+    """
+    settings = SceneConfig(pixels=64, margin=4, variety=variety)
+    scenes = EyeScenes(settings, 18.0, 2000.0, seed=1, stream=TEST)
+    pairs = ambiguous_pairs(scenes, 4, 5)
+    batch = pairs.batch(0, 8)
+    bare = render(pairs.states, rig=scenes.rig, camera=scenes.camera)
+    off = (batch.frames.radiance.sum(1) - bare.pinhole()).abs().mean((1, 2))
+    assert (float(off.max()) > 0.01) == dressed
+    if not dressed:
+        assert float(off.max()) == 0
+    slip = pairs.states.slip_um
+    assert float((slip[::2] - slip[1::2]).norm(dim=1).min()) >= 800.0
+
+
+def test_a_mask_that_its_own_table_shows_to_be_worse_is_refused_in_words():
+    def state(name, strehl):
+        return correction.LensProposal(name, None, strehl, 1.0)
+
+    made, tabled = state("as made", 0.555), state("new bias table", 0.509)
+    words = correction.loss_reason(made, tabled)
+    assert "no correction" in words
+    assert "0.509 (new bias table)" in words
+    assert "0.555 (as made)" in words
+    assert correction.loss_reason(tabled, made) == ""
+
+
+def test_a_lens_is_trained_behind_a_network_and_a_loss_of_ones_own():
+    example = runpy.run_path(str(ROOT / "examples" / "own_network.py"))
+    torch.manual_seed(0)
+    layers = torch.nn.Conv2d(1, 8, 5, stride=4), torch.nn.ReLU(), torch.nn.Flatten()
+    network = torch.nn.Sequential(*layers, torch.nn.LazyLinear(3))
+    phase_rad, losses = example["train"](network, steps=12)
+    assert losses[-1] < 0.9 * losses[0]  # one batch of 16 frames, learned by heart
+    assert int((phase_rad.abs() > 1e-3).sum()) == len(phase_rad)
