@@ -45,7 +45,7 @@ def reference(cell: Cell, wavelength_um: float) -> np.ndarray[Any, np.dtype[Any]
 
 def truncated_row(cell: Cell, wavelength_um: float, exact: Any, harmonics: int) -> Row:
     """Error and estimate at one truncation; the time is that of this truncation alone."""
-    found = rcwa.solve_many(cell, DIAMETERS, wavelength_um, harmonics=harmonics)
+    found = [rcwa.solve(cell, d, wavelength_um, harmonics=harmonics) for d in DIAMETERS]
 
     def work() -> None:
         for diameter_um in DIAMETERS:

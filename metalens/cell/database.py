@@ -168,11 +168,13 @@ Part = DispersionFormula | TabulatedIndex
 
 
 def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
-    """n, k (None: transparent) and the source in words of a page.
+    """n, k (None: transparent) and the source in words of a page of refractiveindex.info.
+
+    Args:
+        text: the page, YAML. where: its name, for messages.
 
     Raises:
-        MaterialError: not such a page, an unknown formula, a bad row (``where`` and the
-            row are named).
+        MaterialError: not such a page, an unknown formula, a bad row.
     """
     try:
         page = yaml.safe_load(text)
@@ -353,7 +355,7 @@ def _source(page: dict[str, Any]) -> str:
 
 
 def load_page(path: Path, where: str) -> tuple[Part, Part | None, str]:
-    """:func:`parse_page` of a file.
+    """As :func:`parse_page`, from the file at ``path``, which messages call ``where``.
 
     Raises:
         MaterialError: also where the file is missing or no text.

@@ -45,6 +45,9 @@ class Incidence:
 def check_direction(angle_rad: float, azimuth_rad: float) -> None:
     """Refuse what is no direction of light.
 
+    Args:
+        angle_rad: of incidence. azimuth_rad: of the plane of incidence.
+
     Raises:
         CellError: an angle that is not finite, or not below a right angle.
     """

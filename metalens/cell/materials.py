@@ -138,8 +138,8 @@ def index(material: cell.Material | Material, wavelength_um: float) -> complex:
 def index_dispersion(
     material: cell.Material | Material, wavelength_um: float
 ) -> complex:
-    """Dispersion d(n + ik)/d(wavelength_um), with the arguments and errors of
-    :func:`index`.
+    """Dispersion d(n + ik)/d(wavelength_um) of a ``material``, with the arguments and
+    errors of :func:`index`.
     """
     return _index_and_slope(material, wavelength_um)[1]
 
@@ -201,6 +201,8 @@ def _substance(name: str) -> list[str]:
 def read_yaml(path: str | Path) -> Material:
     """A material from a page of refractiveindex.info.
 
+    path: of the YAML file.
+
     Raises:
         MaterialError: no such file, or no such page; see :mod:`metalens.cell.database`.
     """
@@ -235,9 +237,11 @@ def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
 def read_csv(path: str | Path) -> Material:
     """A material of a table wavelength_um, n, k (:mod:`metalens.cell.tables`).
 
+    path: of the CSV file.
+
     Raises:
-        MaterialError: no such file, a missing column, or a bad row; the message gives
-            the line.
+        MaterialError: no such file, a missing column, or a bad row; the message gives the
+            line.
     """
     try:
         stat = Path(path).stat()

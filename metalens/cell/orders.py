@@ -34,11 +34,14 @@ def propagating_orders(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> tuple[DiffractionOrder, ...]:
-    """All orders with |k| <= n k0, grazing ones included, the zero order first on each
-    side.
+    """All diffraction orders with |k| <= n k0, grazing ones included, the zero order first
+    on each side.
 
-    angle_rad: of the light outside, in vacuum: the tangential wave vector is k0
-    sin(angle_rad).
+    Args:
+        cell: its lattice and half-spaces. wavelength_um: in vacuum.
+        angle_rad: of the light outside, in vacuum: the tangential wave vector is k0
+            sin(angle_rad).
+        azimuth_rad: of the plane of incidence, from +x to +y.
 
     Raises:
         MaterialError: a wavelength outside the range of a material.
@@ -73,14 +76,14 @@ def propagating_orders(
 
 
 def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
-    """Pitch below which no diffraction order propagates even in the densest material of
-    a cell, at normal incidence.
+    """Pitch below which no diffraction order propagates even in the densest material of a
+    cell, at normal incidence: wavelength / index, times 2 / sqrt(3) for a hexagonal lattice.
 
-    The layer then guides no wave that the lattice couples to light from outside, so
-    that no resonance of the lattice
-    (guided-mode resonances, leaky modes of films with holes) is left: wavelength /
-    index, times 2 / sqrt(3) for a
-    hexagonal lattice.
+    The layer then guides no wave that the lattice couples to light from outside: no
+    guided-mode resonance is left.
+
+    Args:
+        cell: all its materials count. wavelength_um: in vacuum.
 
     Raises:
         MaterialError: a wavelength outside the range of a material.
@@ -104,9 +107,11 @@ def substrate_orders(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> tuple[DiffractionOrder, ...]:
-    """Orders other than zero that propagate in the substrate: what they carry is lost.
+    """Diffraction orders other than zero that propagate in the substrate: what they carry
+    is lost.
 
-    Arguments and errors as for :func:`propagating_orders`.
+    Args:
+        cell, wavelength_um, angle_rad, azimuth_rad: as for :func:`propagating_orders`.
     """
     orders = propagating_orders(
         cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad
@@ -117,7 +122,7 @@ def substrate_orders(
 
 
 def named_orders(orders: Sequence[DiffractionOrder], most: int = 8) -> str:
-    """Orders in words: "(1, 0), (0, -1) and 3 more"."""
+    """``orders`` in words, at most ``most`` of them: "(1, 0), (0, -1) and 3 more"."""
     named = ", ".join(f"({order.m}, {order.n})" for order in orders[:most])
     more = f" and {len(orders) - most} more" if len(orders) > most else ""
     return named + more
@@ -126,10 +131,12 @@ def named_orders(orders: Sequence[DiffractionOrder], most: int = 8) -> str:
 def describe_order_loss(
     cell: Cell, wavelength_um: float, share: float | None = None
 ) -> str:
-    """Which orders of the substrate take light at normal incidence, in a line; empty
-    where none propagates.
+    """Which orders of the substrate take light at normal incidence, in a line; empty where
+    none propagates.
 
-    share: of the light that they and absorption take, where it is known.
+    Args:
+        cell, wavelength_um: as for :func:`propagating_orders`.
+        share: of the light that they and absorption take, where it is known.
     """
     orders = substrate_orders(cell, wavelength_um)
     if not orders:
@@ -148,10 +155,14 @@ def check_subwavelength(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> None:
-    """Refuse a cell that transmits orders other than zero into the cover.
+    """Refuse a cell that transmits orders other than zero into the cover, which would reach
+    the sensor.
 
-    They would reach the sensor beside the image. Orders of the substrate alone are a
-    loss: :func:`substrate_orders` lists them, the solvers' ``energy`` includes them.
+    Orders of the substrate alone are a loss: :func:`substrate_orders` lists them, the
+    solvers' ``energy`` includes them.
+
+    Args:
+        cell, wavelength_um, angle_rad, azimuth_rad: as for :func:`propagating_orders`.
 
     Raises:
         CellError: names the orders, and the pitch below which none propagates.

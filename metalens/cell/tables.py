@@ -21,7 +21,10 @@ _SCALES = {"wavelength_um": 1.0, "wl": 1.0, "wavelength_nm": 1e-3}
 
 
 def parse_table(text: str, where: str) -> tuple[Array, str]:
-    """(3, rows) wavelength_um, n, k, rising; and the comments.
+    """(3, rows) wavelength_um, n, k, rising; and the comments of a table.
+
+    Args:
+        text: of the table. where: its name, for messages.
 
     Raises:
         MaterialError: a missing column or a bad row; the message gives the line.

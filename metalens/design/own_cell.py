@@ -196,12 +196,16 @@ def angle_change(lens: Lens, incidence_rad: float) -> float:
 def _answers(
     lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]
 ) -> Array:
-    found = rcwa.solve_many(
-        lens.cell,
-        tuple(diameters_um.tolist()),
-        lens.wavelength_um,
-        angle_rad=angle_rad,
-        polarization=polarization,
-        tolerance=TOLERANCE,
+    return np.array(
+        [
+            rcwa.solve(
+                lens.cell,
+                diameter_um,
+                lens.wavelength_um,
+                angle_rad=angle_rad,
+                polarization=polarization,
+                tolerance=TOLERANCE,
+            ).t
+            for diameter_um in diameters_um.tolist()
+        ]
     )
-    return np.array([one.t for one in found])

@@ -141,9 +141,8 @@ def _derived(
     (wavelength_um, edges, weights), (cell, size_um, _harmonics) = about, task
     causes = [row for _, row in of_kind(ResponseError)]
     rows = [*(_numbers(row, cell, size_um) for row in causes), edges]
-    return np.transpose(
-        [_slopes(numbers, wavelength_um, weights, task) for numbers in rows]
-    ).tolist()
+    slopes = [_slopes(numbers, wavelength_um, weights, task) for numbers in rows]
+    return [list(each) for each in zip(*slopes, strict=True)]
 
 
 def _numbers(row: Perturbation, cell: Cell, size_um: float) -> dict[str, float]:

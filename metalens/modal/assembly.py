@@ -60,8 +60,15 @@ class JacobianMetric:
 
 
 def jacobian_metric(patch: MeshPatch, rho: float) -> JacobianMetric:
-    """(elements, points) each; N_i·N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j)
-    + eta_eta b_i b_j.
+    """Metric of the map from the reference element, at the points of a patch.
+
+    N_i N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j) + eta_eta b_i b_j.
+
+    Args:
+        patch: elements with one reference basis. rho: diameter over pitch.
+
+    Returns:
+        Products of the Jacobian, (elements, points) each.
     """
     xi = rho * patch.rho_xi + patch.rest_xi
     eta = rho * patch.rho_eta + patch.rest_eta
@@ -74,8 +81,13 @@ def jacobian_metric(patch: MeshPatch, rho: float) -> JacobianMetric:
 def element_matrices(
     patch: MeshPatch, m: JacobianMetric
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass, curl-curl and scalar mass of each element of a patch: (elements, functions,
-    functions).
+    """Finite-element matrices of each element of a patch.
+
+    Args:
+        patch: elements with one reference basis. m: its metric.
+
+    Returns:
+        Mass, curl-curl and scalar mass, (elements, functions, functions) each.
     """
     b = patch.basis
     w = b.weight
@@ -109,7 +121,11 @@ def sum_blocks(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def gradient_matrix(plan: MeshPlan) -> np.ndarray:
-    """Coefficients of the gradients of the scalar functions: topology alone."""
+    """Discrete gradient (vectors, scalars): coefficients of the gradients of the scalar
+    functions in the vector functions, exact and by topology alone.
+
+    plan: of the mesh.
+    """
     mesh = build_mesh(plan)
     out = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
     for patch in mesh.patches:
@@ -121,7 +137,11 @@ def gradient_matrix(plan: MeshPlan) -> np.ndarray:
 
 
 def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMatrices]:
-    """Matrices of the cell and of the disc."""
+    """Assembled matrices of the quarter cell and of its part inside the disc.
+
+    Args:
+        mesh: patches and numbering. rho: diameter over pitch.
+    """
     nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
     sums = {
         inside: [np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns))]
@@ -141,7 +161,8 @@ def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMa
 
 
 def assemble_disc(rho: float, plan: MeshPlan) -> AssembledDisc:
-    """Integrate the matrices of a disc of radius ``rho`` half pitches.
+    """Finite-element matrices of a disc of radius ``rho`` half pitches on the mesh of a
+    ``plan``.
 
     Raises:
         CellError: the disc is not strictly inside the cell: elements between it and the

@@ -54,19 +54,15 @@ class ModalCase:
         return self.k0 * math.sqrt(max(abs(self.disc), abs(self.around))) / math.pi
 
     @property
-    def strange(self) -> float:
-        """How unlike the cells of lenses it is.
+    def regime_factor(self) -> float:
+        """0 in the regime that the error factors are calibrated for, else 1; ``RARER``
+        for a disc of the rarer medium.
 
-        0 for a pillar of the denser medium, lower than eight pitches and higher than a
-        quarter of one, at most two
-        waves in a pitch, no order but zero at normal incidence, moderate angles,
-        between media hardly denser than
-        either half-space; ``RARER`` for a disc of the rarer medium; else 1.
-
-        Forms on a coarse mesh err more alike there. A layer that guides beside the
-        pillars has resonances as sharp as
-        the pillars are thin: bars of three of 30 such cells were down to 0.45 of the
-        error, of 150 others none.
+        The regime: a pillar of the denser medium, a quarter to eight pitches high, at
+        most two waves in a pitch, no order but zero at normal incidence, moderate
+        angles, between media hardly denser than either half-space. Outside it the forms
+        on a coarse mesh err more alike. If the layer between the pillars guides light,
+        resonances are narrow and the bound may be too small by 2 times.
         """
         disc, around = abs(self.disc), abs(self.around)
         outside = self.k0 * math.sqrt(max(self.below, self.above)) / math.pi
@@ -85,19 +81,20 @@ class ModalCase:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeshSolution:
-    """One rung's answer.
+    """Solution on one mesh.
 
-    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of
-    how far the forms are apart,
-    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per
-    relative error of the transverse
-    wavenumbers squared of the layer modes, which both forms share. grazing: change of
-    the matrix for what the mesh
-    misplaces cutoffs. beside: how near an order is to its cutoff, see
-    ``match.nearness``. bloch: half the Bloch phase.
-    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where
-    it is, damping of round trips
-    in the layer. energy: mean of both forms. unknowns: of both forms.
+    matrix: (2, 2) zero-order scattering matrix, mean of both forms.
+    waves, rim: half the difference of the forms, by the wavenumbers of the layer modes
+        and beyond.
+    drift: change of the matrix per relative error of the transverse wavenumbers squared
+        of the layer modes, which both forms share.
+    energy: mean of both forms. unknowns: of both forms.
+    grazing: change of the matrix for what the mesh misplaces cutoffs.
+    cutoff: how near an order is to its cutoff, see
+        :func:`metalens.modal.match.cutoff_proximity`.
+    bloch: half the Bloch phase. size: wavelengths in a pitch, in the densest medium.
+    regime_factor: as in :class:`ModalCase`; where it is not 0, damping of round trips
+        in the layer.
     """
 
     matrix: np.ndarray
@@ -107,10 +104,10 @@ class MeshSolution:
     energy: float
     unknowns: int
     grazing: float = 0.0
-    beside: float = 0.0
+    cutoff: float = 0.0
     bloch: float = 0.0
     size: float = 0.0
-    strange: float = 0.0
+    regime_factor: float = 0.0
     damping: float = 1.0
 
     @property
@@ -120,11 +117,14 @@ class MeshSolution:
 
 
 def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
-    """Check a case, and put it into half pitches.
+    """The modal problem of one pillar and plane wave, in half pitches.
+
+    Args:
+        cell: upright round pillar on a square lattice, films allowed.
+        diameter_um: of the pillar. light: with its plane of incidence along an axis.
 
     Raises:
-        CellError: films or a tilted sidewall (``solve`` takes them), a plane of
-            incidence off the lattice axes, an
+        CellError: a tilted sidewall, a plane of incidence off the lattice axes, an
             absorbing half-space, or a diameter out of range.
     """
     diameter_um = float(diameter_um)
@@ -161,7 +161,7 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
 
 
 def plane_of_incidence(light: Incidence) -> str:
-    """The lattice axis, "x" or "y", that the plane of incidence contains.
+    """The lattice axis, "x" or "y", that the plane of incidence of a ``light`` contains.
 
     Raises:
         CellError: a plane off the lattice axes.
@@ -176,7 +176,8 @@ def plane_of_incidence(light: Incidence) -> str:
 
 
 def half_spaces(cell: Cell, light: Incidence) -> tuple[complex, complex]:
-    """Indices of substrate and cover, neither absorbing, with a zero order in both.
+    """Refractive indices of substrate and cover of a ``cell``, neither absorbing, with a
+    zero order of the ``light`` in both.
 
     Raises:
         CellError: says which absorbs, or that the angle is too large.
@@ -196,7 +197,11 @@ def half_spaces(cell: Cell, light: Incidence) -> tuple[complex, complex]:
 
 
 def check_shape(cell: Cell, diameter_um: float) -> None:
-    """Refuse what the elements cannot follow."""
+    """Refuse a ``cell`` or a ``diameter_um`` that the elements cannot follow.
+
+    Raises:
+        CellError: no upright round pillar, or one that touches its neighbours.
+    """
     if not cell.round:
         raise CellError(
             f"the modal engine takes round pillars on a square lattice, not {cell.described}; use metalens.rcwa"

@@ -44,17 +44,22 @@ MOST = 8
 
 @lru_cache(maxsize=4)
 def disc_geometry(rho: float, plan: MeshPlan) -> AssembledDisc:
-    """Matrices of a disc ``rho`` pitches wide on a mesh, kept for the next call."""
+    """Finite-element matrices of a disc ``rho`` pitches wide on the mesh of a ``plan``,
+    cached.
+    """
     return assemble_disc(rho, plan)
 
 
 def homogeneous_basis(
     rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False
 ) -> HomogeneousBasis:
-    """Homogeneous modes of one symmetry class; reused while only wavelength, height and
+    """Homogeneous modes of one symmetry class, cached while only wavelength, height and
     indices change.
 
-    quick: as in ``modes``; nearly uniform gradients then need no care until later.
+    Args:
+        rho: diameter over pitch. plan: of the mesh.
+        electric: whether the y walls are electric. bloch: half the Bloch phase.
+        quick: as in :func:`metalens.modal.homogeneous.homogeneous_modes`.
     """
     small = class_topology(plan, electric, bloch or None).vectors.size <= SMALL
     return (small_cached_basis if small else cached_basis)(
@@ -68,7 +73,9 @@ def homogeneous_basis(
 def cached_basis(
     rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool
 ) -> HomogeneousBasis:
-    """See ``basis``."""
+    """See :func:`homogeneous_basis`, which has the same ``rho``, ``plan``, ``electric``,
+    ``bloch`` and ``quick``.
+    """
     symmetry_class = build_symmetry_class(
         disc_geometry(rho, plan), electric=electric, half_phase_rad=bloch or None
     )
@@ -128,10 +135,16 @@ class FormSolution:
 def layer_between(
     b: HomogeneousBasis, case: ModalCase, *, magnetic: bool, weak: float
 ) -> tuple[np.ndarray, Callable[[HalfSpace, HalfSpace], ScatteringMatch], bool]:
-    """Axial wavenumbers of the carrying modes, the match between half-spaces, and
-    whether it is of the dual unknown.
+    """Axial wavenumbers of the modes that carry light across the layer, and what matches
+    them between half-spaces.
 
-    Few modes where the layer is without loss and thick enough that few carry, else all.
+    Args:
+        b: homogeneous modes. case: the problem. magnetic: the form.
+        weak: modes weaker than this over the height end where they start.
+
+    Returns:
+        (m,) wavenumbers, the match, and whether it is of the dual unknown. Few modes where
+        the layer is without loss and so thick that few carry, else all.
     """
     medium = LayerMedium(case.k0, case.disc, case.around)
     clear = all(complex(e).imag == 0 for e, _ in (*case.under, *case.over))
@@ -157,7 +170,12 @@ def layer_between(
 def solve_form(
     case: ModalCase, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY
 ) -> FormSolution:
-    """One form on one mesh; ``weak`` as in ``evaluate``."""
+    """Zero-order scattering matrix of one variational form on one mesh.
+
+    Args:
+        case: the problem. plan: of the mesh. magnetic: the form.
+        weak: as in :func:`solve_on_mesh`.
+    """
     # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the
     # electric space
     b = homogeneous_basis(
@@ -217,24 +235,27 @@ def solve_form(
         q=q[travelling],
         by_q=match.rate(moved)[:, pair][:, :, pair] * sign,
         grazing=grazing,
-        damping=match.damping if case.strange else 1.0,
+        damping=match.damping if case.regime_factor else 1.0,
     )
 
 
 def solve_on_mesh(
     case: ModalCase, plan: MeshPlan, *, weak: float = CARRY
 ) -> MeshSolution:
-    """Both forms on one mesh.
+    """Zero-order scattering matrix on one mesh: the mean of the electric and magnetic
+    forms, whose errors have opposite tendency.
 
-    weak: modes weaker than this over the height end at the interface they start from,
-    and the matrix root of the
-    others is this accurate.
-    Their difference is split into what the axial wavenumbers explain and the rest, so
-    that the two cannot cancel.
+    Args:
+        case: the problem. plan: of the mesh.
+        weak: modes weaker than this over the height end at the interface they start from;
+            the matrix root of the others is this accurate.
+
+    Returns:
+        The mean, and the difference of the forms, split into what the axial wavenumbers
+        explain and the rest so that the two cannot cancel.
 
     Raises:
-        CellError: a disc so thin or so wide that the matrices of its elements are
-            singular.
+        CellError: a disc so thin or so wide that the matrices of its elements are singular.
     """
     try:
         # matrices of a few hundred rows: on two threads of BLAS a solve takes three to
@@ -270,13 +291,13 @@ def solve_on_mesh(
         energy=(first.energy + second.energy) / 2,
         unknowns=first.unknowns + second.unknowns,
         grazing=max(first.grazing, second.grazing),
-        beside=max(
+        cutoff=max(
             cutoff_proximity(case.k0**2 * e, case.bloch)
             for e in (case.below, case.above)
         ),
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
-        strange=case.strange,
+        regime_factor=case.regime_factor,
         damping=min(first.damping, second.damping),
     )
 
@@ -307,20 +328,20 @@ class RefinementResult:
 
 
 def refine_mesh(case: ModalCase, tolerance: float) -> RefinementResult:
-    """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
+    """Mesh refinement: the cheapest mesh whose error estimate meets the tolerance.
 
-    At sharp resonances both forms may lie together by accident, far from the truth:
-    guided modes of a thin layer of low
-    contrast, pillars that carry many waves, discs of the rarer medium. So cells unlike
-    those of lenses begin two rungs
-    lower, and how the answer settles from mesh to mesh counts (see ``ladder``); two
-    meshes alone tell nothing of them.
+    Cells outside the calibrated regime (``case.regime_factor``) begin two meshes lower,
+    and the change from mesh to mesh counts: at sharp resonances both forms may agree by
+    accident.
+
+    Args:
+        case: the problem. tolerance: of t and r.
     """
     best: RefinementResult | None = None
     solved: list[MeshSolution] = []
     begin = (
         first_rung(tolerance, case.rho) - COMPARED
-        if case.strange
+        if case.regime_factor
         else first_rung(tolerance, case.rho, case.size)
     )
     last: MeshPlan | None = None
@@ -329,7 +350,7 @@ def refine_mesh(case: ModalCase, tolerance: float) -> RefinementResult:
         if plan == last:  # of wide discs, for which two rungs have one mesh
             continue
         solution, last = solve_on_mesh(case, plan, weak=rung.weak), plan
-        known = not case.strange or len(solved) >= COMPARED
+        known = not case.regime_factor or len(solved) >= COMPARED
         error = rung.error(solution, case.rho, solved) if known else 1.0
         solved.append(solution)
         if error <= tolerance and known:
@@ -353,25 +374,28 @@ def solve(
     polarization: Polarization = "x",
     tolerance: float = 1e-3,
 ) -> Response:
-    """Zero-order response of a round pillar by the modal method, exact along z where
-    the wall is upright.
+    """Zero-order transmission and reflection of a round pillar by the modal method: exact
+    along z, curved finite elements across.
 
-    Pillars with tilted walls or films are solved by :func:`metalens.rcwa.solve`.
+    Pillars with tilted walls are solved by :func:`metalens.rcwa.solve`.
 
-    diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx =
-    k0 sin angle), the same in
-    every layer by Snell's law. azimuth_rad: of the plane of incidence, a multiple of
-    pi/2. polarization: "s" or
-    "p", or "x" or "y" for the field along that axis of the plane of incidence.
-    tolerance: of t and r; the mesh is chosen from it and refined until the estimate
-    meets it.
+    Args:
+        cell: round pillar on a square lattice, films allowed.
+        diameter_um: above 0 and below the pitch.
+        wavelength_um: in vacuum.
+        angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in every layer by
+            Snell's law.
+        azimuth_rad: of the plane of incidence, a multiple of pi/2.
+        polarization: "s" or "p", or "x" or "y" for the field along that axis of the plane
+            of incidence.
+        tolerance: of t and r; the mesh is refined until the estimate meets it.
 
-    Accuracy: ``t_error`` holds for r as well where the wall is upright and without
-    films; it comes from the
-        difference of the electric and magnetic forms.
+    Returns:
+        Co-polarised amplitudes; ``t_error`` holds for t and r and comes from the difference
+        of the electric and magnetic forms.
 
     Raises:
-        CellError, MaterialError: see ``case_of``.
+        CellError, MaterialError: see :func:`metalens.modal.case.case_of`.
     """
     check_tolerance(tolerance)
     light = Incidence(

@@ -78,8 +78,14 @@ class RitzVectors:
 def solve_ritz(
     pencil: LayerPencil, trial: RitzVectors, height: float, weak: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Levels (-q²) and vectors (a, c), (b, c) of the modes stronger than ``weak`` over
-    the height.
+    """Rayleigh-Ritz values (-q^2) and vectors of the modes that carry.
+
+    Args:
+        pencil: of the layer. trial: orthonormal vectors of both blocks.
+        height: of the layer. weak: modes weaker than this over the height are left out.
+
+    Returns:
+        Levels (c,) and vectors (a, c), (b, c).
     """
     k = trial.te.shape[1]
     sign = np.concatenate([trial.te_sign, trial.tm_sign])
@@ -116,10 +122,12 @@ def enlarge_trial_space(
     residual: np.ndarray,
     high: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trial vectors and signs of one block with the directions of ``residual`` outside
-    the low levels added.
+    """Davidson step: the trial space of one block with the directions of the residual
+    outside the low levels added.
 
-    high: sign of growth there.
+    Args:
+        trial, sign: vectors, and signs of growth on them. low: levels in the first space.
+        residual: (n, c). high: sign of growth outside the low levels.
     """
     real = (
         np.concatenate([residual.real, residual.imag], 1)
@@ -140,10 +148,12 @@ def enlarge_trial_space(
 def carrying_modes(
     pencil: LayerPencil, height: float, weak: float, accuracy: float
 ) -> tuple[np.ndarray, ...] | None:
-    """Levels and vectors of the modes that carry, or None where they are too many to be
-    few.
+    """Levels and vectors of the modes that carry, by Davidson's method; None where they
+    are too many to be few.
 
-    accuracy: of the vectors, relative.
+    Args:
+        pencil: of the layer, of this ``height``. weak: as in :func:`few_modes`.
+        accuracy: of the vectors, relative.
     """
     reach = SPARE * (math.log(weak) / height) ** 2 + EXTRA
     low_te, low_tm = pencil.te < reach, pencil.tm < reach
@@ -189,13 +199,15 @@ def carrying_modes(
 def matrix_root(
     square: np.ndarray, signs: np.ndarray, least: float, accuracy: float
 ) -> np.ndarray | None:
-    """X with X² = square and eigenvalues in the right half plane, near the root of its
+    """Matrix square root X with eigenvalues in the right half plane, near the root of its
     diagonal; None if it is not.
 
-    signs: of growth, with respect to which the square is symmetric. least: levels of
-    the diagonal below it are
-    lifted to it. In single precision as far as it goes, half the time of double, which
-    ends it where more is asked.
+    In single precision as far as that goes, half the time of double.
+
+    Args:
+        square: X^2. signs: of growth, with respect to which it is symmetric.
+        least: levels of the diagonal below it are lifted to it.
+        accuracy: relative, of the result.
     """
     n = len(square)
     diagonal = np.sqrt(np.maximum(np.diag(square), least))
@@ -227,12 +239,13 @@ def fixed_point(
     *,
     whole: int,
 ) -> np.ndarray | None:
-    """E = rest - weight E² from a start, for ``fixed`` = (rest, weight); None where the
-    steps do not shrink.
+    """Fixed point E = rest - weight E^2; None where the steps do not shrink.
 
-    The rows of the lowest levels converge last: they are watched until they move by
-    less than ``aim``, and after
-    ``whole`` steps go on alone until all rows are worth another.
+    The rows of the lowest levels converge last: they are watched until they move by less
+    than ``aim``, and after ``whole`` steps go on alone until all rows are worth another.
+
+    Args:
+        e: the start. fixed: (rest, weight). signs: of growth.
     """
     rest, weight = fixed
     slow = max(1, len(e) // SLOW)
@@ -260,9 +273,9 @@ def fixed_point(
 
 
 def symmetrize_by_signs(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """A matrix made symmetric with respect to the signs to the last bit: products of
-    some processors are not, and what
-    is left of the difference is light that is lost."""
+    """A matrix ``e`` made symmetric with respect to the ``signs`` to the last bit:
+    products of some processors are not, and the rest is light that is lost.
+    """
     mirror = (signs[:, None] * signs).astype(e.dtype) * e.T
     return np.asarray((e + mirror) / 2)
 
@@ -285,10 +298,12 @@ def symmetric_square(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
 
 
 def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | None:
-    """Modes stronger than ``weak`` over the height, and the admittance of the rest;
+    """Modes of a layer that carry light over its height, and the admittance of the rest;
     None where they are not few.
 
-    weak: the accuracy asked for, relative.
+    Args:
+        pencil: of the layer. height: in half pitches.
+        weak: the accuracy asked for, relative; weaker modes are left out.
     """
     found = carrying_modes(pencil, height, weak, 0.1 * math.sqrt(weak))
     if found is None:

@@ -56,8 +56,11 @@ class HomogeneousBasis:
 
 
 def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
-    """Discrete wavenumbers squared with the zero order's, where this family has it, set
-    to its exact value.
+    """Transverse wavenumbers squared with that of the zero order, where this family has
+    it, set to its exact value.
+
+    Args:
+        discrete: (n,) of the mesh, rising. half_phase_rad: half the Bloch phase, or None.
     """
     exact = (half_phase_rad or 0.0) ** 2
     out: np.ndarray = np.maximum(discrete, 0.0)
@@ -69,14 +72,16 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
 def gradient_modes(
     space: SymmetryClass, lower: np.ndarray, *, careful: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transverse wavenumbers squared and scalar fields of the gradients, and a full
+    """Transverse wavenumbers squared and scalar fields of the gradients (TM), and a full
     orthogonal basis, gradients first.
 
     The basis is in coordinates ``lower.T @ field``, in which the mass matrix is the
-    identity. ``careful`` takes
-    singular values instead of eigenvalues of the squared problem: nearly uniform
-    gradients (grazing the normal)
-    keep all digits, at twice the cost.
+    identity.
+
+    Args:
+        space: the symmetry class. lower: Cholesky factor of its mass.
+        careful: take singular values instead of eigenvalues of the squared problem: nearly
+            uniform gradients keep all digits, at twice the cost.
     """
     g = space.gradient
     if careful:
@@ -103,9 +108,13 @@ def gradient_modes(
 def homogeneous_modes(
     space: SymmetryClass, *, careful: bool = False, quick: bool = False
 ) -> HomogeneousBasis:
-    """TM modes from the gradients, TE modes from their complement; ``careful`` as in
-    ``gradients``, quick as in
-    ``quick_modes``."""
+    """Eigenmodes of the empty cell: TM modes from the gradients, TE modes from their
+    complement.
+
+    Args:
+        space: the symmetry class. careful: as in :func:`gradient_modes`.
+        quick: allow :func:`quick_modes`.
+    """
     if quick and not careful:
         return quick_modes(space)
     lower = np.linalg.cholesky(space.cell.mass)
@@ -125,15 +134,14 @@ def homogeneous_modes(
 
 
 def quick_modes(space: SymmetryClass) -> HomogeneousBasis:
-    """In the basis of cotree unknowns and gradients, where the curl knows the first
-    alone: problems of half the size.
+    """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients, half the
+    time of :func:`homogeneous_modes`.
 
-    With G the gradients, K = Gᵀ mass G, the TM modes solve K f = tm scalar f, and the
-    TE modes are x on the cotree
-    less its projection on the gradients: curl_cc x = te (mass_cc - mass_cG K⁻¹ mass_Gc)
-    x. Half the time; the
-    difference loses digits (1e-8 of t at worst). Of the disc's matrices the rows that
-    are not zero alone are taken.
+    The curl knows the cotree unknowns alone: with G the gradients, K = G^T mass G, the TM
+    modes solve K f = tm scalar f, and the TE modes are x on the cotree less its projection
+    on the gradients: curl_cc x = te (mass_cc - mass_cG K^-1 mass_Gc) x.
+
+    space: the symmetry class. Accuracy: the difference loses digits, 1e-8 of t at worst.
     """
     c, down_to = space.cotree, space.transposed
     corner = c[:, None], c
@@ -186,7 +194,13 @@ def assemble_basis(
     scalar: np.ndarray,
     disc: tuple[np.ndarray, np.ndarray],
 ) -> HomogeneousBasis:
-    """The basis, from its parts; disc: mass and curl of the disc."""
+    """The basis of homogeneous modes from its parts.
+
+    Args:
+        space: the symmetry class. te, tm: transverse wavenumbers squared.
+        vector: makes the fields. scalar: longitudinal fields of the TM modes.
+        disc: mass and curl of the disc in these modes.
+    """
     return HomogeneousBasis(
         te=np.maximum(te, 0.0),
         tm=tm,

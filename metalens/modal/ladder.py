@@ -1,83 +1,30 @@
-"""The ladder of meshes: which one to try first for a tolerance, and how its error is
+"""The sequence of meshes: which one to try first for a tolerance, and how its error is
 estimated.
 
 To first order the error of a scattering matrix S is that of the wavenumbers q_j of the
-layer's modes and that of the
-fields at both ends; g_j is the transverse wavenumber:
+layer's modes and that of the fields at both ends; g_j is the transverse wavenumber:
 
-    dS = sum_j (dS/dq_j) dq_j + (fields at the ends),        dq_j = -(relative error of g_j²) g_j² / (2 q_j).
+    dS = sum_j (dS/dq_j) dq_j + (fields at the ends),
+    dq_j = -(relative error of g_j^2) g_j^2 / (2 q_j).
 
 The electric and the magnetic form are dual: where one overestimates, the other
-underestimates, save for what both
-share. Two real numbers fitted to each of 51 cells, a share of half the difference and a
-common relative error of all
-g_j², leave a tenth of the error of the mean (median). So a solution tells
-(``engine.evaluate``):
+underestimates, but for what both share. A solution therefore tells
 
-    rim      half the difference beyond wavenumbers: fields singular at the rim, where the forms err apart
-    waves    half the difference for wavenumbers, mode by mode: the forms may place a guided wave alike
-    drift    what a relative error of one of all g_j² does: waves on polynomials of degree p err, in both forms, as the
-             2p-th power of the waves in a pitch
+    rim      half the difference beyond wavenumbers: fields singular at the rim
+    waves    half the difference by wavenumbers, mode by mode
+    drift    the change by a relative error of all g_j^2: waves on polynomials of degree
+             p err, in both forms, as the 2p-th power of the waves in a pitch
 
-The factors are those of a mesh and of the width of a disc, the least that hold (linear
-programmes over 290 cells of
-every kind of ``engines``, seeds 4417 and 5531, against finer meshes) times 1.9. With
-the same rim, waves and
-drift, errors still differ by a factor of three, of which a bar has to tell the largest.
+and its error is bounded by a sum of these with the factors of a mesh and a width of the
+disc. The factors are a fit to finer meshes times 1.9; ``python -m benchmarks
+hard_cells`` judges them on fresh cells.
 
-At a sharp resonance first order fails: dS goes as one over what waves in the layer lose
-in a round trip, the least
-singular value of 1 - R exp(iqh) R exp(iqh) (``damping``), and forms may lie together by
-accident, far from the truth.
-Estimates of some hundredths reckon with it (``beyond``). So cells unlike those of
-lenses (``Case.strange``) are judged
-by how the answer moved since two meshes before, in as far as the forms have drawn
-together since (the root of it:
-errors decay no slower), over the damping.
-
-At normal incidence, where every wave loses a tenth and more in a round trip on all
-three meshes, no resonance is
-sharp, and the change needs no damping: it shows how much less the error of the mean is
-than the difference of the
-forms, and what is left in both forms alike is a share of the drift (``Settling``). The
-lesser of both estimates counts.
-On the mesh "even" the factors are three times the least that hold for 257 cells (of
-many waves in a pitch, at cutoffs,
-of low contrast, very tall, low and of other media, seeds 77123, 77124, 551 and 40961,
-against the mesh "finer"). Two
-thirds of them held for 300 others (68117, 90721), the nearest, of more than
-``MOST_WAVES`` or very tall, at 0.97 of the
-bar; as they are the nearest takes half of it. The mesh "good" would gain little. Beside
-a cutoff both forms err alike,
-however near they are, so that the estimate does not apply there (``NEAREST``); discs of
-the rarer medium move there as
-much again as since the last mesh (1 of 317 bars, drawn with seed 514229, was 0.70 of
-the error), which counts in full.
-
-On three other seeds 1157 of 1163 bars of four meshes held at first; with factors
-widened for four (a thin disc in
-steep light, ``slanted``; one of 0.9 pitches; two of many waves in a pitch) all do, the
-nearest at 0.82 of its bar.
-Factors at cutoffs are those of cells drawn there, of meshes finer than "good" the worst
-of 60 cells.
-
-Discs of 0.03 to 0.2 pitches err by 0.45 to 0.54 of ``rim`` and little else, at normal
-incidence: their factors are
-twice those of a linear programme over 130 of them, and held for 59 others drawn more
-widely (0.6 of the bar).
-
-Later draws found bars of the mesh "good" below the error, down to 0.38 of it. The cause
-is its angular degree: of 5, it
-misplaces the first order of an empty cell by 2e-5 of g², both forms alike, where degree
-6 does by 8e-7; discs of more
-than 0.6 pitches (``GOOD_WIDE``), and cells beside a cutoff, answer to it. Discs of 0.3
-to 0.6 pitches leave a wide gap
-besides: an outer degree of 6 (``GOOD_MIDDLE``) takes the error there from 1e-6 to 1e-7.
-An order counts as near its
-cutoff up to two fifths of it, less and less (``match.nearness``): beyond a tenth three
-meshes had bars of 0.82 to
-1.02 of the error. Discs of 0.7 to 0.8 pitches and an index near 2 in such cells set
-what both forms of "fair" share.
+At a sharp resonance first order fails: dS goes as one over the least singular value of
+1 - R exp(iqh) R exp(iqh) (``damping``), and the forms may agree by accident. Cells
+outside the calibrated regime are judged by the change since two coarser meshes, times
+the root of how far the forms have drawn together since, over the damping; where every
+wave loses a tenth in a round trip the change needs no damping (:class:`DampedEstimate`).
+Near a cutoff both forms err alike: factors rise, less and less up to two fifths from it.
 """
 
 import math
@@ -117,7 +64,7 @@ class ErrorFactors:
 
     def bound(self, found: MeshSolution, before: Sequence[MeshSolution] = ()) -> float:
         """Error estimate of a solution, after the meshes ``before``."""
-        near = self.at_cutoff * found.beside
+        near = self.at_cutoff * found.cutoff
         waves = max(self.waves, near, self.slanted if found.bloch > 0 else 0.0)
         shared = self.flat + self.oblique * (found.bloch > 0)
         shared += self.steep * (found.size / SIZE) ** STEEP
@@ -127,8 +74,8 @@ class ErrorFactors:
         change = self.moved * max(
             (damped_change(found, one) for one in before[-COMPARED:]), default=0.0
         )
-        if before and found.strange >= RARER:
-            change = max(change, ALIKE * found.beside * mesh_change(found, before[-1]))
+        if before and found.regime_factor >= RARER:
+            change = max(change, ALIKE * found.cutoff * mesh_change(found, before[-1]))
         return parts + self.grazing * found.grazing + change
 
 
@@ -150,8 +97,10 @@ class DampedEstimate:
         """Error estimate; infinite where it does not apply."""
         meshes = (*before[-COMPARED:], found)
         damped = min(one.damping for one in meshes) >= DAMPED
-        beyond_it = found.bloch > 0 or found.strange >= RARER or found.size > MOST_WAVES
-        if len(meshes) <= COMPARED or not damped or beyond_it or found.beside > NEAREST:
+        beyond_it = (
+            found.bloch > 0 or found.regime_factor >= RARER or found.size > MOST_WAVES
+        )
+        if len(meshes) <= COMPARED or not damped or beyond_it or found.cutoff > NEAREST:
             return math.inf
         change = max(contracted_change(found, one) for one in meshes[:-1])
         return (
@@ -177,10 +126,9 @@ class MeshChoice:
 class MeshLevel:
     """Meshes of one accuracy, thinnest disc first.
 
-    usual: the estimate that most pillars of many waves in a pitch end with. alone:
-    factors for cells unlike those of
-    lenses, by this mesh alone, times how unlike they are. settling: of these cells
-    after two meshes.
+    usual: the estimate that most pillars of many waves in a pitch end with.
+    alone: factors outside the calibrated regime, by this mesh alone.
+    settling: estimate outside the regime after two coarser meshes.
     """
 
     name: str
@@ -208,19 +156,21 @@ class MeshLevel:
         *,
         mesh: MeshChoice | None = None,
     ) -> float:
-        """Error estimate of the mean of both forms.
+        """Error estimate of the mean of both forms, of t and r.
 
-        before: solutions on coarser meshes, which cells unlike those of lenses are
-            judged by where there are any.
-        mesh: what was solved on; where that is not the rung's own for the diameter, the
-            wider of both estimates counts.
+        Args:
+            found: the solution. rho: diameter over pitch.
+            before: solutions on coarser meshes, which cells outside the calibrated
+                regime are judged by where there are any.
+            mesh: what was solved on; where that is not the level's own for the diameter,
+                the wider of both estimates counts.
         """
-        if found.strange and before:
+        if found.regime_factor and before:
             bound = self.choice(rho).after.bound(found, before)
             if self.settling:
                 bound = min(bound, self.settling.bound(found, before))
-        elif found.strange:
-            bound = found.strange * self.alone.bound(found)
+        elif found.regime_factor:
+            bound = found.regime_factor * self.alone.bound(found)
         else:
             own = self.choice(rho)
             judges = (own, mesh) if mesh and mesh.plan != own.plan else (own,)
@@ -233,18 +183,16 @@ def second_order_bound(first: float) -> float:
     """An estimate of first order with the orders beyond it: at most twice as much, or
     twice ``RESONANT``.
 
-    Beside a resonance of amplitude a, S changes by a / (1 - x) - a = first / (1 - first
-    / a) for a shift of x of the
-    way to it, with first = a x. Of silicon discs in oblique light one error of 0.052
-    had an estimate of 0.038.
+    Near a resonance of amplitude a, S changes by a / (1 - x) - a = first / (1 - first / a)
+    for a shift of x of the way to it, with ``first`` = a x.
     """
     whole = first / max(0.5, 1 - first / RESONANT)
     return max(first, min(whole, 2 * RESONANT))
 
 
 def damped_change(found: MeshSolution, before: MeshSolution) -> float:
-    """:func:`contracted_change` over the damping: at most ``AMPLIFIED`` times the
-    change.
+    """Change ``found`` made since the mesh ``before`` (:func:`contracted_change`) over the
+    damping of round trips: at most ``AMPLIFIED`` times the change.
     """
     most = AMPLIFIED * mesh_change(found, before)
     return min(
@@ -253,15 +201,17 @@ def damped_change(found: MeshSolution, before: MeshSolution) -> float:
 
 
 def contracted_change(found: MeshSolution, before: MeshSolution) -> float:
-    """Change since a mesh before, times the root of how far the forms have drawn
-    together since.
+    """Change ``found`` made since a mesh ``before``, times the root of how far the forms
+    have drawn together since: errors decay no slower.
     """
     together = min(1.0, found.spread / before.spread) if before.spread > 0 else 1.0
     return mesh_change(found, before) * math.sqrt(together)
 
 
 def mesh_change(found: MeshSolution, before: MeshSolution) -> float:
-    """Largest change of an element of the matrix since a mesh before."""
+    """Largest change of an element of the scattering matrix ``found`` since a mesh
+    ``before``.
+    """
     return float(np.abs(found.matrix - before.matrix).max())
 
 
@@ -281,7 +231,7 @@ RESONANT = 0.1
 # tells
 MOST_WAVES = 2.5
 DAMPED = 0.1  # of a wave in a round trip: where each loses more, no resonance is sharp
-# of ``beside``: nearer to a cutoff both forms err alike, by up to nine times half their
+# of ``cutoff``: nearer to a cutoff both forms err alike, by up to nine times half their
 # difference
 NEAREST = 0.5
 ALIKE = 1.5  # of the last change, of discs of the rarer medium at a cutoff
@@ -551,12 +501,12 @@ RUNGS = (
 
 
 def first_rung(tolerance: float, rho: float | None = None, size: float = LARGE) -> int:
-    """Index of the coarsest mesh that usually meets the tolerance: for discs of ``rho``
-    pitches, or for most.
+    """Index of the coarsest mesh that usually meets a tolerance.
 
-    size: waves in a pitch, of cells like those of lenses. Of 70 at normal incidence
-    estimates fell as the third power
-    of it on the coarse meshes, and faster on the mesh "good".
+    Args:
+        tolerance: of t and r. rho: diameter in pitches; None: of most pillars.
+        size: waves in a pitch of a cell in the calibrated regime; estimates fall as the
+            third power of it.
     """
     fewer = min(1.0, size / LARGE) ** FALL
 

@@ -56,14 +56,20 @@ class LayerModes:
 
 
 def axial_wavenumber(square: np.ndarray) -> np.ndarray:
-    """The root of q² that decays upwards, or goes up where it does neither."""
+    """Square root q of q^2 (``square``) that decays upwards, or goes up where it does
+    neither.
+    """
     q = np.sqrt(square + 0j)
     flip = (q.imag < 0) | ((np.abs(q.imag) <= 1e-9 * np.abs(q)) & (q.real < 0))
     return np.where(flip, -q, q)
 
 
 def electric_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
-    """Layer modes for u = E_t."""
+    """Layer modes for u = E_t by a dense eigensolver.
+
+    Args:
+        basis: homogeneous modes. medium: wavenumber and permittivities.
+    """
     disc, around = medium.permittivities()
     n, a, k0 = basis.size, len(basis.te), medium.k0
     scale = k0 / np.sqrt(basis.tm)
@@ -89,7 +95,11 @@ def electric_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
 
 
 def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
-    """Layer modes for u = H_t."""
+    """Layer modes for u = H_t by a dense eigensolver.
+
+    Args:
+        basis: homogeneous modes. medium: wavenumber and permittivities.
+    """
     disc, around = (1 / e for e in medium.permittivities())
     n, a, k0 = basis.size, len(basis.te), medium.k0
     scale = k0 / np.sqrt(basis.tm)

@@ -125,12 +125,13 @@ def half_space(
 
 def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the
-    lattice has them.
+    lattice has them: (bloch + pi m)^2 + (pi n)^2, each the nearest.
 
-    Near its cutoff an order's admittance is the root of a small difference, in which
-    the error of the mesh weighs as
-    one over the axial wavenumber. The exact values are (bloch + pi m)² + (pi n)²; each
-    takes the nearest.
+    Near its cutoff an order's admittance is the root of a small difference, in which the
+    error of the mesh weighs as one over the axial wavenumber.
+
+    Args:
+        square: of the mesh. cutoff: k0^2 times the permittivity. bloch: kx.
     """
     close = np.flatnonzero(
         (np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9))
@@ -146,11 +147,11 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
 
 
 def cutoff_proximity(cutoff: float, bloch: float) -> float:
-    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over
-    the distance, to 0 at ``NEAR``.
+    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over the
+    distance, to 0 at ``NEAR``.
 
-    An admittance answers to the error of a wavenumber squared as one over its distance
-    from the cutoff.
+    Args:
+        cutoff: k0^2 times the permittivity. bloch: kx.
     """
     exact = lattice_wavenumbers(cutoff, bloch)
     apart = float(np.abs(exact[exact > bloch**2 * (1 + 1e-9)] / cutoff - 1).min())
@@ -190,7 +191,11 @@ class LayerInterface:
 def layer_interface(
     layer: LayerModes, carry: np.ndarray, half: HalfSpace
 ) -> LayerInterface:
-    """Blocks at a half-space, from all modes of the layer."""
+    """Blocks of the scattering at a half-space, from all modes of the layer.
+
+    Args:
+        layer: modes. carry: places of those that travel. half: the half-space.
+    """
     ports = half.ports
     rate, c = 1j * layer.q, len(carry)
     columns = np.concatenate(
@@ -213,8 +218,11 @@ def layer_interface(
 def few_interface(
     pencil: LayerPencil, modes: FewModes, half: HalfSpace
 ) -> LayerInterface:
-    """Blocks at a half-space, from the modes that carry and the real admittance of all
-    others.
+    """Blocks of the scattering at a half-space, from the modes that carry and the real
+    admittance of all others.
+
+    Args:
+        pencil: of the layer. modes: those that carry. half: the half-space.
     """
     half = half.dual if pencil.dual else half
     near, ports = half.real_admittance(dual=pencil.dual), half.ports
@@ -294,11 +302,11 @@ class InterfaceRates:
 def correct_stand_ins(
     green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: InterfaceRates
 ) -> LayerInterface:
-    """Blocks from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports,
-    its stand-ins put right.
+    """Blocks from (Y_layer + Y_half)^-1 with its real stand-ins corrected (Woodbury).
 
-    green: of partners and ports with the solution; inward: the solution; norm: partners
-    with fields.
+    Args:
+        green: of partners and ports with the solution; inward: the solution.
+        norm: partners with fields. rates: true values and stand-ins.
     """
     c, m = len(rates.mode), len(green)
     port = rates.half.admittance[rates.half.ports]
@@ -379,8 +387,11 @@ def exchange_waves(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarr
 def scattering_matrix(
     layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
 ) -> ScatteringMatch:
-    """Match both ends of all modes: the matrix is symmetric, and unitary where
-    lossless.
+    """Scattering matrix of a layer between half-spaces, from all its modes: symmetric, and
+    unitary where lossless.
+
+    Args:
+        layer: modes. height: of the layer. below, above: half-spaces.
     """
     travel = np.exp(1j * layer.q * height)
     carry = np.flatnonzero(np.abs(travel) > CARRY)
@@ -399,10 +410,11 @@ def few_scattering(
     below: HalfSpace,
     above: HalfSpace,
 ) -> ScatteringMatch:
-    """As ``scattering``, from few modes; ``carry`` counts them, and ``inward`` is in
-    the pencil's coordinates.
-    A dual unknown inverts the admittances of the half-spaces, and the reflection
-    changes its sign.
+    """As :func:`scattering_matrix`, from few modes; ``carry`` counts them, and ``inward``
+    is in the pencil's coordinates.
+
+    Args:
+        pencil, modes: of the layer. height: of the layer. below, above: half-spaces.
     """
     foot, top = few_interface(pencil, modes, below), few_interface(pencil, modes, above)
     return join_interfaces(
@@ -413,7 +425,12 @@ def few_scattering(
 def join_interfaces(
     foot: LayerInterface, top: LayerInterface, carry: np.ndarray, x: np.ndarray
 ) -> ScatteringMatch:
-    """Round trips of the carrying modes, with factors x, between both interfaces."""
+    """Scattering matrix of a layer from both its interfaces, by the round trips of the
+    carrying modes.
+
+    Args:
+        foot, top: interfaces. carry: places of the modes. x: (c,) factors exp(iqh).
+    """
     c, n = len(carry), len(foot.back)
     round_trip = np.eye(2 * c) - exchange_waves(foot.reflect, top.reflect, x)
     source = np.zeros((2 * c, n + len(top.back)), complex)
@@ -428,7 +445,13 @@ def join_interfaces(
 def zero_order(
     basis: HomogeneousBasis, half: HalfSpace, wavenumber: float, *, te: bool
 ) -> int:
-    """Position among the ports of the order with the given transverse wavenumber."""
+    """Position among the ports of a half-space of the order with a given transverse
+    wavenumber.
+
+    Args:
+        basis: homogeneous modes. half: the half-space.
+        wavenumber: of the order. te: its family.
+    """
     a = len(basis.te)
     family = basis.te_exact if te else basis.tm_exact
     mode = int(np.argmin(np.abs(family - wavenumber**2))) + (0 if te else a)

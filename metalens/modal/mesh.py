@@ -191,15 +191,18 @@ def core_vertex(i: int, j: int, n: int) -> Vertex:
 
 
 def ring_vertex(side: str, ring: int, j: int, n: int) -> Vertex:
-    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above); both
-    sides share the diagonal.
+    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above) with n
+    sectors; both sides share the diagonal. ring: from the core.
     """
     return ("diagonal", ring, 0) if j == n else (side, ring, j)
 
 
 def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
-    """Bilinear quadrilateral with corners (0, 0), (a, 0), (c, c), (0, a), cut along
-    both parameters.
+    """Core of the disc: a bilinear quadrilateral with corners (0, 0), (a, 0), (c, c),
+    (0, a), cut along both parameters.
+
+    Args:
+        plan: of the mesh. numbers: hands out global numbers.
     """
     a = plan.core
     excess = 0.8 * a - a
@@ -239,8 +242,11 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
 
 
 def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start and end curve of a ring stack at fraction v of 45 degrees, as P and Q
-    parts, each with its derivative.
+    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as parts P
+    and Q of rho P + Q, each with its derivative.
+
+    Args:
+        plan: of the mesh. inside: whether the rings lie in the disc.
     """
     phi, rate = v * math.pi / 4, math.pi / 4
     circle = np.stack([np.cos(phi), np.sin(phi)], -1)
@@ -263,8 +269,12 @@ def ring_patch(
     inside: bool,
     radial: IntervalBasis,
 ) -> MeshPatch:
-    """Elements of the given rings (counted from the core), both sides; the Jacobians
-    are those of side A.
+    """Elements of some rings, both sides; the Jacobians are those of side A.
+
+    Args:
+        plan: of the mesh. numbers: hands out global numbers.
+        rings: counted from the core. inside: whether they lie in the disc.
+        radial: basis along the radius.
     """
     ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
     first = 0 if inside else len(plan.inner)

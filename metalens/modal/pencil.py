@@ -104,9 +104,7 @@ class LayerPencil:
 
 
 def is_lossless(medium: LayerMedium) -> bool:
-    """Whether the layer is one of positive real permittivities, as the definite blocks
-    need.
-    """
+    """Whether a ``medium`` has positive real permittivities, as the definite blocks need."""
     return all(
         e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around))
     )
@@ -130,8 +128,11 @@ def low_levels(
 
 
 def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil:
-    """u = E_t: growth = diag(1, (scalar_eps⁻¹ tm / k0² - 1)⁻¹ negative), stiffness =
-    curl - k0² mass_eps.
+    """Block-diagonalised equation of the layer for u = E_t: growth = diag(1, (scalar_eps^-1
+    tm / k0^2 - 1)^-1 negative), stiffness = curl - k0^2 mass_eps.
+
+    Args:
+        basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
     """
     around = float(medium.around.real)
     a, b, k2, step = (
@@ -163,8 +164,11 @@ def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
 
 
 def magnetic_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil:
-    """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ -
-    diag(0, tm / k0²).
+    """Block-diagonalised equation of the layer for the dual unknown of u = H_t: growth =
+    stiffness^-1, stiffness = mass_(1/eps)^-1 - diag(0, tm / k0^2).
+
+    Args:
+        basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
     """
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
     a, b, k2 = len(basis.te), len(basis.tm), medium.k0**2

@@ -47,14 +47,14 @@ class IntervalBasis:
 
 
 def gauss_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre points and weights on [0, 1]."""
+    """Gauss-Legendre quadrature: ``n`` points and weights on [0, 1]."""
     x, w = np.polynomial.legendre.leggauss(n)
     return (x + 1) / 2, w / 2
 
 
 def graded_rule(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rule on [0, 1] for integrands that are polynomials of ``s**(1 / RIM_POWER)``
-    and vary smoothly in s.
+    """Quadrature of ``n`` points on [0, 1] for integrands that are polynomials of
+    ``s**(1 / RIM_POWER)`` and vary smoothly in s.
     """
     t, w = gauss_rule(n)
     return t**RIM_POWER, w * RIM_POWER * t ** (RIM_POWER - 1)
@@ -74,7 +74,9 @@ def polynomial_basis(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @lru_cache(maxsize=64)
 def polynomial_interval(degree: int, points: int) -> IntervalBasis:
-    """Polynomials only, on a Gauss rule."""
+    """Integrated Legendre polynomials up to a ``degree`` on a Gauss rule of so many
+    ``points``.
+    """
     s, w = gauss_rule(points)
     return IntervalBasis(s, w, *polynomial_basis(degree, s))
 
@@ -83,11 +85,15 @@ def polynomial_interval(degree: int, points: int) -> IntervalBasis:
 def rim_interval(
     degree: int, points: int, exponents: tuple[float, ...], at_end: bool
 ) -> IntervalBasis:
-    """Polynomials and rim bubbles ``d**tau - d``, d the distance to s = 0, or to s = 1
-    if ``at_end``.
+    """Polynomials and singular functions ``d**tau - d``, d the distance to s = 0, or to
+    s = 1 if ``at_end``.
 
-    The slope of each bubble is made orthonormal to the slopes before it, which keeps
-    the matrices well conditioned.
+    The slope of each singular function is made orthonormal to the slopes before it, which
+    keeps the matrices well conditioned.
+
+    Args:
+        degree: of the polynomials. points: of the graded rule.
+        exponents: tau of each function. at_end: where they are singular.
     """
     d, w = graded_rule(points)
     value, slope = polynomial_basis(degree, 1 - d if at_end else d)
@@ -144,8 +150,8 @@ def derivative_matrix(degree: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
-    """The element basis made of two interval bases; vector functions along xi come
-    first.
+    """Curl-conforming element basis made of interval bases ``xi`` and ``eta``; vector
+    functions along xi come first.
     """
 
     def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

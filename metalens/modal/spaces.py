@@ -77,6 +77,10 @@ def select_functions(
 ) -> FunctionSelection:
     """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with
     electric x walls for None.
+
+    Args:
+        wall: bits of each function. electric: whether the y walls are electric.
+        half_phase_rad: phase over half a pitch.
     """
     free = (wall & (Y0 | Y1)) == 0 if electric else np.ones(len(wall), bool)
     at_start, at_end = (wall & X0) != 0, (wall & X1) != 0
@@ -98,9 +102,11 @@ def select_functions(
 def restrict_matrix(
     matrix: np.ndarray, rows: FunctionSelection, columns: FunctionSelection
 ) -> np.ndarray:
-    """The quarter-cell matrix acting on the real and imaginary parts of the unknowns.
+    """A quarter-cell matrix acting on the real and imaginary parts of the unknowns.
 
-    The half phase enters by the weights at x = pitch / 2.
+    Args:
+        matrix: of the functions. rows, columns: unknowns; the half phase enters by the
+            weights at x = pitch / 2.
     """
     picked = matrix.take(rows.order, 0).take(columns.order, 1)
     if not rows.periodic:
@@ -160,7 +166,13 @@ class ClassTopology:
 def class_topology(
     plan: MeshPlan, electric: bool, half_phase_rad: float | None
 ) -> ClassTopology:
-    """See ``Topology``; cached, as it does not depend on the diameter."""
+    """Unknowns and gradient of a symmetry class, which do not depend on the diameter;
+    cached.
+
+    Args:
+        plan: of the mesh. electric: whether the y walls are electric.
+        half_phase_rad: Bloch phase over half a pitch, or None.
+    """
     mesh = build_mesh(plan)
     vectors = select_functions(
         mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad
@@ -181,8 +193,12 @@ def class_topology(
 def cotree_functions(
     plan: MeshPlan, electric: bool, half_phase_rad: float | None
 ) -> np.ndarray:
-    """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a
-    phase.
+    """Unknowns off a spanning tree, by pivoted elimination of the gradients, once for a
+    mesh and a phase.
+
+    Args:
+        plan: of the mesh. electric: whether the y walls are electric.
+        half_phase_rad: Bloch phase over half a pitch, or None.
     """
     known = class_topology(plan, electric, half_phase_rad)
     size = np.sqrt(
@@ -199,8 +215,11 @@ def cotree_functions(
 def build_symmetry_class(
     geometry: AssembledDisc, *, electric: bool, half_phase_rad: float | None
 ) -> SymmetryClass:
-    """The symmetry class with electric or natural y walls, and the given Bloch phase
-    over half a pitch.
+    """Matrices of a symmetry class of one disc.
+
+    Args:
+        geometry: assembled disc. electric: whether the y walls are electric, else natural.
+        half_phase_rad: Bloch phase over half a pitch, or None.
     """
     plan = geometry.mesh.plan
     known = class_topology(plan, electric, half_phase_rad)

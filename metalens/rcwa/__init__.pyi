@@ -10,7 +10,6 @@ from .solver import JonesResponse as JonesResponse
 from .solver import jones as jones
 from .solver import most_harmonics as most_harmonics
 from .solver import solve as solve
-from .solver import solve_many as solve_many
 from .solver import solve_truncation as solve_truncation
 from .supercell import RowResponse as RowResponse
 from .supercell import block_of as block_of

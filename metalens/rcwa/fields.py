@@ -147,7 +147,7 @@ class _Stack:
     def indices(self, z_um: Array) -> Array:
         """(nz,) 0 for the substrate, then the slabs, last the cover."""
         on = _ON * (self.ends[-1] - self.ends[0])
-        return np.searchsorted(self.ends, self.k0 * z_um + on, side="right")
+        return np.asarray(np.searchsorted(self.ends, self.k0 * z_um + on, "right"))
 
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
         """For substrate, slabs and cover: eps (ny, nx), and N n n^T of (2) as (xx, yy,

@@ -132,10 +132,9 @@ def normal_tables(
         flips: mirrors (sx, sy) that outlines and lattice share; None: those that the
             outlines have.
     """
-    if _is_centred_disc(outlines, cell):
-        return _disc_normal_tables(
-            outlines[0].parts[0].half_x_um / cell.pitch_um, reach
-        )  # type: ignore[union-attr]
+    radius_um = _disc_radius_um(outlines, cell)
+    if radius_um:
+        return _disc_normal_tables(radius_um / cell.pitch_um, reach)
     most = tuple(_KEPT * math.ceil(2 * r / _KEPT) for r in reach)
     rows, columns = (
         slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True)
@@ -145,17 +144,14 @@ def normal_tables(
     return xx, yy, xy
 
 
-def _is_centred_disc(outlines: tuple[Outline, ...], cell: Cell) -> bool:
-    """Whether the section is one disc on a square lattice."""
-    if len(outlines) > 1 or len(outlines[0].parts) > 1:
-        return False
+def _disc_radius_um(outlines: tuple[Outline, ...], cell: Cell) -> float:
+    """Radius of a section that is one disc on a square lattice, else 0."""
+    if len(outlines) > 1 or len(outlines[0].parts) > 1 or cell.lattice.kind != "square":
+        return 0.0
     part = outlines[0].parts[0]
-    return (
-        cell.lattice.kind == "square"
-        and isinstance(part, EllipseArc)
-        and part.half_x_um == part.half_y_um
-        and part.centre_um == (0.0, 0.0)
-    )
+    if not isinstance(part, EllipseArc) or part.half_x_um != part.half_y_um:
+        return 0.0
+    return part.half_x_um if part.centre_um == (0.0, 0.0) else 0.0
 
 
 def _disc_normal_tables(

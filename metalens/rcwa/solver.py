@@ -8,7 +8,6 @@ face of the films under it) to its top; time factor exp(-iwt).
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -322,15 +321,6 @@ def solve(
         found.converged,
         found.reason,
     )
-
-
-def solve_many(
-    cell: Cell, diameter_um: Iterable[float], wavelength_um: float, **options: object
-) -> list[Response]:
-    """RCWA of several pillars, one after another: :func:`solve` of a ``cell`` for each
-    ``diameter_um`` at one ``wavelength_um``, with its other ``options``.
-    """
-    return [solve(cell, d, wavelength_um, **options) for d in diameter_um]  # type: ignore[arg-type]
 
 
 def jones(

@@ -82,7 +82,9 @@ class RowBlock:
 
 
 def block_of(pitch_um: float, diagonal: bool) -> RowBlock:
-    """The square that repeats along a row of a square lattice."""
+    """The square that repeats along a row of a square lattice of ``pitch_um``, or along its
+    ``diagonal``.
+    """
     return RowBlock(math.sqrt(2) * pitch_um, 2) if diagonal else RowBlock(pitch_um, 1)
 
 

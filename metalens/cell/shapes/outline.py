@@ -298,7 +298,7 @@ class Outline:
 
 
 def offset_corners(corners: Array, grow_um: float) -> tuple[Point, ...]:
-    """Corners of the polygon whose edges lie ``grow_um`` / 2 further out, mitred.
+    """``corners`` of the polygon whose edges lie ``grow_um`` / 2 further out, mitred.
 
     Raises:
         CellError: so far in that an edge vanishes.
@@ -317,7 +317,7 @@ def offset_corners(corners: Array, grow_um: float) -> tuple[Point, ...]:
 
 
 def rotate_corners(corners: Array, angle_rad: float) -> Array:
-    """(n, 2) corners turned from +x towards +y."""
+    """(n, 2) ``corners`` turned by ``angle_rad`` from +x towards +y."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.asarray(corners @ np.array([[c, s], [-s, c]]))
 

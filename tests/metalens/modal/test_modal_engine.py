@@ -3,7 +3,6 @@ methods.
 """
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from metalens import modal, rcwa
 from metalens.cell.light import Incidence
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import CellError
-from metalens.modal import engine
 from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
 from metalens.modal.engine import geometric_mean, nearest_pairs, solve_on_mesh
@@ -31,90 +29,6 @@ def cell(height=0.7, n=3.6, k=0.0, pitch=0.4, substrate=1.4525, cover=1.0, betwe
     return Cell(
         pitch, height, Index(n, k), Index(substrate), Index(cover), Index(between)
     )
-
-
-def rungs(errors, plans=None, told=None):
-    """Meshes with their estimates typed in; those before are told."""
-
-    def one(n, estimate):
-        def error(solution, rho, before):
-            (told if told is not None else []).append((solution, rho, list(before)))
-            return estimate
-
-        plan = n if plans is None else plans[n]
-        return SimpleNamespace(
-            name=f"n{n}",
-            weak=0.1 * n,
-            choice=lambda rho: SimpleNamespace(plan=plan),
-            error=error,
-        )
-
-    return tuple(one(n, estimate) for n, estimate in enumerate(errors))
-
-
-@pytest.mark.parametrize(
-    ("strange", "tolerance", "errors", "last", "error"),
-    [
-        (
-            False,
-            0.03,
-            (0.9, 0.9, 0.9, 0.9, 0.02, 0.01),
-            4,
-            0.02,
-        ),  # 3 is where it begins
-        (
-            True,
-            0.03,
-            (0.9, 1e-9, 1e-9, 0.7, 0.02, 0.01),
-            4,
-            0.02,
-        ),  # from 1 on; the first two tell nothing
-        (
-            True,
-            0.03,
-            (0.9, 1e-9, 1e-9, 0.7, 0.8, 0.75),
-            3,
-            0.7,
-        ),  # none meets it: the least of those that tell
-        (False, 0.02, (0.9, 0.9, 0.9, 0.9, 0.02, 0.01), 4, 0.02),
-    ],
-)
-def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
-    monkeypatch, strange, tolerance, errors, last, error
-):
-    told = []
-    begun = (tolerance, 0.4) if strange else (tolerance, 0.4, 1.7)
-    monkeypatch.setattr(engine, "RUNGS", rungs(errors, told=told))
-    monkeypatch.setattr(engine, "first_rung", lambda *asked: 3 if asked == begun else 5)
-    monkeypatch.setattr(
-        engine, "solve_on_mesh", lambda case, plan, weak: (plan, round(10 * weak))
-    )
-    made = engine.refine_mesh(
-        SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance
-    )
-    assert (made.solution, made.rung.name, made.error) == (
-        (last, last),
-        f"n{last}",
-        error,
-    )
-    assert made.converged is (error <= tolerance)
-    assert ("meets" in made.reason) is made.converged
-    first = 1 if strange else 3
-    for (n, _), rho, before in told:  # of each mesh all that were solved before it
-        assert rho == 0.4
-        assert before == [(m, m) for m in range(first, n)]
-
-
-def test_a_mesh_that_is_the_one_before_is_not_solved_again(monkeypatch):
-    solved = []
-    monkeypatch.setattr(engine, "RUNGS", rungs((0.9, 0.5, 0.01, 0.2), plans="aabb"))
-    monkeypatch.setattr(engine, "first_rung", lambda *asked: 0)
-    monkeypatch.setattr(
-        engine, "solve_on_mesh", lambda case, plan, weak: solved.append(plan) or plan
-    )
-    made = engine.refine_mesh(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
-    assert solved == ["a", "b"]
-    assert (made.solution, made.error) == ("b", 0.01)
 
 
 def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):

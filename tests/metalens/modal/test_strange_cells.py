@@ -378,7 +378,7 @@ def test_cells_of_damped_waves_have_bars_of_three_errors_from_how_the_answer_set
     if settles:
         assert 2 * error < bar < 3.7 * error
     else:
-        assert found.beside > NEAREST
+        assert found.cutoff > NEAREST
         assert bar == pytest.approx(
             usual, rel=1e-9
         )  # but for what no mesh tells, 1e-12
@@ -441,8 +441,8 @@ def case(**other):
         ({"around": 2.53, "above": 2.2}, 0.0),
     ],
 )
-def test_what_is_unlike_the_cells_of_lenses(other, want):
-    assert case(**other).strange == want
+def test_cells_outside_the_calibrated_regime(other, want):
+    assert case(**other).regime_factor == want
 
 
 def test_the_bar_of_coupled_waves_holds_for_what_a_black_layer_reflects():

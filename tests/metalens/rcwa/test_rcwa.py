@@ -304,7 +304,7 @@ MODAL_CELLS = [
 
 @pytest.mark.parametrize(("cell", "wavelength_um", "values"), MODAL_CELLS)
 def test_error_and_estimate_against_the_modal_method(cell, wavelength_um, values):
-    results = rcwa.solve_many(cell, values, wavelength_um, harmonics=10)
+    results = [rcwa.solve(cell, d, wavelength_um, harmonics=10) for d in values]
     error = np.abs(
         [got.t - want for got, want in zip(results, values.values(), strict=True)]
     )
@@ -323,7 +323,7 @@ def test_a_hundredth_is_reached_over_the_whole_range(cell, wavelength_um, values
         else {}
     )
     wanted = values | extra
-    results = rcwa.solve_many(cell, wanted, wavelength_um, harmonics=16)
+    results = [rcwa.solve(cell, d, wavelength_um, harmonics=16) for d in wanted]
     error = np.abs(
         [got.t - want for got, want in zip(results, wanted.values(), strict=True)]
     )
@@ -334,7 +334,7 @@ def test_a_hundredth_is_reached_over_the_whole_range(cell, wavelength_um, values
 def test_errors_fall_as_the_square_of_the_truncation():
     error = {}
     for harmonics in (5, 10):
-        results = rcwa.solve_many(CELL, MODAL_850, 0.85, harmonics=harmonics)
+        results = [rcwa.solve(CELL, d, 0.85, harmonics=harmonics) for d in MODAL_850]
         error[harmonics] = np.median(
             np.abs(
                 [
@@ -386,16 +386,6 @@ def test_a_loose_tolerance_stops_early_and_a_tight_one_is_honest():
     assert not stuck.converged
     assert stuck.t_error > 1e-8
     assert "above the tolerance" in stuck.reason
-
-
-def test_many_diameters_are_what_each_one_is_alone():
-    many = rcwa.solve_many(CELL, [0.0, 0.1, 0.25], WAVELENGTH, tolerance=0.1)
-    for diameter, got in zip([0.0, 0.1, 0.25], many, strict=True):
-        alone = rcwa.solve(CELL, diameter, WAVELENGTH, tolerance=0.1)
-        assert (
-            abs(alone.t - got.t) < 1e-10
-        )  # eigenvalues of matrices side by side: 2e-12 on one processor
-        assert alone.orders == got.orders
 
 
 def plain_slices(cell, diameter_um, harmonics, slices):
