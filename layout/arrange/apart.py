@@ -54,6 +54,9 @@ def reach_um(process: Process) -> float:
 
     The half-plane gives sum w/2 erfc(d / a) of the exposure of its own middle, and
     dose-to-size is half of that.
+
+    Args:
+        process: with the point exposure and its tolerance.
     """
     if not process.exposure.corrected:
         return 0.0
@@ -81,6 +84,10 @@ def check_separation(
     (squares of a 64th of the
     lattice), any other shape as boxes around slices of it (5 um high, or a 64th).
 
+    Args:
+        placed: parts on the die.
+        process: rules and exposure.
+
     Raises:
         ProcessError: more than 4000 parts on the die.
     """
@@ -107,6 +114,9 @@ def extent_of_copies(
 ) -> Array:
     """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``:
     of what is exposed alone.
+
+    Args:
+        placed: parts on the die.
     """
     made = []
     for one in standing_parts(placed):

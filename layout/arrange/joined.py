@@ -193,6 +193,7 @@ def place_fields(
 
     Args:
         splits: fields of each lens about its axis, by the name of its part.
+        placed: parts on the die.
     """
     for one in placed:
         if one.part.name not in splits:
@@ -221,7 +222,12 @@ def place_fields(
 def without_fields(
     placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
 ) -> list[str]:
-    """Lenses with copies whose write fields would not lie along x and y, by name."""
+    """Lenses with copies whose write fields would not lie along x and y, by name.
+
+    Args:
+        placed: parts on the die.
+        splits: fields of each lens, by the name of its part.
+    """
     return [
         one.part.name
         for one in placed
@@ -231,7 +237,11 @@ def without_fields(
 
 
 def write_fields(fields: Sequence[PlacedField], path: str | Path) -> None:
-    """The fields of a die in their order, as CSV."""
+    """The fields of a die in their order, as CSV.
+
+    Args:
+        path: of the CSV file.
+    """
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(FIELD_HEAD)

@@ -119,6 +119,9 @@ def notch_distance_um(wafer: WaferSettings, boxes: Array) -> Array:
     SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` deep. That
     is a sharp V with its corner at the middle of the bottom's circle, widened by the
     radius; a box is nearest to it at a corner or an edge of either.
+
+    Args:
+        wafer: with its notch.
     """
     radius = 1e3 * NOTCH_RADIUS_MM
     corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius
@@ -136,6 +139,11 @@ def step_and_repeat(
 ) -> tuple[CellReference, ...]:
     """The dies as arrays: neighbours of a row together, equal rows above each other
     together.
+
+    Args:
+        child: cell of the die.
+        found: dies that the wafer holds.
+        units_per_um: database units in a micrometre.
     """
     spans: dict[int, list[tuple[int, int]]] = {}
     order = np.lexsort((found.index[:, 0], found.index[:, 1]))

@@ -37,6 +37,9 @@ _LISTED = 12  # spaces between parts that are listed one by one
 def run(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does
     not read back as planned.
+
+    Args:
+        options: of the command.
     """
     record = config.load(options.lens, Floorplan)
     named = [part.file for part in record.parts]

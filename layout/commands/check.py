@@ -50,7 +50,11 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Check the mask; exit 1 where a rule is violated or no shape was checked."""
+    """Check the mask; exit 1 where a rule is violated or no shape was checked.
+
+    Args:
+        options: of the command.
+    """
     layers = [parse_layer(text) for text in options.layers]
     process = (
         processes.Process()
@@ -88,6 +92,9 @@ def run(options: Options) -> int:
 
 def parse_layer(text: str) -> LayerChoice:
     """Layer number and datatype of "1" (datatype None: all) or "1/0".
+
+    Args:
+        text: as a user writes it.
 
     Raises:
         MaskFileError: neither of these.
@@ -128,7 +135,11 @@ def _values(content: MaskLibrary, report: DrcReport) -> dict[str, Any]:
 
 
 def format_counts(counts: Mapping[str, int]) -> str:
-    """Numbers of elements by kind, for a person."""
+    """Numbers of elements by kind, for a person.
+
+    Args:
+        counts: {kind: number}.
+    """
     return ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
 
 

@@ -44,7 +44,11 @@ def mask_summary(path: Path, top: str | None = None) -> dict[str, Any]:
 
 
 def mask_summary_text(found: dict[str, Any]) -> str:
-    """Lines for people."""
+    """Lines for people.
+
+    Args:
+        found: from :func:`mask_summary`.
+    """
     lines = [
         f"{found['file']}: {found['kind']}, {found['shapes']:,} shapes in "
         f"{found['cells']} cells, database unit {found['unit_nm']:g} nm",

@@ -14,6 +14,9 @@ ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 def run(options: Options) -> int:
     """Make the mask; exit 1 where a rule is broken, a file does not read back as
     planned or a study is none.
+
+    Args:
+        options: of the command.
     """
     if options.lens.suffix.lower() == ARRANGEMENT:
         from layout.commands import arranged

@@ -280,7 +280,11 @@ def _accompany(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
 
 
 def values_of(job: LayoutJob) -> dict[str, Any]:
-    """What layout.json says."""
+    """What layout.json says.
+
+    Args:
+        job: that has been written.
+    """
     found = job.drc
     return {
         "ok": job.ok,

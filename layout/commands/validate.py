@@ -42,6 +42,9 @@ def validate_mask(
 
     content: what was read of it, where it was read already.
 
+    Args:
+        path: of the file.
+
     Raises:
         MaskFileError: an empty file.
         OSError: it cannot be opened.

@@ -27,6 +27,9 @@ def mask_panels(path: Path) -> list[Panel]:
     """The drawing of a mask file, or of the one in a folder, and its layers with their
     doses.
 
+    Args:
+        path: of a mask file, or of a folder with one.
+
     Raises:
         MaskFileError: no mask file, one that cannot be read, or that draws nothing.
     """

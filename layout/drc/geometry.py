@@ -63,6 +63,9 @@ def clean_contour(points: Array) -> Array:
 def is_convex(points: Array) -> bool:
     """Whether a contour without collinear corners turns left at every corner, once
     around.
+
+    Args:
+        points: (n, 2) corners.
     """
     before = points - np.roll(points, 1, axis=0)
     after = np.roll(before, -1, axis=0)
@@ -328,7 +331,12 @@ def _measure_separation(
 
 @compile_loop
 def edge_distance_squared(e: Array, f: Array) -> float:
-    """Squared distance of two edges, 0 where they cross or touch."""
+    """Squared distance of two edges, 0 where they cross or touch.
+
+    Args:
+        e: x1, y1, x2, y2.
+        f: the other edge.
+    """
     if _on_both_sides(e, f) and _on_both_sides(f, e) and _overlap_on_axes(e, f):
         return 0.0
     ends = min(
@@ -372,7 +380,12 @@ def _point_distance_squared(x: float, y: float, e: Array) -> float:
 
 @compile_loop
 def encloses_point(edges: Array, x: float, y: float) -> bool:
-    """Whether the winding number of a polygon about a point off its edges is not 0."""
+    """Whether the winding number of a polygon about a point off its edges is not 0.
+
+    Args:
+        x: of the point.
+        y: of the point.
+    """
     winding = 0
     for n in range(len(edges)):
         x1, y1, x2, y2 = edges[n]
@@ -385,7 +398,11 @@ def encloses_point(edges: Array, x: float, y: float) -> bool:
 
 @compile_loop
 def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
-    """(n,) :func:`projected_distance` of pairs (n, 2) of edges."""
+    """(n,) :func:`projected_distance` of pairs (n, 2) of edges.
+
+    Args:
+        side: 1 through the interior, -1 through the exterior.
+    """
     out = np.empty(len(pairs))
     for n in range(len(pairs)):
         out[n] = projected_distance(edges[pairs[n, 0]], edges[pairs[n, 1]], side)

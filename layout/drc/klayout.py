@@ -23,7 +23,11 @@ _HOLLOW, _DOTTED = "I1", "I9"  # KLayout's stipple patterns
 
 
 def write_lyp(plan: MaskPlan | MaskLibrary, path: str | Path) -> None:
-    """Write layer properties: a name and a colour for each layer that ``plan`` uses."""
+    """Write layer properties: a name and a colour for each layer that ``plan`` uses.
+
+    Args:
+        path: of the file.
+    """
     root = ElementTree.Element("layer-properties")
     for n, (layer, datatype) in enumerate(sorted(plan.layers)):
         name = plan.layer_names.get((layer, datatype), f"layer_{layer}_{datatype}")

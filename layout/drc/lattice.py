@@ -373,6 +373,9 @@ def lattice_vectors(lattice: PillarArray, reach: float) -> Array:
     of each opposite pair.
 
     The nearest sites on all sides are always among them.
+
+    Args:
+        lattice: of the pillars.
     """
     nearest = 2 if lattice.centred else 1
     across = max(nearest, int(reach // lattice.pitch))
@@ -418,6 +421,12 @@ def locate_pairs(
 ) -> int:
     """Fill ``found`` (n, 3) with row, column, vector of marked pairs; arguments as in
     :func:`count_pairs`.
+
+    Args:
+        block: (rows, columns) class numbers.
+        new: first row that counts.
+        kind: (classes + 1,) outline number of each class.
+        vectors: (m, 2) columns to the right and rows up.
     """
     rows, columns = block.shape
     count = 0

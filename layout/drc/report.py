@@ -226,6 +226,10 @@ class DrcReport:
 
 
 def format_size(size_nm: float | None) -> str:
-    """A size with its unit, "none" where nothing was measured (None or inf)."""
+    """A size with its unit, "none" where nothing was measured (None or inf).
+
+    Args:
+        size_nm: in nanometres.
+    """
     measured = size_nm is not None and math.isfinite(size_nm)
     return f"{size_nm:.1f} nm" if measured else "none"

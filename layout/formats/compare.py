@@ -109,7 +109,11 @@ def _shapes(cell: MaskCell) -> list[tuple[LayerNumber, list[tuple[int, ...]]]]:
 
 
 def canonical_corners(points: Array) -> tuple[int, ...]:
-    """Corners from the smallest on, counter-clockwise."""
+    """Corners from the smallest on, counter-clockwise.
+
+    Args:
+        points: (n, 2) corners of a polygon.
+    """
     p = np.asarray(points, np.int64)
     after = np.roll(p, -1, axis=0)
     if (p[:, 0] * after[:, 1] - after[:, 0] * p[:, 1]).sum() < 0:

@@ -49,6 +49,10 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
     """Write the pillars whose site lies in the window, and all figures; the number of
     pillars.
 
+    Args:
+        plan: of a die.
+        path: of the file.
+
     Raises:
         ProcessError: more than 200 000 pillars in the window, or ezdxf is not
             installed.
@@ -84,6 +88,9 @@ def dxf_differences(
 ) -> tuple[str, ...]:
     """What a DXF file, read by ezdxf, holds that the window of the plan does not, and
     the other way, in words.
+
+    Args:
+        path: of the file.
 
     Raises:
         MaskFileError: the file cannot be read as DXF.
@@ -150,7 +157,12 @@ def _sites(plan: MaskPlan, window: DxfWindow) -> list[tuple[int, int, int]]:
 def sites_in(
     plan: MaskPlan, lattice: PillarArray, window: DxfWindow
 ) -> Iterator[tuple[int, int, int]]:
-    """(class, x, y) of the pillars whose site lies in the window, database units."""
+    """(class, x, y) of the pillars whose site lies in the window, database units.
+
+    Args:
+        plan: of a die.
+        lattice: one of its lattices.
+    """
     scale = 1e3 / plan.unit_nm
     half = window.size_um / 2
     left = _ceil(

@@ -17,6 +17,9 @@ LARGE_PART = 1 << 23  # placements of which each column has 32 MB
 def map_bytes(path: str | Path) -> Array:
     """The bytes of a file as uint8, read when they are looked at.
 
+    Args:
+        path: of the file.
+
     Raises:
         MaskFileError: an empty file. OSError: it cannot be opened.
     """
@@ -32,7 +35,11 @@ CONTEXT_CELL = "$$$CONTEXT_INFO$$$"  # KLayout's record of library cells: no dra
 
 
 def decode_name(data: bytes) -> str:
-    """A name of a mask file: UTF-8, or Latin-1 where it is none; trailing NULs go."""
+    """A name of a mask file: UTF-8, or Latin-1 where it is none; trailing NULs go.
+
+    Args:
+        data: bytes of the name.
+    """
     data = data.rstrip(b"\0")
     try:
         return data.decode("utf-8")
@@ -41,7 +48,11 @@ def decode_name(data: bytes) -> str:
 
 
 def has_area(points: Array) -> bool:
-    """Whether the corners (n, 2) of a polygon do not all lie on one line."""
+    """Whether the corners (n, 2) of a polygon do not all lie on one line.
+
+    Args:
+        points: (n, 2) corners.
+    """
     steps = points[1:] - points[0]
     if not len(steps):
         return False
@@ -54,6 +65,9 @@ def placement_limit(path: Path) -> int:
 
     4 million take less than 1 GB however small the file; 20 more for each byte admit
     long lists (OASIS masks of this package have 4 to 17 pillars a byte).
+
+    Args:
+        path: of the mask file.
     """
     return 4_000_000 + 20 * path.stat().st_size
 
@@ -61,6 +75,9 @@ def placement_limit(path: Path) -> int:
 def release_bytes(data: Array, end: int) -> None:
     """Give back the memory of the bytes before ``end`` of a mapped file; they are read
     again if they are looked at.
+
+    Args:
+        data: from :func:`map_bytes`.
     """
     base: object = data.base.obj if isinstance(data.base, memoryview) else data.base
     if (

@@ -85,6 +85,7 @@ def read_gdsii(
         keep: most placements of one structure that are kept; of more only the sums are
             (:mod:`layout.formats.digest`),
             in bounded memory. None: all are kept.
+        path: of the file.
 
     Raises:
         MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte
@@ -99,6 +100,11 @@ def parse_gdsii(
 ) -> MaskLibrary:
     """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
     in errors.
+
+    Args:
+        data: bytes, uint8.
+        limit: most placements that are read.
+        keep: most placements of one structure that are kept; None: all.
     """
     return _Reader(where, data, limit, keep).library()
 

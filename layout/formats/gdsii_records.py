@@ -101,6 +101,9 @@ MOST_POINTS = 8190  # of one boundary, closing point included
 def gdsii_real(value: float) -> bytes:
     """Excess-64 base-16 floating point: 1 sign bit, 7 bits of exponent, 56 bits of
     fraction.
+
+    Args:
+        value: any number.
     """
     if value == 0:
         return bytes(8)
@@ -113,7 +116,11 @@ def gdsii_real(value: float) -> bytes:
 
 
 def to_float(data: bytes) -> float:
-    """Inverse of :func:`gdsii_real`."""
+    """Inverse of :func:`gdsii_real`.
+
+    Args:
+        data: 8 bytes.
+    """
     fraction = int.from_bytes(data[1:8], "big") / 2**56
     return (-1.0 if data[0] & 128 else 1.0) * fraction * 16.0 ** ((data[0] & 127) - 64)
 
@@ -124,23 +131,41 @@ def gdsii_record(kind: int, data: bytes = b"") -> bytes:
 
 
 def text_record(kind: int, value: str) -> bytes:
-    """A record of text, filled to an even length with a zero."""
+    """A record of text, filled to an even length with a zero.
+
+    Args:
+        kind: of the record.
+        value: its text.
+    """
     data = value.encode()
     return gdsii_record(kind, data + bytes(len(data) % 2))
 
 
 def integer_record(kind: int, *values: int) -> bytes:
-    """A record of 16-bit integers."""
+    """A record of 16-bit integers.
+
+    Args:
+        kind: of the record.
+    """
     return gdsii_record(kind, struct.pack(f">{len(values)}h", *values))
 
 
 def xy_record(xy: Array) -> bytes:
-    """XY record of (n, 2) points."""
+    """XY record of (n, 2) points.
+
+    Args:
+        xy: database units.
+    """
     return gdsii_record(XY, xy.astype(">i4").tobytes())
 
 
 def library_head(name: str, unit_nm: float) -> bytes:
-    """Everything before the first structure; user unit micrometre."""
+    """Everything before the first structure; user unit micrometre.
+
+    Args:
+        name: of the library.
+        unit_nm: database unit.
+    """
     head = (
         integer_record(HEADER, 600)
         + integer_record(BGNLIB, *TIMES)

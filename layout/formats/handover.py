@@ -43,7 +43,11 @@ class WriteStep:
 
 
 def field_sequence(split: FieldPlan) -> list[WriteStep]:
-    """All fields that hold pillars."""
+    """All fields that hold pillars.
+
+    Args:
+        split: write fields of a lens.
+    """
     x, y = split.x_um.tolist(), split.y_um.tolist()
     made: list[WriteStep] = []
     for i, row in enumerate(split.pillars):
@@ -58,7 +62,12 @@ def field_sequence(split: FieldPlan) -> list[WriteStep]:
 
 
 def write_fields(split: FieldPlan, path: str | Path) -> None:
-    """The fields in their order, as CSV."""
+    """The fields in their order, as CSV.
+
+    Args:
+        split: write fields of a lens.
+        path: of the CSV file.
+    """
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(FIELD_HEAD)
@@ -76,6 +85,10 @@ def charge_uC(
     """{step: charge} of the two steps: base dose times relative dose times area.
 
     areas: um^2 of each layer.
+
+    Args:
+        doses: relative dose of each layer.
+        process: base dose, and layer of the aperture.
     """
     found = {"pillars": 0.0, "aperture": 0.0}
     for layer, dose in doses.items():
@@ -86,7 +99,11 @@ def charge_uC(
 
 
 def charge_lines(charges: Mapping[str, float]) -> Iterator[str]:
-    """Charge of each step and its time at 1 nA, for the job sheet."""
+    """Charge of each step and its time at 1 nA, for the job sheet.
+
+    Args:
+        charges: from :func:`charge_uC`.
+    """
     for step, charge in charges.items():
         hours = charge * 1e3 / 3600
         yield (
@@ -101,7 +118,14 @@ def dose_lines(
     names: Mapping[LayerNumber, str],
     process: Process,
 ) -> Iterator[str]:
-    """The dose table with the area of each layer, for the job sheet."""
+    """The dose table with the area of each layer, for the job sheet.
+
+    Args:
+        areas: um^2 of each layer.
+        doses: relative dose of each layer.
+        names: of the layers.
+        process: base dose.
+    """
     yield (
         "Doses (layer/datatype, relative, uC/cm2, area um2, name); the same in "
         "doses.csv:"
@@ -115,7 +139,11 @@ def dose_lines(
 
 
 def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
-    """(x, y, width, height) of each mark, from the lower left on."""
+    """(x, y, width, height) of each mark, from the lower left on.
+
+    Args:
+        plan: of a die.
+    """
     source = plan if plan.standing is None else plan.standing
     shapes = [
         p
@@ -149,6 +177,13 @@ def job_sheet(
 ) -> str:
     """Everything that an operator needs to set up the job, as text; what the machine
     decides is left open.
+
+    Args:
+        plan: of a die.
+        process: base dose, layers and verniers.
+        split: write fields.
+        files: {name: bytes} of the mask files.
+        verdict: first line of the report.
     """
     return "\n".join(_lines(plan, process, split, files, verdict)) + "\n"
 
@@ -204,7 +239,13 @@ DosedMask = MaskPlan | MaskLibrary
 
 
 def write_dose_table(plan: DosedMask, process: Process, path: str | Path) -> None:
-    """Write the table, one line for each (layer, datatype) that is exposed, rising."""
+    """Write the table, one line for each (layer, datatype) that is exposed, rising.
+
+    Args:
+        plan: mask with doses and layer names.
+        process: base dose, and layer of the aperture.
+        path: of the CSV file.
+    """
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(DOSE_HEAD)
@@ -225,6 +266,9 @@ def write_dose_table(plan: DosedMask, process: Process, path: str | Path) -> Non
 
 def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
     """{(layer, datatype): relative dose} of a table.
+
+    Args:
+        path: of the CSV file.
 
     Raises:
         MaskFileError: missing file, missing columns, a line that is no dose or comes
@@ -261,6 +305,11 @@ def layers_without_dose(
 ) -> tuple[LayerNumber, ...]:
     """Layers of a file that hold shapes to be exposed and have no dose; outline and
     write fields are not exposed.
+
+    Args:
+        content: of the file.
+        doses: its dose table.
+        process: layers of outline and write fields.
     """
     layers = process.layers
     return tuple(sorted(content.layers - {layers.outline, layers.fields} - set(doses)))

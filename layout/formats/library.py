@@ -525,7 +525,11 @@ def library_of(plan: MaskPlan) -> MaskLibrary:
 
 
 def group_equal(numbers: Array) -> Iterator[tuple[int, Array]]:
-    """Each distinct number, and the indices where it stands."""
+    """Each distinct number, and the indices where it stands.
+
+    Args:
+        numbers: (n,) integers.
+    """
     order = np.argsort(numbers, kind="stable")
     distinct, starts = np.unique(numbers[order], return_index=True)
     if len(distinct):
@@ -534,7 +538,13 @@ def group_equal(numbers: Array) -> Iterator[tuple[int, Array]]:
 
 
 def circle_polygon(x: int, y: int, radius: int) -> Array:
-    """(64, 2) corners of a polygon of the area of a circle, on whole units."""
+    """(64, 2) corners of a polygon of the area of a circle, on whole units.
+
+    Args:
+        x: of the centre.
+        y: of the centre.
+        radius: database units.
+    """
     return polygon.disc_polygon(radius, (x, y), CIRCLE_CORNERS)
 
 
@@ -558,6 +568,9 @@ class PolygonStack:
 
 def flatten_stacks(library: MaskLibrary, top: str) -> Iterator[PolygonStack]:
     """Every polygon below ``top``; true circles as polygons of 64 corners.
+
+    Args:
+        library: of the cells.
 
     Raises:
         MaskFileError: as :meth:`MaskLibrary.walk`.

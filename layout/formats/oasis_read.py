@@ -36,6 +36,7 @@ def read_oasis(
         keep: most placements of one cell that are kept; of more only the sums are
             (:mod:`layout.formats.digest`), in
             bounded memory. None: all are kept.
+        path: of the file.
 
     Raises:
         MaskFileError: not OASIS, cut, broken anywhere, of a wrong checksum, or with
@@ -51,6 +52,11 @@ def parse_oasis(
 ) -> MaskLibrary:
     """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
     in errors.
+
+    Args:
+        data: bytes, uint8.
+        limit: most placements and copies that are read.
+        keep: most placements of one cell that are kept; None: all.
     """
     return _Reader(ByteCursor(where, data), limit, keep).whole_file()
 

@@ -54,7 +54,11 @@ END_SIZE = 256
 
 
 def unsigned_integer(value: int) -> bytes:
-    """7 bits a byte, least significant first; the top bit says that more follow."""
+    """7 bits a byte, least significant first; the top bit says that more follow.
+
+    Args:
+        value: 0 or above.
+    """
     out = bytearray()
     while value > 127:
         out.append(value & 127 | 128)
@@ -64,18 +68,30 @@ def unsigned_integer(value: int) -> bytes:
 
 
 def signed_integer(value: int) -> bytes:
-    """Magnitude shifted left by the sign bit."""
+    """Magnitude shifted left by the sign bit.
+
+    Args:
+        value: any integer.
+    """
     return unsigned_integer(abs(value) << 1 | (value < 0))
 
 
 def oasis_string(text: str) -> bytes:
-    """Length and characters."""
+    """Length and characters.
+
+    Args:
+        text: UTF-8.
+    """
     data = text.encode()
     return unsigned_integer(len(data)) + data
 
 
 def oasis_real(value: float) -> bytes:
-    """Whole numbers as such, their reciprocals as such, all others as IEEE double."""
+    """Whole numbers as such, their reciprocals as such, all others as IEEE double.
+
+    Args:
+        value: any number.
+    """
     if value > 0 and value == round(value):
         return b"\0" + unsigned_integer(round(value))
     if 0 < value < 1 and 1 / round(1 / value) == value:
@@ -84,7 +100,12 @@ def oasis_real(value: float) -> bytes:
 
 
 def compressed_block(raw: bytes | memoryview, level: int) -> bytes:
-    """A CBLOCK record, or the bytes themselves where compression gains nothing."""
+    """A CBLOCK record, or the bytes themselves where compression gains nothing.
+
+    Args:
+        raw: bytes of whole records.
+        level: of deflate, 1 to 9.
+    """
     packer = zlib.compressobj(level, zlib.DEFLATED, -15)
     packed = packer.compress(raw) + packer.flush()
     block = (
@@ -99,6 +120,9 @@ def compressed_block(raw: bytes | memoryview, level: int) -> bytes:
 def start_record(unit_nm: float) -> bytes:
     """Magic and START: version 1.0, grid steps in a micrometre, table offsets in the
     END record.
+
+    Args:
+        unit_nm: database unit.
     """
     return (
         MAGIC

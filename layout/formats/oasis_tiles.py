@@ -14,7 +14,13 @@ LARGEST_RECORD = 18  # bytes of one placement
 
 @compile_loop
 def put_unsigned(out: Array, at: int, value: int) -> int:
-    """Write a variable-length integer; the position after it."""
+    """Write a variable-length integer; the position after it.
+
+    Args:
+        out: bytes.
+        at: position.
+        value: 0 or above.
+    """
     while value > 127:
         out[at] = value & 127 | 128
         value >>= 7
@@ -76,6 +82,8 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
     Args:
         child: (n,) reference numbers. turn: (n,) quarter turns and mirror, 0 to 7. out:
             as for :func:`encode_tile`.
+        x: (n,) places.
+        y: (n,) places.
     """
     out[0] = 15  # XYABSOLUTE
     at, last_x, last_y = 1, 0, 0

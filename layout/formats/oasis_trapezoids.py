@@ -20,7 +20,12 @@ KINDS = len(_CORNERS)
 
 
 def compact_trapezoid(kind: int, w: int, h: int) -> Array:
-    """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25."""
+    """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25.
+
+    Args:
+        w: width.
+        h: height.
+    """
     value = {
         "0": 0,
         "w": w,
@@ -58,7 +63,11 @@ def dependent_size(kind: int, w: int, h: int) -> tuple[int, int]:
 
 
 def slanted_trapezoid(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
-    """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans."""
+    """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans.
+
+    Args:
+        upright: whether the parallel sides are upright.
+    """
     if upright:
         corners = [
             (0, max(a, 0)),

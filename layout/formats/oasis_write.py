@@ -69,7 +69,11 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
 
 
 def cell_name(number: int, name: str) -> bytes:
-    """Record of a cell's name."""
+    """Record of a cell's name.
+
+    Args:
+        number: that references use.
+    """
     return (
         bytes([oasis.CELLNAME_REF])
         + oasis.oasis_string(name)
@@ -101,6 +105,10 @@ def _cells(library: MaskLibrary, number: dict[str, int]) -> Iterator[bytes]:
 def polygon_element(layer: LayerNumber, points: Array) -> bytes:
     """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last
     one implied.
+
+    Args:
+        layer: number and datatype.
+        points: (n, 2) corners.
     """
     steps = np.diff(points.astype(np.int64), axis=0).tolist()
     x, y = (oasis.signed_integer(int(v)) for v in points[0])
@@ -116,7 +124,12 @@ def polygon_element(layer: LayerNumber, points: Array) -> bytes:
 
 
 def g_delta(dx: int, dy: int) -> bytes:
-    """A g-delta of any direction."""
+    """A g-delta of any direction.
+
+    Args:
+        dx: step along x.
+        dy: step along y.
+    """
     return oasis.unsigned_integer(
         abs(dx) << 2 | (dx < 0) << 1 | 1
     ) + oasis.signed_integer(dy)

@@ -31,6 +31,7 @@ def path_outline(
             lengths by which it goes
             on beyond its ends.
         rounded: with half circles at the ends.
+        half_width: half the width, database units.
     """
     p = np.asarray(points, float)
     p = p[np.r_[True, (np.diff(p, axis=0) != 0).any(1)]]

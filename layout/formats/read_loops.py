@@ -15,6 +15,9 @@ _MOST_NAMES = 65536
 def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, int]:
     """Plain GDSII references from byte ``at`` on, all with names of one length.
 
+    Args:
+        data: bytes of the file.
+
     Returns:
         (names, index into names, x, y, byte after the last); nothing where the next
         record is something else.
@@ -110,6 +113,10 @@ def _big_endian(data: Array, at: int) -> int:
 def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
     """A variable-length integer of at most 6 bytes and the position after it; -1 where
     it is cut or longer.
+
+    Args:
+        data: bytes.
+        end: of the bytes.
     """
     value, shift = 0, 0
     while at < end and shift < 42:
@@ -132,6 +139,11 @@ def scan_placements(
     out: (4, n) child, x, y, turn of each, filled.
     state: (4,) placement x, y, whether relative, and the cell placed last (-1: none),
     kept up to date.
+
+    Args:
+        data: bytes.
+        at: first byte.
+        end: of the bytes.
 
     Returns:
         (position of the first record that is something else or broken, placements read)
@@ -178,6 +190,12 @@ def scan_placements(
 @compile_loop
 def sum_deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int:
     """Running sums of the g-deltas of a repetition; x[0], y[0] are given.
+
+    Args:
+        data: bytes.
+        at: first byte.
+        end: of the bytes.
+        grid: factor of all steps.
 
     Returns:
         the position after the last, or -1 where the list is cut or leaves 32 bits.

@@ -137,6 +137,11 @@ def die_surroundings(
 
     clear_um: half the width, about the middle, that the test structures leave free.
 
+    Args:
+        process: rules, layers and die.
+        name: of the top cell.
+        size_um: (x, y) of the die.
+
     Raises:
         ProcessError: as :func:`plan`.
     """
@@ -169,6 +174,12 @@ def wafer_mark(
 ) -> DrawnMask:
     """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
 
+    Args:
+        process: rules and layers.
+        name: of the top cell.
+        mark_um: arm length.
+        width_um: line width.
+
     Raises:
         ProcessError: as :func:`plan`.
     """
@@ -193,6 +204,10 @@ def _drawn(
 
 def pitch_units(pitch_um: float, process: Process) -> int:
     """A step of the lattice in database units.
+
+    Args:
+        pitch_um: of the lattice.
+        process: with the grid.
 
     Raises:
         ProcessError: it is no multiple of the grid.

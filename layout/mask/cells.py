@@ -110,6 +110,9 @@ def with_isolation(
     some ``sites``.
 
     The third is None where the process asks for none.
+
+    Args:
+        diameters: designed sizes.
     """
     design, bias = diameters.diameter_um, process.bias
     reach = (

@@ -105,7 +105,12 @@ def add_die_frame(
 
 
 def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
-    """``plan`` (the lens alone) with the opening of its aperture and nothing else."""
+    """``plan`` (the lens alone) with the opening of its aperture and nothing else.
+
+    Args:
+        process: layers.
+        radius_um: of the opening.
+    """
     layer, unit = process.layers.aperture, DatabaseUnits(plan)
     figure = FigureCell(
         "APERTURE",
@@ -125,6 +130,11 @@ def wafer_mark(
     between two of its arms.
 
     plan: of a lens, whose pillars the witness cells repeat.
+
+    Args:
+        process: layers.
+        mark_um: arm length.
+        width_um: line width.
     """
     unit, layers = DatabaseUnits(plan), process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
@@ -163,6 +173,10 @@ def wafer_mark(
 def aperture_polygon(radius: float, centre: tuple[float, float], grid: int) -> Array:
     """Polygon of the area of a circle whose edges stay within half a grid step of it,
     at most 8000 vertices.
+
+    Args:
+        radius: database units.
+        centre: x and y, database units.
     """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
     return polygon.disc_polygon(radius, centre, count, grid)

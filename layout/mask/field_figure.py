@@ -10,7 +10,12 @@ from layout.process.process import Process
 
 
 def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
-    """``plan`` with one rectangle for each write field, clipped to the lens."""
+    """``plan`` with one rectangle for each write field, clipped to the lens.
+
+    Args:
+        split: write fields of the lens.
+        process: layers.
+    """
     lattice = plan.lattices[0]
 
     def edges(sites: np.ndarray, most: int, step: int) -> list[int]:

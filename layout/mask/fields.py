@@ -94,6 +94,8 @@ def split_write_fields(
 
     Args:
         drawn: the pillars of this map, quantised; left out: quantised here.
+        diameters: of the lens.
+        process: bias, steps and write field.
 
     Raises:
         ProcessError: a field smaller than the pitch; as

@@ -39,6 +39,7 @@ def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, 
     Args:
         x, y: lower left corner; square: side of one square of the letters, even; all in
             database units.
+        words: the line of text.
 
     Raises:
         ProcessError: a character that the font does not hold.
@@ -47,7 +48,12 @@ def text_rectangles(words: str, *, x: int, y: int, square: int) -> tuple[Array, 
 
 
 def text_width(words: str, square: int) -> int:
-    """Length of the line."""
+    """Length of the line.
+
+    Args:
+        words: the line of text.
+        square: side of one square of the letters.
+    """
     return max(len(words) * 6 - 1, 0) * square
 
 

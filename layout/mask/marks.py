@@ -104,6 +104,11 @@ def alignment_crosses(
     unlike all its turns and mirrors.
 
     Shapes, and the windows that the aperture opens around them.
+
+    Args:
+        process: size of marks and street.
+        unit: of the plan.
+        die: outline of the die.
     """
     arm, width = unit(process.die.mark_um / 2), unit(process.die.mark_width_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM) + arm
@@ -161,6 +166,11 @@ def wafer_cross(
 ) -> tuple[Array, ...]:
     """Four bars for the coarse alignment about (0, 0), and a fine cross in the middle
     that they leave free.
+
+    Args:
+        unit: of the plan.
+        mark_um: arm length.
+        width_um: line width.
     """
     arm, half = unit(mark_um / 2), unit(width_um / 2)
     inner, thin = arm // _FINE // unit.grid * unit.grid * 2, _thin(half, unit)
@@ -181,6 +191,10 @@ def vernier_scales(
 ) -> VernierScales:
     """Verniers along x and y and a box in a box, from the upper right cross to the
     left; none where none are wanted.
+
+    Args:
+        process: pitch and step of the verniers.
+        unit: of the plan.
 
     Raises:
         ProcessError: the die is too narrow for them, or the step of the vernier is

@@ -338,6 +338,15 @@ def pillar_classes(
 ) -> tuple[PillarClass, ...]:
     """One class for each drawn diameter (database units, whole), thinnest first;
     equally long names.
+
+    Args:
+        diameters: drawn, rising.
+        layer: number and datatype.
+        grid: step of the coordinates, database units.
+        unit_nm: database unit.
+        vertices: of the polygons, at most.
+        shape: ``round`` or ``shot``.
+        prefix: first letter of the names.
     """
     digits = max((len(str(int(d))) for d in diameters), default=1)
     made = []

@@ -38,6 +38,11 @@ def shape_classes(
 ) -> tuple[DrawnClasses, tuple[PillarClass, ...]]:
     """The pillars of a lens as classes, and what is drawn for each.
 
+    Args:
+        source: lens of shaped or rotated pillars.
+        process: rules and bias.
+        unit_nm: database unit.
+
     Raises:
         ProcessError: too many classes, a pillar of less than a step, a hole that the
             grid or the bias closes.

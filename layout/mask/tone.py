@@ -31,6 +31,9 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
     """The mask that leaves standing what ``plan`` draws; the layers of a second step
     (aperture) stay as they are.
 
+    Args:
+        process: layers.
+
     Raises:
         ProcessError: a pillar wider than its lattice square, lattices of different
             pitches.
@@ -65,6 +68,9 @@ def reverse_tone(plan: MaskPlan, process: Process) -> MaskPlan:
 def lattice_box(lattice: PillarArray, grid: int) -> Array:
     """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
     the ends of every other row).
+
+    Args:
+        grid: step of the coordinates.
     """
     left, bottom, right, top = _square(lattice, grid)
     across, down = (

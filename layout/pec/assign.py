@@ -106,6 +106,10 @@ def dose_range(fields: ExposedBodies, settings: ExposureSettings) -> DoseRange:
 
     Where the edge is so soft that the tolerance moves it by more than a nanometre of
     width, as much finer steps are needed.
+
+    Args:
+        fields: backgrounds of the wanted doses.
+        settings: tolerance.
     """
     span = np.array(
         [np.inf, 0.0, 0.0]
@@ -151,6 +155,10 @@ def dose_ladder(
 
     A quarter of the tolerance is left for the background of rounded doses and for what
     changes across a piece of a mark.
+
+    Args:
+        ranges: of all dies of a job.
+        settings: tolerance, and number of doses.
     """
     least = min(one.least for one in ranges)
     span = max(one.most for one in ranges) / least
@@ -163,6 +171,9 @@ def dose_ladder(
 def straight_edge_error(point: PointExposure) -> float:
     """Relative error of the exposure that moves both edges of a line of dose 1 by what
     rounded doses may.
+
+    Args:
+        point: narrow terms of the point exposure.
     """
     steep = float((point.weights / point.widths_um).sum()) / np.sqrt(np.pi)
     return float(_SOFTEST_UM * steep / 2 / THRESHOLD)
@@ -196,6 +207,12 @@ def dose_class_map(
 ) -> Array:
     """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is
     none.
+
+    Args:
+        fields: backgrounds of the wanted doses.
+        number: of the body.
+        first: row of the block.
+        steps: doses of the job.
     """
     t, out = fields.table, np.empty(block.shape, np.uint8)
     field = fields.at(fields.far, number, first, len(block), fields.near)

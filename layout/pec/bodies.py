@@ -105,7 +105,14 @@ def count_pillars(bodies: Sequence[PillarArray], entries: int) -> Array:
 def split_ranges(
     point: PointExposure, drawn: DrawnKinds, number: Array, body: PillarArray
 ) -> ScatterRanges:
-    """Which Gaussians reach how far, for these pillars on the densest of the lattices."""
+    """Which Gaussians reach how far, for these pillars on the densest of the lattices.
+
+    Args:
+        point: exposure of a beam.
+        drawn: kinds of pillars.
+        number: (entries,) pillars of each.
+        body: the densest lattice.
+    """
     mass = number * drawn.area_um2
     total = float(mass.sum())
     wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
@@ -151,6 +158,10 @@ def exposure_table(
 
     Args:
         body: the densest of the lattices.
+        drawn: kinds of pillars.
+        goal: (entries,) wanted edge exposure over the threshold.
+        number: (entries,) pillars of each.
+        ranges: the same by reach.
 
     Raises:
         ProcessError: no pillar, or pillars so much finer than the point exposure that

@@ -93,6 +93,7 @@ def solve_doses(
         kinds, goal: (entries,) of the table, entry 0 for none.
         cut: rectangles along whose outer sides the background hardly changes
             (:func:`fracture_boxes`).
+        settings: point exposure and tolerance.
 
     Raises:
         ProcessError: no pillar; no or an unreadable point exposure; pillars finer than
@@ -131,6 +132,11 @@ def fracture_by_surroundings(
 ) -> tuple[Array, Array]:
     """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and
     (m,) the box of each.
+
+    Args:
+        boxes: whole grid steps.
+        parts: lattices of pillars.
+        settings: point exposure and tolerance.
 
     Raises:
         ProcessError: too many pieces.
@@ -232,6 +238,10 @@ def _masses(
 def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvolution:
     """Convolution on the sites of a lattice with the Gaussians that reach neighbours
     only.
+
+    Args:
+        body: lattice of pillars.
+        ranges: point exposure by reach.
     """
     if body.rows * body.columns > _MOST_SITES:
         raise ProcessError(

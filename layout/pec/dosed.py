@@ -39,6 +39,9 @@ class WantedPlan:
 def solve_wanted_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedPlan:
     """The doses that everything on a plan needs, before they are rounded to classes.
 
+    Args:
+        exposure: point exposure and tolerance.
+
     Raises:
         ProcessError: as :func:`layout.pec.correct.correct`.
     """
@@ -109,6 +112,9 @@ def apply_dose_classes(
     pieces of one dose each.
 
     ladder, needed: of all that is written in one job.
+
+    Args:
+        wanted: doses of the plan.
     """
     plan, boxes, of = wanted.plan, wanted.boxes, wanted.of
     found = dose.round_doses(wanted.doses, ladder, needed)
@@ -175,7 +181,12 @@ def _name(plan: MaskPlan, layer: LayerNumber, level: float) -> str:
 
 
 def layer_title(kind: str, level: float) -> str:
-    """Name of a layer that says its relative dose."""
+    """Name of a layer that says its relative dose.
+
+    Args:
+        kind: of shapes.
+        level: relative dose.
+    """
     return f"{kind}_dose_{level:.4f}"
 
 

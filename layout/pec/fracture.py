@@ -74,6 +74,7 @@ def fracture_boxes(
             middle and end of a side, or
             the piece is a 64th of the range or two of the core short (doses that step
             so often are even once blurred).
+        point: exposure of a beam.
 
     Raises:
         ProcessError: more than 500 000 pieces.

@@ -153,7 +153,15 @@ def gather_to_nodes(
 def interpolate_from_nodes(
     field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
 ) -> None:
-    """The node field (y, x) at the sites of a block of rows: (rows, columns) float32."""
+    """The node field (y, x) at the sites of a block of rows: (rows, columns) float32.
+
+    Args:
+        yn: (rows,) first nodes.
+        yw: (rows, 4) weights.
+        xn: (columns,) first nodes.
+        xw: (columns, 4) weights.
+        out: is filled.
+    """
     line = np.zeros(field.shape[1])
     for row in range(out.shape[0]):
         line[:] = 0
@@ -197,6 +205,10 @@ def gaussian_convolution(
     widths out (exp(-25)).
 
     hollow: leave out what a node gives to itself.
+
+    Args:
+        shape: (y, x) nodes.
+        point: sum of Gaussians.
     """
     from scipy import fft
 

@@ -51,6 +51,9 @@ def point_exposure(exposure: ExposureSettings) -> PointExposure:
     """What the process file describes: the double or triple Gaussian, or the fit of its
     measured table.
 
+    Args:
+        exposure: settings of the process.
+
     Raises:
         ProcessError: it describes none, or the table cannot be used.
     """
@@ -80,6 +83,7 @@ def fit_point_spread(
     Args:
         radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above
             0.
+        where: name of the table in errors.
 
     Raises:
         ProcessError: fewer than 4 samples, radii that do not rise, values that are not
@@ -137,6 +141,10 @@ def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
 
     From the Marcum Q function at equal arguments, Q1(c, c) = (1 + exp(-c^2) I0(c^2)) /
     2. Exact.
+
+    Args:
+        diameter_um: of the disc.
+        width_um: 1/e radius.
     """
     from scipy.special import i0e
 
@@ -147,6 +155,10 @@ def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
 def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
     """How fast that exposure falls with the radius there, per um: (2 R / a^2) exp(-x)
     I1(x). Exact.
+
+    Args:
+        diameter_um: of the disc.
+        width_um: 1/e radius.
     """
     from scipy.special import i1e
 
@@ -162,6 +174,10 @@ def disc_exposure(
 
     The probability that a Gaussian displacement ends within the disc: non-central
     chi-square of 2 degrees.
+
+    Args:
+        diameter_um: of the disc.
+        width_um: 1/e radius.
     """
     from scipy.special import chndtr
 

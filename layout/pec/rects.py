@@ -24,6 +24,10 @@ def self_exposure(
     """What a shape gives to its own edges by the Gaussians that are not summed on
     nodes, exact.
 
+    Args:
+        rects: pieces of shapes.
+        near: Gaussians that are not summed on nodes.
+
     Returns:
         (pieces,) mean exposure of the outer edges of each piece by its whole group at
         unit dose (an inner piece: of
@@ -54,6 +58,10 @@ def pairs_near(
 ) -> tuple[Array, Array]:
     """Pairs of rows (one, two), sorted, of boxes of one group that touch or lie within
     six widths (exp(-36)).
+
+    Args:
+        boxes_um: (n, 4) left, bottom, right, top.
+        point: sum of Gaussians.
     """
     order = np.lexsort((boxes_um[:, 0], group))
     boxes, group = np.ascontiguousarray(boxes_um[order]), group[order]
@@ -110,6 +118,8 @@ def sums_of_boxes(
 
     Args:
         x_um, y_um: (n, i) and (n, j) lines; row: (n,) whose boxes each of the n takes.
+        boxes_um: (m, 4) left, bottom, right, top.
+        point: sum of Gaussians.
 
     Returns:
         (n, j, i) exposure, exact to rounding.
@@ -268,6 +278,10 @@ def rectangle_samples(
 ) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the
     rectangle of each (n,).
+
+    Args:
+        rects: pieces of shapes.
+        step_um: between the points, at most.
     """
     box = rects.box_um
     counts = np.maximum(np.ceil((box[:, 2:] - box[:, :2]) / step_um - 1e-9), 1).astype(

@@ -40,6 +40,10 @@ def exact_edges(scene: ExposedLattices, samples: int) -> tuple[Array, Array, Arr
     Exact: whole shapes of all pillars within 5 sites, seen along the edges, and the
     direct sum over every other pillar (and piece of a mark) of Gaussians whose second
     moment is that of its shape.
+
+    Args:
+        scene: lattices with doses.
+        samples: pillars of the first lattice.
     """
     lens = scene.bodies[0]
     rows, columns = _some(lens, samples)

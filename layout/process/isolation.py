@@ -33,6 +33,7 @@ def isolation_map(
         centred: every other place alone is a site, as on a hexagonal lattice
             (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none,
             or those with it even.
+        range_um: of the bias of isolated pillars.
 
     Raises:
         ProcessError: a range so short that nobody has neighbours, and a lone pillar
@@ -68,7 +69,12 @@ def isolation_map(
 
 
 def isolation_halo(step_um: float, range_um: float) -> int:
-    """Rows (or columns) of this distance whose pillars bear on a pillar."""
+    """Rows (or columns) of this distance whose pillars bear on a pillar.
+
+    Args:
+        step_um: from row to row.
+        range_um: of the bias of isolated pillars.
+    """
     return max(1, int(np.ceil(3 * range_um / step_um)))
 
 

@@ -23,6 +23,9 @@ def compile_loop(function: Function) -> Function:
 def announce_compilation(say: Callable[[str], None]) -> Iterator[None]:
     """Say once that loops are compiled, if any must be: what is on disk already is
     loaded without a word.
+
+    Args:
+        say: is called with the line.
     """
     from numba.core import event
 

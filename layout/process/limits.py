@@ -20,6 +20,11 @@ def printable_limits(
     """(thinnest pillar, least gap) in nm of designed pillars, so that what is drawn
     keeps the rules.
 
+    Args:
+        path: of PROCESS.toml.
+        pitch_um: of the lattice.
+        height_um: of the pillars.
+
     Raises:
         ConfigError, ProcessError: the file cannot be used; ProcessError: no diameter
             keeps both rules on this pitch.

@@ -31,6 +31,9 @@ def legal_cell_name(text: str) -> str:
 def check_distinct_names(names: list[str]) -> None:
     """Refuse a name that is used twice.
 
+    Args:
+        names: of all cells.
+
     Raises:
         ProcessError: two cells of one name.
     """

@@ -404,6 +404,9 @@ class Process:
 def load_process(path: str | Path) -> Process:
     """Read PROCESS.toml; CSV files that it names lie beside it.
 
+    Args:
+        path: of PROCESS.toml.
+
     Raises:
         ConfigError: missing file, unknown key, wrong type or impossible value, with
             file and key.

@@ -22,6 +22,9 @@ def convex_hull(points: Array) -> Array:
 def least_width(points: Array) -> float:
     """Least distance of two parallel lines with the polygon between them: one of them
     runs along an edge.
+
+    Args:
+        points: (n, 2) corners, counter-clockwise.
     """
     edges = np.roll(points, -1, axis=0) - points
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])

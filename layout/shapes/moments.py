@@ -14,6 +14,9 @@ Contours = Sequence[Array]  # (n, 2) each
 def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
     """Area, (2,) integral of x and y over it, and integral of x² + y²; of a hole alone
     the area is below 0.
+
+    Args:
+        contours: of one polygon.
     """
     area, first, second = 0.0, np.zeros(2), 0.0
     for a in contours:
@@ -26,12 +29,20 @@ def polygon_moments(contours: Contours) -> tuple[float, Array, float]:
 
 
 def perimeter(contours: Contours) -> float:
-    """Length of all edges."""
+    """Length of all edges.
+
+    Args:
+        contours: of one polygon.
+    """
     return sum(float(np.hypot(*(np.roll(c, -1, axis=0) - c).T).sum()) for c in contours)
 
 
 def points_along_edges(contours: Contours, count: int) -> Array:
-    """(count, 2) places evenly along all edges."""
+    """(count, 2) places evenly along all edges.
+
+    Args:
+        contours: of one polygon.
+    """
     start = np.concatenate(list(contours))
     edge = np.concatenate([np.roll(c, -1, axis=0) for c in contours]) - start
     long = np.hypot(*edge.T)

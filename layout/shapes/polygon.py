@@ -249,6 +249,10 @@ def twice_area(points: Array) -> int:
 def edge_error(points: Array, radius: float) -> float:
     """Largest distance between a polygon around the origin and a circle: at a vertex or
     at the foot of an edge.
+
+    Args:
+        points: (n, 2) corners.
+        radius: of the circle.
     """
     p, q = points.astype(float), np.roll(points, -1, axis=0).astype(float)
     edge = q - p

@@ -15,6 +15,9 @@ def split_rectilinear(points: Array) -> Array:
     """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by
     slab.
 
+    Args:
+        points: (m, 2) corners.
+
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
     """
@@ -43,6 +46,9 @@ def split_rectilinear(points: Array) -> Array:
 def covering_rectangles(shape: Array) -> Array:
     """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of
     slices 5 um high or more.
+
+    Args:
+        shape: (n, 2) corners.
     """
     step = np.roll(shape, -1, axis=0) - shape
     if not (step != 0).all(1).any():
@@ -73,6 +79,10 @@ def covering_rectangles(shape: Array) -> Array:
 
 
 def box_corners(box: Array) -> Array:
-    """(4, 2) corners of left, bottom, right, top, counter-clockwise."""
+    """(4, 2) corners of left, bottom, right, top, counter-clockwise.
+
+    Args:
+        box: (4,) left, bottom, right, top.
+    """
     left, bottom, right, top = np.asarray(box).tolist()
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])

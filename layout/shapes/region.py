@@ -11,7 +11,11 @@ from metalens.core.arrays import Array
 
 
 def union_contours(polygons: Iterable[Array]) -> list[Array]:
-    """Contours of the union: outlines counter-clockwise, holes clockwise."""
+    """Contours of the union: outlines counter-clockwise, holes clockwise.
+
+    Args:
+        polygons: (n, 2) corners each.
+    """
     return _contours(_section(polygons))
 
 
@@ -38,6 +42,7 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
 
     Args:
         grid: step of the places of the cuts.
+        contours: outlines counter-clockwise, holes clockwise.
     """
     return list(_cut(_section(contours, filled=False), grid))
 

@@ -181,6 +181,9 @@ def focus_window(
     Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
 
     depths_um: left out: the source distance of the design.
+
+    Args:
+        lens: as designed.
     """
     depths = np.array(
         [lens.source_distance_um] if depths_um is None else depths_um, float

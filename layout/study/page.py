@@ -28,6 +28,9 @@ Answers = Mapping[
 def answers_of(lens: Lens) -> Answers:
     """How the pillars answer to height, wall, index and their kin, from the solver.
 
+    Args:
+        lens: as designed.
+
     Raises:
         CellError, MaterialError: from the solver of the pillar.
     """
@@ -47,6 +50,10 @@ def study_sections(
     Of pillars of two sizes two sections for light along x and two for light along y.
 
     answers: :func:`answers_of` the lens.
+
+    Args:
+        process: spread and write field.
+        plan: write fields.
     """
     if lens.pairs is None:
         return _of_light(lens, process, plan, answers[""])
@@ -129,7 +136,13 @@ def _stitched(found: StitchReport) -> bytes:
 def tolerance_section(
     lens: Lens, process: Process, answers: LogSensitivities | PairSensitivities
 ) -> Section:
-    """Each cause alone and all together, and what the numbers are not of."""
+    """Each cause alone and all together, and what the numbers are not of.
+
+    Args:
+        lens: as designed.
+        process: spread.
+        answers: sensitivities of the pillars.
+    """
     study = tolerance.analyse_tolerance(lens, process, sens=answers)
     rows = [
         [

@@ -75,6 +75,10 @@ def classify_pillars(
 ) -> tuple[Array, Array, PillarKindsOfLens]:
     """((y, x) kind of each site from 1 on, 0 none; (kinds,) how many of each; what
     their t follows from).
+
+    Args:
+        lens: as designed.
+        sens: sensitivities of its pillars.
     """
     own = Kinds.of(lens.diameters)
     index = (own.index(lens.diameters) + 1) % (len(own.count) + 1)

@@ -92,6 +92,12 @@ def reduce_spread(
 ) -> SpreadModel:
     """Find the basis from random draws of the spread, and sum the pillars for each of
     its functions.
+
+    Args:
+        lens: as designed.
+        sens: sensitivities of its pillars.
+        focus: sums of a window.
+        seed: of the random draws.
     """
     index, count, pillars = classify_pillars(lens, sens)
     states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
@@ -162,6 +168,10 @@ def _summed(
 def reduction_error(model: SpreadModel, lenses: Sequence[Draw]) -> float:
     """Largest rms relative error of t over the pillars in any draw, at the centre and
     on both sides of the edge.
+
+    Args:
+        model: reduced lens.
+        lenses: draws of the process.
     """
     worst = 0.0
     for draw in lenses:

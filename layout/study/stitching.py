@@ -54,6 +54,13 @@ def simulate_stitching(
     The mean offset of the fields, which only moves the image, is taken out of each
     draw.
 
+    Args:
+        lens: as designed.
+        plan: write fields.
+        process: stitching error.
+        draws: number of them.
+        seed: of the draws.
+
     Accuracy:
         terms beyond the second order in the offset: (k NA offset)^3 / 6, below 1e-5 at
         20 nm and NA 0.25.
@@ -97,7 +104,13 @@ def simulate_stitching(
 
 
 def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, Array]:
-    """(fields that hold pillars, (fields, nodes y, nodes x) sums of their pillars)."""
+    """(fields that hold pillars, (fields, nodes y, nodes x) sums of their pillars).
+
+    Args:
+        lens: as designed.
+        plan: write fields.
+        focus: sums of a window.
+    """
     found = []
     for rows, columns in plan.blocks():
         if not lens.diameters.diameter_um[rows, columns].any():

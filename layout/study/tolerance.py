@@ -119,6 +119,7 @@ def analyse_tolerance(
             middle of the depths at which
             the lens blurs (:mod:`metalens.lens.reach`). The design source is always
             looked at as well.
+        seed: of the draws.
 
     Accuracy: see ``error`` of the report (measured); bands of percentiles carry the
     sampling error of ``draws``.

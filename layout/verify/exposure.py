@@ -85,6 +85,7 @@ def verify_exposure(
         content: read back; sums over its placements are enough.
         doses: its dose table. height_um: of the pillars, for their feet.
         keep: is given the rows of all lattices, in turn; memory is bounded.
+        process: point exposure, bias, etch and layers.
 
     Accuracy: the field on nodes to some 1e-4 (the result states the difference from
     direct sums); widths by the slope at the drawn edge, 3 % of a shift of 4 nm.
@@ -134,6 +135,10 @@ def read_scene(
     process: Process,
 ) -> WrittenMask:
     """Shapes, doses and layers of a file, on the lattices of its plan.
+
+    Args:
+        content: read back.
+        process: layers.
 
     Raises:
         ProcessError: a class that is not one outline, or no pillar with a dose.

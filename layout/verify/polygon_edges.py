@@ -52,6 +52,10 @@ class EdgeSamples:
 def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
     """Every few um along the outline of what each layer number draws, two ranges and
     more away from corners.
+
+    Args:
+        polygons: with their layers.
+        range_um: of the core of the point exposure.
     """
     places, normals, layers = (
         [np.empty((0, 2))],
@@ -95,6 +99,10 @@ def exposure_at_edges(
 ) -> Array:
     """(n,) exposure at points by the polygons with their doses, for (range, weight) of
     each Gaussian.
+
+    Args:
+        at_um: (n, 2) points.
+        terms: range and weight of each Gaussian.
     """
     total = np.zeros(len(at_um))
     if not (len(at_um) and terms):
@@ -124,7 +132,11 @@ def exposure_at_edges(
 
 
 def slope_aside(found: EdgeSamples) -> tuple[Array, Array]:
-    """Points just outside and just inside the edges."""
+    """Points just outside and just inside the edges.
+
+    Args:
+        found: samples on edges.
+    """
     return (
         found.at_um + _ASIDE_UM * found.normal,
         found.at_um - _ASIDE_UM * found.normal,
