@@ -17,9 +17,8 @@ from metalens.fabrication.perturbations import (
     ResponseError,
     WavefrontError,
 )
-from metalens.fabrication.response import Answer, Sensitivity
-from metalens.fabrication.solved import Solved
-from metalens.fabrication.state import State
+from metalens.fabrication.process import State
+from metalens.fabrication.response import Answer, Sensitivity, Solved
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
