@@ -13,13 +13,8 @@ from layout.study.spread_model import SpreadModel, reduce_spread, reduction_erro
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
-from metalens.fabrication import (
-    Draw,
-    PairSensitivities,
-    State,
-    pair_sensitivities,
-    spread,
-)
+from metalens.fabrication import Draw, PairSensitivities, State, pair_sensitivities
+from metalens.fabrication import draws as draw_lenses
 from metalens.lens import Lens, reach
 from metalens.psf import encircled_power, find_peak, fwhm
 
@@ -152,11 +147,7 @@ def analyse_tolerance(
         for name, s in process.spread.stated.items()
         for sign in (-1, 1)
     ]
-    everything = [
-        Draw({}),
-        *single,
-        *spread.draws(process.spread, draws, seed=seed + 1),
-    ]
+    everything = [Draw({}), *single, *draw_lenses(process.spread, draws, seed=seed + 1)]
     outcome = _outcome(model, [draw.state() for draw in everything], step_um)
     nominal, alone, many = (
         _part(outcome, part)
