@@ -143,7 +143,13 @@ class SimulatedFrames:
 def simulate_frames(
     lens: Lens, truth: HiddenLens, response: Sensitivity
 ) -> SimulatedFrames:
-    """Frames with noise; the same seed gives the same frames."""
+    """Frames with noise; the same seed gives the same frames.
+
+    Args:
+        lens: the design.
+        truth: the hidden lens and its captures.
+        response: what height, index and sidewall do to the pillars.
+    """
     random = np.random.default_rng(truth.seed)
     light = bench_irradiance(lens, truth, response)
     electrons = light * (truth.peak_e / light.max()) + background_plane(truth)
@@ -166,6 +172,11 @@ def simulate_frames(
 def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Array:
     """(n, y, x) noise-free light in the pixels, in units of its own; background left
     out.
+
+    Args:
+        lens: the design.
+        truth: the hidden lens and its captures.
+        response: what height, index and sidewall do to the pillars.
     """
     x = truth.vector()
     stated, angles = truth.stated
@@ -385,7 +396,11 @@ def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:
 
 
 def background_plane(truth: HiddenLens) -> Array:
-    """(y, x) electrons of the background plane."""
+    """(y, x) electrons of the background plane.
+
+    Args:
+        truth: the hidden lens and its captures.
+    """
     x, camera = truth.vector(), truth.camera
     n = camera.pixels
     edge = (np.arange(n) - (n - 1) / 2) / (n / 2)

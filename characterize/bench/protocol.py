@@ -156,6 +156,10 @@ def plan_captures(
     Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change
     the weights in second order.
 
+    Args:
+        protocol: what the bench can do.
+        response: what height, index and sidewall do to the pillars.
+
     Raises:
         FitError: as :class:`ForwardModel`.
     """
@@ -370,6 +374,12 @@ def candidate_information(
 ) -> tuple[Array, Array]:
     """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every
     candidate frame.
+
+    Args:
+        lens: the design.
+        protocol: what the bench can do.
+        response: what height, index and sidewall do to the pillars.
+        names: of the parameters.
     """
     near, far = protocol.depths_um
     depths = 1 / np.linspace(1 / near, 1 / far, protocol.depth_count)
@@ -420,6 +430,12 @@ def choose_frames(
     are kept, where there are so
     many. An optimum has hardly more places than its model needs, and nothing to test
     that model with.
+
+    Args:
+        information: (candidates, p, p) of each frame.
+        prior: (p, p) information known beforehand.
+        criterion: which optimality is asked for.
+        names: (p,) names of the fitted parameters.
     """
     chosen: list[int] = []
     total = prior.copy()
@@ -459,6 +475,11 @@ def design_criterion(
 ) -> float:
     """What is to be large: det^(1/p) in typical units (D), or p over the sum of
     variances in typical units (A).
+
+    Args:
+        information: (p, p) of all frames.
+        criterion: which optimality is asked for.
+        names: of the parameters.
     """
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values = np.maximum(np.linalg.eigvalsh(information * np.outer(unit, unit)), 1e-12)

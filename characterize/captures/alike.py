@@ -9,7 +9,11 @@ from metalens.core.arrays import Array
 
 
 def above_rim(frames: Array) -> Array:
-    """Frames less a plane through their rim, holes filled by the frame's median."""
+    """Frames less a plane through their rim, holes filled by the frame's median.
+
+    Args:
+        frames: (n, y, x) frames.
+    """
     out = np.empty(frames.shape)
     ny, nx = frames.shape[1:]
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
@@ -52,7 +56,12 @@ def normalized_cross_correlation(
 
 
 def shift_frames(light: Array, shift: tuple[int, int]) -> Array:
-    """(..., y, x) moved by whole pixels (y, x); nothing comes in from outside."""
+    """(..., y, x) moved by whole pixels (y, x); nothing comes in from outside.
+
+    Args:
+        light: (..., y, x) light.
+        shift: (y, x) pixels.
+    """
     out = np.zeros_like(light)
     rows, columns = light.shape[-2:]
     dy, dx = shift

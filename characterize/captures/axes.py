@@ -21,6 +21,9 @@ def stated_axes(about: dict[str, Any], where: str) -> str | None:
     """``axes`` of the capture's description, which is taken out; None where it says
     nothing.
 
+    Args:
+        about: entries of the capture's description.
+
     Raises:
         CaptureError: none of ``ORDERS``.
     """
@@ -49,6 +52,7 @@ def frames_first(
     taken is said.
 
     Args:
+        path: the file.
         stack: (n, y, x) or (y, x, n), of colour images with these behind.
         order: one of ``ORDERS``, or None.
         count: of its frames, where it is known.
@@ -99,6 +103,8 @@ def as_large(
     it lay otherwise.
 
     Args:
+        stack: images as they lie in the file.
+        path: the file.
         size: (y, x) of the frames as they are used, one pixel in ``pitch`` each way of
             those on disk.
     """

@@ -103,6 +103,9 @@ def load(path: str | Path) -> Capture:
     file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its
     ImageJ or OME tags.
 
+    Args:
+        path: the file or folder.
+
     Raises:
         CaptureError: nothing there, lossy or truncated images, frames of different
             size, non-finite values,
@@ -137,6 +140,9 @@ def load(path: str | Path) -> Capture:
 def read_images(path: Path) -> Array:
     """(n, y, x) grey images of one file, in its own number type.
 
+    Args:
+        path: the file.
+
     Raises:
         CaptureError: unknown, lossy, truncated or non-finite; colour.
     """
@@ -170,6 +176,10 @@ def _beside(path: Path, colours: ColourChannels, size: tuple[int, ...]) -> Stack
 def check_images(images: Array, path: Path) -> Array:
     """Images as they are.
 
+    Args:
+        images: (n, y, x), or with colours last.
+        path: the file.
+
     Raises:
         CaptureError: empty, of numbers that hold no counts, or non-finite.
     """
@@ -182,6 +192,10 @@ def check_images(images: Array, path: Path) -> Array:
 def read_all(path: Path, colours: ColourChannels = _PLAIN) -> Array:
     """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they
     lie there.
+
+    Args:
+        path: the file.
+        colours: which channel is lit, and how a mosaic lies.
 
     Raises:
         CaptureError: unknown, lossy or truncated.

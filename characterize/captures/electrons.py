@@ -150,6 +150,9 @@ def to_electrons(capture: Capture) -> ElectronFrames:
     beforehand by whoever wants one frame a position; without that every exposure is
     fitted as its own frame.
 
+    Args:
+        capture: frames in counts with their stage and camera.
+
     Raises:
         CaptureError: all pixels are bad, or everything is saturated.
     """
@@ -197,6 +200,9 @@ def to_electrons(capture: Capture) -> ElectronFrames:
 def saturation_level(capture: Capture) -> float:
     """Count at which pixels clip: full scale, or a lower plateau at the maximum shared
     by many pixels (full well).
+
+    Args:
+        capture: frames in counts with their stage and camera.
     """
     frames = capture.frames
     highest = float(frames.max())
@@ -246,6 +252,9 @@ def bad_pixels(capture: Capture) -> Array:
     in every one of >= 3 frames.
     Constant pixels count where they differ from those around them: a dark background of
     few bits is constant too.
+
+    Args:
+        capture: frames in counts with their stage and camera.
     """
     frames = np.asarray(capture.frames, float)
     bad = _lonely(frames)

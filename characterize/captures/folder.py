@@ -56,12 +56,15 @@ _CURES = {
 def conversion_hint(suffix: str) -> str:
     """How to save anew what is held in a kind of file that is not read; empty where
     that is not known.
+
+    Args:
+        suffix: ending of the file's name.
     """
     return f": save it {_CURES[suffix]}" if suffix in _CURES else ""
 
 
 def list_images(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Image files of a folder in the order of their names, numbers counted (frame_2
+    """Image files of a folder with one of ``suffixes`` in the order of their names, numbers counted (frame_2
     before frame_10).
 
     Files that a system keeps hidden (._frame.tif of a disk that a Mac wrote to) are
@@ -78,6 +81,9 @@ def list_images(folder: Path, suffixes: Collection[str]) -> list[Path]:
 def find_table(folder: Path, kind: str) -> Path | None:
     """The file ``stage`` or ``capture`` of a folder, in capital letters or small ones;
     None where there is none.
+
+    Args:
+        kind: ``stage`` or ``capture``.
 
     Raises:
         CaptureError: there is one in another format (``stage.xlsx``), which nothing
@@ -104,6 +110,9 @@ def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]
     """What to say of images in kinds of file that are not read; ``beside``: dark and
     flat, where they are there.
 
+    Args:
+        folder: the capture folder.
+
     Raises:
         CaptureError: a dark frame or a flat is among them.
     """
@@ -128,6 +137,9 @@ def unread_images_text(folder: Path, beside: Collection[str]) -> tuple[str, ...]
 def check_steps(files: Sequence[Path], folder: Path) -> None:
     """Refuse numbered frames of which one is missing, where their order alone would say
     their depths.
+
+    Args:
+        folder: the capture folder.
 
     Raises:
         CaptureError: numbers that go by unlike steps, in files that differ in one

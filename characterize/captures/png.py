@@ -15,6 +15,9 @@ _LEAST = 33  # bytes of a PNG's mark and head
 def read_png(path: Path) -> Array:
     """(y, x) image of a file, or (1, y, x, red green blue [alpha]).
 
+    Args:
+        path: the file.
+
     Raises:
         CaptureError: truncated, no PNG file, or its head claims more than the file
             holds.

@@ -150,6 +150,9 @@ def read_beside(path: Path) -> dict[str, Any]:
     """Entries of the TOML or JSON file of the same name beside an image file; empty
     where there is none.
 
+    Args:
+        path: the image file.
+
     Raises:
         CaptureError: as :func:`read_about`.
     """
@@ -214,6 +217,9 @@ def _checked(about: dict[str, Any], path: Path) -> dict[str, Any]:
 def ome_entries(xml: str, name: str) -> Iterator[dict[str, str]]:
     """Attributes of each element of a name in OME-XML, of whatever namespace.
 
+    Args:
+        xml: OME-XML text.
+
     Raises:
         ElementTree.ParseError: no XML.
     """
@@ -231,6 +237,9 @@ def ome_positions(xml: str) -> Array:
     which they are written down;
     empty where one has no position or one in a unit that is no length ("reference
     frame").
+
+    Args:
+        xml: OME-XML text.
 
     Raises:
         ElementTree.ParseError: no XML.
@@ -364,6 +373,10 @@ def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]
 def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
     """What to say of images in the folder that the stage file does not name.
 
+    Args:
+        files: image files of the folder.
+        rows: rows of the stage file.
+
     Raises:
         CaptureError: they are called as dark frames or flats, and would not be used.
     """
@@ -385,7 +398,11 @@ def left_out(files: Sequence[Path], rows: StageRows) -> tuple[str, ...]:
 
 
 def unread_keys_text(about: dict[str, Any]) -> tuple[str, ...]:
-    """What to say of entries of a capture's description that nothing reads."""
+    """What to say of entries of a capture's description that nothing reads.
+
+    Args:
+        about: entries of the capture's description.
+    """
     rest = [reading.to_valid_utf8(name) for name in about if name not in _KNOWN]
     return (
         (

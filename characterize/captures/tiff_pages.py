@@ -38,6 +38,7 @@ def read_tiff(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Ar
     """(n, y, x) images of a file, or (n, y, x, colours).
 
     Args:
+        path: the file.
         coloured: separate planes are the colours of an image; else they are images,
             since some writers take a stack of
             three or four for colours.
@@ -95,6 +96,9 @@ def page_order(path: Path) -> str | None:
     one, as cameras and image programs
     do; None of an array that was written at once (tifffile), whose axes may be any,
     unless it says them.
+
+    Args:
+        path: the file.
     """
     import tifffile
 

@@ -45,6 +45,9 @@ class TiffTags:
 def read_tags(path: Path) -> TiffTags:
     """Tags of a TIFF file; nothing where it has none of these.
 
+    Args:
+        path: the file.
+
     Raises:
         CaptureError: several channels in one file.
     """

@@ -25,7 +25,11 @@ _STATED = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
 
 
 def run(options: Options) -> int:
-    """Shoot and write, or plan; exit 0."""
+    """Shoot and write, or plan; exit 0.
+
+    Args:
+        options: options of the command.
+    """
     if (options.truth is None) == (options.protocol is None):
         raise ConfigError(
             "give either --truth truth.toml (a virtual bench) or --protocol protocol.toml (a plan)"

@@ -41,7 +41,11 @@ class MetrologySettings:
 
 
 def run(options: Options) -> int:
-    """Fit; exit 0 when all checks passed, 1 when a result fails its own checks."""
+    """Fit; exit 0 when all checks passed, 1 when a result fails its own checks.
+
+    Args:
+        options: options of the command.
+    """
     target = options.output
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")

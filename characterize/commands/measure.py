@@ -70,6 +70,9 @@ class Options(CommonOptions):
 def run(options: Options) -> int:
     """Measure and write; exit 0, or 1 where no pillar could be measured or most sites
     hold what is no round one.
+
+    Args:
+        options: options of the command.
     """
     if options.pixel_nm is None and options.bar_nm is None and options.edge_um is None:
         options = dataclasses.replace(

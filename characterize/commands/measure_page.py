@@ -28,7 +28,12 @@ _NAMED = 8  # lines that a legend holds
 
 
 def frames_page(path: Path, found: frames.CaptureQuality) -> None:
-    """Every frame with its numbers, and encircled energy over the radius."""
+    """Every frame with its numbers, and encircled energy over the radius.
+
+    Args:
+        path: the page to write.
+        found: quality of the frames.
+    """
     columns = {
         words: [attrgetter(name)(row) for row in found.frames]
         for name, words in COLUMNS.items()
@@ -95,7 +100,14 @@ def _curves(found: frames.CaptureQuality) -> bytes:
 def edge_page(
     path: Path, image: Array, found: metrics.EdgeMtf, *, pixel_um: float
 ) -> None:
-    """The edge and the modulation across it."""
+    """The edge and the modulation across it.
+
+    Args:
+        path: the page to write.
+        image: (y, x) picture.
+        found: modulation across the edge.
+        pixel_um: pitch of the pixels, um.
+    """
     figure, (picture, curve) = report.make_figure(1, 2)
     picture.imshow(image, cmap="gray")
     picture.set_axis_off()
@@ -124,7 +136,15 @@ def micrograph_page(
     *,
     pixel_nm: float,
 ) -> None:
-    """The picture with a circle on every pillar, coloured by its error; the bias table."""
+    """The picture with a circle on every pillar, coloured by its error; the bias table.
+
+    Args:
+        path: the page to write.
+        image: (y, x) picture.
+        found: measured pillars.
+        laid: the micrograph's pillars on the mask.
+        pixel_nm: size of a pixel, nm.
+    """
     caption = "Circles: measured edges, coloured by the error against the design (diameter where there is none); "
     caption += "crosses: missing; squares: collapsed; thick: outliers."
     sections = [

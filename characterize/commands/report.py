@@ -22,7 +22,11 @@ BESIDE = (
 
 
 def pupil_report(path: Path, fit: PupilFit) -> None:
-    """Write the page of a generic pupil fit."""
+    """Write the page of a generic pupil fit.
+
+    Args:
+        path: the page to write.
+    """
     score = fit.held_out or fit.agreement
     keys = [
         report.KeyFigure(
@@ -69,6 +73,10 @@ def asbuilt_report(
     of each parameter as a curve;
     correlations; what to measure next. ``truth``: hidden values by name, where they are
     known, drawn beside the fit.
+
+    Args:
+        path: the page to write.
+        result: the as-built lens.
     """
     sure = float(
         np.mean(
@@ -251,7 +259,11 @@ def _parameters(result: AsBuilt) -> report.Table:
 
 
 def typical_sigma(name: str) -> float:
-    """Typical uncertainty of a parameter."""
+    """Typical uncertainty of a parameter.
+
+    Args:
+        name: of the parameter.
+    """
     return PARAMETERS[PLACE[name]].scale
 
 
@@ -352,6 +364,12 @@ def frames_figure(
 ) -> bytes:
     """PNG of all frames, twelve to a band: one row for each stack, the last for the
     residual in sigma (-5 to 5).
+
+    Args:
+        stacks: (n, y, x) frames, one stack a row.
+        residual_sigma: (n, y, x) residual over its noise.
+        labels: one for each stack.
+        titles: one for each frame.
     """
     from matplotlib.figure import Figure
 

@@ -17,7 +17,11 @@ from metalens.view import ImagePanel, Panel, SliderAxis, TablePanel, at_brightes
 
 
 def capture_panels(path: Path) -> list[Panel]:
-    """Every frame of a capture, in counts, and what was written down with it."""
+    """Every frame of a capture, in counts, and what was written down with it.
+
+    Args:
+        path: the file.
+    """
     read = captures.load(path)
     frames = np.asarray(read.frames, float)
     step = read.pixel_um if np.isfinite(read.pixel_um) else 1.0
@@ -62,6 +66,9 @@ def capture_panels(path: Path) -> list[Panel]:
 def asbuilt_panels(path: Path) -> list[Panel]:
     """The lens as built: its parameters with intervals, frames beside fit and residual,
     and its PSFs.
+
+    Args:
+        path: the file.
     """
     made = AsBuilt.load(path)
     axis = [
@@ -103,6 +110,9 @@ def asbuilt_panels(path: Path) -> list[Panel]:
 def pupil_panels(path: Path) -> list[Panel]:
     """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the
     numbers.
+
+    Args:
+        path: the file.
     """
     stored = store.load(path, "pupil")
     held, about = stored.arrays, stored.attributes

@@ -83,6 +83,9 @@ class FrameArrangement:
 def few_frames(setting: FrameSetting) -> Array:
     """Frames that tell the starts apart: the ends and the middle of the depths at every
     angle.
+
+    Args:
+        setting: depths, angles and window of the frames.
     """
     chosen: list[int] = []
     for angle in np.unique(setting.angle_rad, axis=0):
@@ -111,6 +114,11 @@ def find_arrangement(
     shifted by a depth or two looks
     like one in another order. What needs less putting right and is as much alike is
     taken.
+
+    Args:
+        model: the forward model.
+        data: frames, masks and noise that are fitted.
+        start: (p,) where it begins.
     """
     frames = _Frames.of(model, data)
     start = parameter_vector() if start is None else start.copy()
@@ -455,7 +463,11 @@ def _bare(x: Array) -> Array:
 
 
 def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
-    """Frames turned and put in order as the arrangement says, where it is clear."""
+    """Frames turned and put in order as the arrangement says, where it is clear.
+
+    Args:
+        values: (n, y, x) values of the frames.
+    """
     out = (
         orient_frames(values, arrangement.orientation)
         if arrangement.clearly
@@ -467,6 +479,9 @@ def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
 def laid_words(found: FrameArrangement) -> list[str]:
     """What to say of how the frames lie: turned or reordered, and what of that cannot
     be seen.
+
+    Args:
+        found: how the frames lie.
     """
     words = []
     if found.clearly:

@@ -338,6 +338,10 @@ def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
 def save(path: str | Path, result: AsBuilt) -> None:
     """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it can
     be used alone.
+
+    Args:
+        path: the file to write.
+        result: the as-built lens.
     """
     arrays, attributes = records.flatten_record(result)
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
@@ -349,6 +353,9 @@ def save(path: str | Path, result: AsBuilt) -> None:
 @typed_reader
 def load(path: str | Path) -> AsBuilt:
     """Read an as-built file.
+
+    Args:
+        path: the file.
 
     Raises:
         StoreError: not an as-built file.

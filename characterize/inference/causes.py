@@ -83,6 +83,10 @@ def systematic_changes(
 
     From differences of images that leave ``_ENOUGH`` of a field out: what causes are
     taken for moves by a percent.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        x: all parameters, in the order of ``PARAMETERS``.
     """
     task = dataclasses.replace(
         task, model=task.model.rough(max(task.model.cut, _ENOUGH))
@@ -378,7 +382,13 @@ def write_fields(lens: Lens) -> Array:
 
 
 def smooth_phase_changes(u: Array, v: Array, count: int) -> Array:
-    """Smooth phases that no parameter describes, then leans and defocus."""
+    """Smooth phases that no parameter describes, then leans and defocus.
+
+    Args:
+        u: x on the lens over its radius.
+        v: y on the lens over its radius.
+        count: of the phases.
+    """
     return np.concatenate(
         [thin_plate_basis(u, v, MODES), np.stack([u, v, u * u + v * v])]
     )[:count]
@@ -430,6 +440,7 @@ def seen_at(model: ForwardModel, x: Array, places: Sequence[Array]) -> Array:
     Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order.
 
     Args:
+        model: the forward model.
         places: k matrices (2, 2) from (y, x) of a pixel, counted from the window's
             middle, to where it lies.
     """

@@ -94,6 +94,7 @@ def fit(
     """The as-built lens behind a capture.
 
     Args:
+        options: free parameters, stated values, window and search range.
         response: what height, index and sidewall do to the pillars; from the cell
             solvers without it.
 

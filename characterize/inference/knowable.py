@@ -15,6 +15,8 @@ def correlated_pairs(
     about.
 
     Args:
+        names: (p,) names of the fitted parameters.
+        covariance: (p, p) of the parameters.
         sigma_prior: (p,) prior standard deviation of each, inf where none.
     """
     sigma = np.sqrt(np.diag(covariance))
@@ -46,6 +48,11 @@ def identifiable_combinations(
 ) -> list[str]:
     """Combinations (in typical units) that the frames alone fix better than prior
     knowledge, best first, in words.
+
+    Args:
+        names: (p,) names of the fitted parameters.
+        information: (p, p) Fisher information of the frames alone.
+        sigma_prior: (p,) prior standard deviations, inf where none.
     """
     values, vectors = information_eigenvectors(names, information)
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
@@ -74,6 +81,9 @@ def information_eigenvectors(
 ) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of the information in units of each parameter's
     typical scale.
+
+    Args:
+        names: (p,) names of the fitted parameters.
     """
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
@@ -86,6 +96,9 @@ def profile_density(curve: Array, at: Array) -> Array:
 
     The signed root of the rise, straight where the valley is a parabola, runs linearly
     between the points and beyond.
+
+    Args:
+        curve: (2, points) values and rise of -2 ln L.
     """
     value, keep = np.unique(curve[0], return_index=True)
     root = np.sqrt(np.maximum(curve[1][keep], 0.0))

@@ -232,6 +232,11 @@ def fit_levenberg_marquardt(
     Stops when a full step moves every combination of parameters by less than
     ``step_tolerance`` sigma.
 
+    Args:
+        data: frames, masks and noise.
+        prior: prior knowledge of the fitted parameters.
+        settings: when to stop.
+
     Raises:
         FitError: the model is not finite at the start, or no pixel is usable.
     """

@@ -57,7 +57,11 @@ class ResidualFinding:
 def decisive_findings(
     found: Sequence[ResidualFinding], sigma: float = 5.0
 ) -> list[str]:
-    """Findings beyond ``sigma``, in words: no fit with one passes its checks."""
+    """Findings beyond ``sigma``, in words: no fit with one passes its checks.
+
+    Args:
+        found: what residuals hold.
+    """
     return [one.words for one in found if one.sigma > sigma]
 
 
@@ -160,6 +164,10 @@ class UnmodelledShifts:
 def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
     """Look for every cause that is not fitted, by the image and the slopes that a fit
     ended with.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        mode: the fit it is judged at.
     """
     x, image, slopes = task.all_of(mode.value), mode.image, mode.slopes
     root = np.where(
@@ -250,6 +258,7 @@ def to_fit(
     than not.
 
     Args:
+        found: score tests.
         stuck: a parameter ran to its bound, so that any cause may stand behind it.
         most: causes that are fitted in turn to see which explains most.
     """
@@ -264,6 +273,9 @@ def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
 
     Nothing where all is chance. Its significance is that of a normal variable which is
     as improbable.
+
+    Args:
+        found: score tests, the most telling first.
     """
     told = [one for one in found if one.chance < CHANCE]
     if not told:
@@ -291,6 +303,9 @@ def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
 
     The fit then bends the lens, or turns the frames, until the spots of all angles lie
     where their windows are.
+
+    Args:
+        found: score tests.
     """
     most = max((one.chi2 - one.degrees for one in found), default=0.0)
     return [
@@ -307,6 +322,9 @@ def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
 def undetectable_effects(found: list[ScoreTest]) -> list[str]:
     """Causes that are not fitted and cannot be told from what is, with what they would
     be taken for.
+
+    Args:
+        found: score tests.
     """
     return [f"{one.cause} is not fitted: {one.taken}" for one in found if one.taken]
 

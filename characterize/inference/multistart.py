@@ -223,6 +223,9 @@ def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSo
     with a gradient of either sign.
 
     Again from a new best.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
     """
     for _ in range(_AGAIN):
         best = ends[0]
@@ -244,6 +247,9 @@ def scan_parameter(
 
     It is held at places across its prior with all others fitted to a few frames, from
     the best mode outwards; minima on the way are followed with all free, on all frames.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
     """
     kept = list(modes)
     for _ in range(_AGAIN):
@@ -294,6 +300,10 @@ def follow_starts(
     as much as the best.
 
     At most ``_MOST`` ends, none that leads to the best itself or to another.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        begins: (p,) starts.
     """
     settings = SolverSettings(
         iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False
@@ -320,6 +330,10 @@ def bias_reversals(task: SearchTask, best: FitSolution) -> list[Array]:
     images show products of its parts
     nearly alone, which are the same for a field of the other sign. Then each gradient
     that does, and these together.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        best: fit that is reversed.
     """
     value, covariance = best.value, best.covariance
     rows = usual_parameters(task.names, task.model.lens)
@@ -345,7 +359,12 @@ def bias_reversals(task: SearchTask, best: FitSolution) -> list[Array]:
 
 
 def refine_fit(task: SearchTask, value: Array) -> FitSolution:
-    """A fit to the end from values of the fitted parameters."""
+    """A fit to the end from values of the fitted parameters.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        value: (p,) where the fit begins.
+    """
     return _long(task, value)
 
 
@@ -355,6 +374,9 @@ def hold_windows(task: SearchTask, value: Array) -> SearchTask:
     Frames begin where the light lies, up to a pixel off the decentre (a prism of the
     bias moves light too): at NA 0.2
     and 6000 electrons half a pixel each way moves trefoil by 0.7 sigma.
+
+    Args:
+        value: (p,) fitted parameters.
     """
     model, x = task.model, task.all_of(value)
     middle = float(x[PLACE["decentre_x_um"]]), float(x[PLACE["decentre_y_um"]])
@@ -387,6 +409,10 @@ def widen_search(
 ) -> tuple[SearchTask, list[FitSolution]] | None:
     """A search with more parameters from where the usual ones led; None where they lead
     out of the model's range.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        begin: (p,) start of the search.
     """
     try:
         return search_modes(task, begins=[begin])
@@ -397,6 +423,10 @@ def widen_search(
 def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> float:
     """-2 ln posterior of a short fit with further parameters, from where the best is;
     infinite where they lead out of the model's range.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        frees: names of the parameters that are fitted too.
     """
     more = dataclasses.replace(task, free=(*task.free, *frees), left_out=None)
     x = task.all_of(best.value)
@@ -412,7 +442,11 @@ def merit_with(task: SearchTask, best: FitSolution, frees: Sequence[str]) -> flo
 
 
 def distinct_modes(ends: Sequence[FitSolution]) -> list[FitSolution]:
-    """Ends that are not the same, best first, within ``MODES_WITHIN`` of the best."""
+    """Ends that are not the same, best first, within ``MODES_WITHIN`` of the best.
+
+    Args:
+        ends: fits that were led to an end.
+    """
     kept: list[FitSolution] = []
     for one in sorted(ends, key=lambda e: e.merit):
         near = one.merit < kept[0].merit + MODES_WITHIN if kept else True
@@ -483,7 +517,11 @@ def _opened(task: SearchTask, x: Array) -> dict[str, float]:
 
 
 def names_of(known: dict[str, KnownValue], free: Sequence[str]) -> tuple[str, ...]:
-    """What is fitted: the usual, what is asked for, what is known with an error."""
+    """What is fitted: the usual, what is asked for, what is known with an error.
+
+    Args:
+        free: names of further parameters.
+    """
     for name in free:
         parameter_vector({name: 0.0})
     wanted = {p.name for p in PARAMETERS if p.free} | set(free)
@@ -497,6 +535,10 @@ def prior_of(
 ) -> GaussianPrior:
     """Priors of the fitted parameters: metrology where there is, else what is usual for
     such a lens.
+
+    Args:
+        names: (p,) names of the fitted parameters.
+        known: stated values by name.
     """
     table = usual_parameters(names, lens)
     entries = [known.get(name) for name in names]
@@ -514,7 +556,12 @@ def prior_of(
 
 
 def with_values(x: Array, values: dict[str, float]) -> Array:
-    """All parameters, some set by name."""
+    """All parameters, some set by name.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+        values: by name.
+    """
     out = x.copy()
     for name, value in values.items():
         out[PLACE[name]] = value
@@ -524,6 +571,10 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
 def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, float]:
     """(x, y) of the window's middle from the chief ray, as the light lies in the
     frames.
+
+    Args:
+        found: how the frames lie.
+        model: the forward model.
     """
     most = _ASIDE_UM * coarser(model.lens.wavelength_um)
     x, y = (
@@ -538,6 +589,10 @@ def starting_points(
 ) -> list[Array]:
     """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain,
     background off the frames.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        biases_nm: bias of each start, nm at 0.85 um.
     """
     model, data, found = task.model, task.data, task.found
     if found is None:

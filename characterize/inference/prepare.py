@@ -43,6 +43,10 @@ def merge_exposures(
 
     As they are where exposures are not known, or differ and nobody says what is counted
     without light.
+
+    Args:
+        capture: frames in counts with their stage and camera.
+        frames: the same in electrons.
     """
     place = np.column_stack([capture.position_um, capture.angle_rad])
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
@@ -75,6 +79,9 @@ def setting_of(
 ) -> tuple[FrameSetting, tuple[slice, slice]]:
     """The frames to predict, and the window (rows, columns) of at most ``largest``
     pixels that is fitted.
+
+    Args:
+        capture: frames in counts with their stage and camera.
 
     Raises:
         CaptureError: depths, pixel or wavelength missing; windows at field angles that
@@ -139,7 +146,11 @@ def _window(capture: Capture, largest: int) -> tuple[slice, slice]:
 
 
 def data_of(frames: ElectronFrames, window: tuple[slice, slice]) -> FitImages:
-    """What is fitted, cut to the window."""
+    """What is fitted, cut to the window.
+
+    Args:
+        frames: frames in electrons.
+    """
     shape = frames.electrons.shape
     cut = (slice(None), *window)
     wide = frames.variance_e2, frames.scale, frames.common_floor
@@ -163,6 +174,9 @@ def correct_quantization(data: FitImages, image: Array) -> FitImages:
     information, so that a fit to them ends
     where the likelihood of the counts (:mod:`characterize.captures.rounding`) is
     greatest, once ``image`` is of it.
+
+    Args:
+        data: frames, masks and noise that are fitted.
     """
     step, variance = data.count_e / data.scale, data.variance(image)
     noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
@@ -189,6 +203,9 @@ def quick_enough(model: ForwardModel, data: FitImages, x: Array) -> ForwardModel
 
     Judged at parameters ``x``, against all terms: a rise of chi-square of ``_NOTHING``
     over all pixels.
+
+    Args:
+        data: frames and their noise.
     """
     exact = model.images(x)[0]
     noise = np.sqrt(data.variance(exact))
@@ -238,6 +255,8 @@ def lit_part(
     frames tells over its noise.
 
     Args:
+        model: the forward model.
+        data: frames, masks and noise that are fitted.
         x: all parameters, of ``image`` (n, y, x).
     """
     light = np.maximum(image - background_planes(x, model.setting), 0.0)
@@ -251,6 +270,10 @@ def lit_part(
 
 def check_enough(data: FitImages, names: Sequence[str]) -> None:
     """Refuse what cannot fix its parameters however good the frames are.
+
+    Args:
+        data: frames, masks and noise that are fitted.
+        names: (p,) names of the fitted parameters.
 
     Raises:
         CaptureError: one frame for more parameters than one image can tell apart, or
@@ -278,6 +301,9 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
     """Refuse depths that are no micrometres: a thousand times nearer or farther than
     the lens is focused on.
 
+    Args:
+        depth_um: (n,) stated source depths, um.
+
     Raises:
         CaptureError: with the column that would be right.
     """
@@ -298,6 +324,9 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
 def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     """Priors that the capture itself states: wavelength (as usual unless
     wavelength_sigma_nm), pinhole, glass.
+
+    Args:
+        lens: the design.
     """
     offset, usual_nm = (
         (capture.wavelength_um - lens.wavelength_um) * 1e3,
@@ -343,6 +372,10 @@ def _number(capture: Capture, name: str) -> float:
 def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
     """What is known of the pillars to a tenth of it at best, or to a bias less than is
     reckoned with, in words.
+
+    Args:
+        lens: the design.
+        response: slopes of the pillars by height and index.
     """
     rough = f"slopes of the pillars by height and index are known to {response.error:.0%} only"
     return [*_beyond_table(lens), *([rough] if response.error > _ROUGH else [])]

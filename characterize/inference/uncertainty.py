@@ -127,6 +127,9 @@ def profile_parameters(
 
     Where -2 ln posterior at both ends of the parabola's interval is that of the
     parabola, these are the ends, and no fit is made.
+
+    Args:
+        problem: images, frames and prior.
     """
     at = problem.merit(mode.value)
     here = dataclasses.replace(mode, merit=at)
@@ -229,6 +232,9 @@ def shared_calibration(problem: FitProblem, mode: FitSolution) -> Array:
 def mode_probabilities(modes: Sequence[FitSolution], spread: float = 1.0) -> Array:
     """(k,) probability of every mode by Laplace's rule: exp(-merit / 2) times the
     volume of its covariance; ``spread``: factor of all variances.
+
+    Args:
+        modes: fits at the modes, best first.
     """
     log = np.array([_log_mass(one.merit, one.covariance, spread) for one in modes])
     return np.asarray(special.softmax(log))
@@ -251,6 +257,10 @@ def draw_posterior(
     Importance resampling from the mixture of Gaussians about ``components``, twice
     ``count`` of them, with weights truncated at their mean times the root of their
     number (Ionides 2008). ``spread``: factor of all variances.
+
+    Args:
+        problem: images, frames and prior.
+        seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
     centre = np.array([one.value for one in components])

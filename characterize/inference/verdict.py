@@ -41,6 +41,10 @@ _STRUCTURE = 4.5
 def is_chi_square_consistent(solution: FitSolution, gain: SensorNoise) -> bool:
     """Whether chi-square is that of noise: within 15 %, or four of its own sigma where
     pixels or flats are few.
+
+    Args:
+        solution: the fit that is judged.
+        gain: noise of the sensor.
     """
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
 
@@ -49,6 +53,7 @@ def quantization_text(gain: SensorNoise, *, whole: bool) -> list[str]:
     """How counts too coarse for their noise were fitted, in words; empty for others.
 
     Args:
+        gain: noise of the sensor.
         whole: the frames are counts and no means of them: fitted as rounded.
     """
     if gain.coarse:
@@ -68,6 +73,9 @@ def too_quiet(solution: FitSolution, gain: SensorNoise) -> list[str]:
     Chi-square may be as far below 1 as above; half of it where no gain is known.
     Counts too coarse for their noise are not judged: in the middle of a count most
     pixels tell nothing.
+
+    Args:
+        solution: the fit that is judged.
     """
     if gain.coarse or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
         return []
@@ -88,6 +96,9 @@ def _allowed(solution: FitSolution, gain: SensorNoise) -> float:
 def chance_of(solution: FitSolution) -> float:
     """Standard deviation of chi-square per degree of freedom over the pixels that
     count.
+
+    Args:
+        solution: the fit that is judged.
     """
     return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
 
@@ -97,6 +108,11 @@ def fit_problems(
 ) -> list[str]:
     """Checks of a finished fit, each with the cause it points to; bounds are judged by
     :func:`held_back`.
+
+    Args:
+        names: (p,) names of the fitted parameters.
+        solution: the fit that is judged.
+        gain: noise of the sensor.
     """
     words = []
     if not solution.converged:
@@ -136,7 +152,13 @@ def fit_problems(
 def held_back(
     names: tuple[str, ...], solution: FitSolution, prior: GaussianPrior
 ) -> list[str]:
-    """:func:`at_bounds` in words."""
+    """:func:`at_bounds` in words.
+
+    Args:
+        names: (p,) names of the fitted parameters.
+        solution: the fit that is judged.
+        prior: prior knowledge of the fitted parameters.
+    """
     return [
         f"{name} ran to its bound {value:g}: the true value lies outside, or the frames are misread"
         for name, value in at_bounds(names, solution, prior)
@@ -151,6 +173,11 @@ def at_bounds(
     The frames want them beyond it by more than ``_BEYOND`` sigma; where they say so
     little that a value inside is
     nearly as good, the bound is the end of an interval and no fault.
+
+    Args:
+        names: (p,) names of the fitted parameters.
+        solution: the fit that is judged.
+        prior: prior knowledge of the fitted parameters.
     """
     ends = zip(
         names,
@@ -172,6 +199,10 @@ def at_bounds(
 def spectrum_text(lens: Lens, known: Mapping[str, KnownValue]) -> list[str]:
     """Whether pillars were solved for the colours of a stated spectrum, in words;
     beyond, ``designed`` holds them.
+
+    Args:
+        lens: the design.
+        known: stated values by name.
     """
     bandwidth_nm = known["bandwidth_nm"].value if "bandwidth_nm" in known else 0.0
     low, high = (edge * 1e3 for edge in lens.proxy.wavelengths_um)
@@ -280,6 +311,10 @@ def process_verdict(
     frames say nothing. Numbers are those with what ``unstated`` causes may have moved;
     where these are too large, a
     cause is known in the model alone, and so said.
+
+    Args:
+        low: (p,) lower ends of statistical 95 %.
+        high: (p,) upper ends of statistical 95 %.
     """
     names = [row.name for row in rows]
     causes = [
@@ -320,6 +355,10 @@ def process_verdict(
 def predicted_error(task: SearchTask, found: Posterior) -> tuple[float, float]:
     """Expected NRMSE of the as-built images: at the captured depths, and half-way
     between them.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        found: the posterior.
     """
     model, values = (
         task.model.quick(),
@@ -333,7 +372,12 @@ def predicted_error(task: SearchTask, found: Posterior) -> tuple[float, float]:
 def predicted_aside(task: SearchTask, found: Posterior) -> tuple[float, float] | None:
     """As :func:`predicted_error` at the captured depths: half-way between neighbouring
     field angles, and half a step
-    beyond the outermost; None of frames at one angle."""
+    beyond the outermost; None of frames at one angle.
+
+    Args:
+        task: model, frames, priors and arrangement of the search.
+        found: the posterior.
+    """
     angles = largest_angle_gap(task.model.setting.angle_rad)
     if angles is None:
         return None
@@ -348,7 +392,11 @@ def predicted_aside(task: SearchTask, found: Posterior) -> tuple[float, float] |
 def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
     """(x, y) half-way between the two neighbours that lie farthest apart among field
     angles (n, 2), and as far beyond
-    the outermost as half of its step from its neighbour; None where all are one."""
+    the outermost as half of its step from its neighbour; None where all are one.
+
+    Args:
+        angle_rad: (n, 2) field angles, rad.
+    """
     angles = np.unique(angle_rad, axis=0)
     if len(angles) < 2:
         return None
@@ -430,6 +478,10 @@ def left_out(task: SearchTask, mode: FitSolution) -> float:
 
     About 1 + parameters over pixels where model and intervals hold; nan with fewer than
     four frames.
+
+    Args:
+        task: model, frames and priors.
+        mode: the fit it is judged at.
     """
     n = len(task.data.electrons)
     if n < 4:

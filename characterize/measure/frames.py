@@ -89,6 +89,7 @@ def measure_frames(
     """Quality of the frames as they are.
 
     Args:
+        capture: frames in counts with their stage and camera.
         design: gives the aperture for the Strehl ratio.
         reference_e: electrons of the same beam through an empty aperture of the lens's
             size, for the efficiency.
@@ -160,6 +161,10 @@ def airy_pattern(
     pixels.
 
     place_px: (x, y) of its middle from the window's.
+
+    Args:
+        design: the lens whose aperture it is.
+        shape: (rows, columns).
     """
     wave = (
         capture.wavelength_um

@@ -78,6 +78,7 @@ def find_lattice(flat: Array, pitch_px: float | None = None) -> ImageLattice:
     """The lattice of bright pillars in a levelled picture.
 
     Args:
+        flat: (y, x) levelled picture.
         pitch_px: distance of neighbours where it is known: waves of neither it nor a
             longer side are not considered.
 

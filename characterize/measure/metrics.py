@@ -66,6 +66,11 @@ def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> EdgeMtf:
     """MTF along x or y of a sampled PSF (background taken off): |FFT of the line
     spread| / its zero frequency.
 
+    Args:
+        psf: (y, x) light, background taken off.
+        step_um: side of a sample, um.
+        axis: x or y.
+
     Raises:
         CaptureError: no light.
     """
@@ -82,6 +87,8 @@ def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> EdgeMt
     derivative windowed.
 
     Args:
+        pixel_um: pitch of the pixels, um.
+        oversample: bins of the edge profile a pixel.
         image: one straight edge, tilted 2 to 20 degrees from the rows or columns.
 
     Accuracy: the finite difference and the bins are divided out; 1-2 % on noise-free
@@ -134,6 +141,9 @@ def strehl_ratio(psf: Array, ideal: Array) -> float:
 
     Peaks come from parabolas through the highest samples, so that their place under the
     grid does not matter.
+
+    Args:
+        psf: (y, x) light, background taken off.
     """
     return _peak(np.asarray(psf, float) / np.sum(psf)) / _peak(
         np.asarray(ideal, float) / np.sum(ideal)
@@ -142,6 +152,10 @@ def strehl_ratio(psf: Array, ideal: Array) -> float:
 
 def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
     """Widths of a PSF whose background is taken off.
+
+    Args:
+        psf: (y, x) light, background taken off.
+        step_um: side of a sample, um.
 
     Raises:
         CaptureError: no light.
@@ -165,6 +179,11 @@ def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
 
     Noise below the background counts as it is, below 0: cut off, that above would be
     light of its own.
+
+    Args:
+        psf: (y, x) light, background taken off.
+        step_um: side of a sample, um.
+        radius_um: (r,) radii, um.
     """
     light = np.asarray(psf, float)
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
@@ -187,6 +206,7 @@ def focusing_efficiency(
     aperture of the lens's size: as :class:`metalens.psf.FocusMetrics`, measured.
 
     Args:
+        step_um: side of a sample, um.
         image_e, reference_e: electrons, background taken off; the reference is a frame
             of the same beam through an
             empty aperture, whole on the sensor, or the sum of it.

@@ -52,6 +52,9 @@ def overlay_design(found: MeasuredDiameters, design: DiameterMap) -> MaskOverlay
     The picture's +x is taken as the mask's, to half the angle between two rows of the
     lattice.
 
+    Args:
+        found: pillars of the micrograph.
+
     Raises:
         CaptureError: fewer than twelve good pillars, a lattice that is not the design's
             or lies across it, or more
@@ -138,6 +141,11 @@ def lattice_scale(
     stretched along one axis counts half. Masks are written true to scale to a few parts
     in a million, pixels of
     microscopes are known to some per cent. Accuracy: 4e-4 for five pillars a side.
+
+    Args:
+        found: pillars of the micrograph.
+        pixel_nm: stated pixel, nm.
+        design: what was drawn.
     """
     good = np.isfinite(found.diameter_nm)
     sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
@@ -150,6 +158,10 @@ def lattice_scale(
 def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
     """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of
     the pillars, outliers left out.
+
+    Args:
+        laid: the micrograph's pillars on the mask.
+        knots: rows of the table at most.
 
     Raises:
         CaptureError: fewer than twelve pillars to take it from.
@@ -178,7 +190,12 @@ def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
 
 
 def register_to_mask(found: MeasuredDiameters, laid: MaskOverlay) -> MeasuredDiameters:
-    """The same pillars with the mask's own row and column as their site."""
+    """The same pillars with the mask's own row and column as their site.
+
+    Args:
+        found: pillars of the micrograph.
+        laid: the micrograph's pillars on the mask.
+    """
     return dataclasses.replace(found, site=laid.site)
 
 

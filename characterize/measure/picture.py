@@ -25,6 +25,9 @@ def read_picture(path: Path) -> Array:
     Microscopes save grey pictures with three equal colours, and write into them in
     yellow or green.
 
+    Args:
+        path: the file.
+
     Raises:
         CaptureError: as :func:`characterize.captures.capture.read_images`; several
             pictures, or one in colours.
@@ -49,6 +52,9 @@ def without_strip(image: Array) -> Array:
     Rows of it are of one value but for letters and a bar, where noise gives a picture's
     rows many. A picture whose own
     rows are of few values stays as it is.
+
+    Args:
+        image: (y, x) picture.
     """
     share = (image == np.median(image, axis=1, keepdims=True)).mean(1)
     pictured = np.flatnonzero(share < _FLAT)

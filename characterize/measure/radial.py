@@ -23,7 +23,11 @@ _MOST_GAIN = 5.0  # a disc as narrow as its blur has no width of its own
 
 
 def ray_smoothing(pitch: float) -> float:
-    """Standard deviation in pixels by which rays are smoothed along themselves."""
+    """Standard deviation in pixels by which rays are smoothed along themselves.
+
+    Args:
+        pitch: distance of neighbours, pixels.
+    """
     return max(1.0, pitch / 150)
 
 
@@ -36,6 +40,9 @@ def rim_and_gap_levels(reach: Array, rays: Array) -> tuple[float, float, int]:
     The rim is looked for just inside the fall, within a fifth of its radius or 16
     samples: tops may be dark. The gap is
     the darkest third beyond the fall: of crowded pillars it is a few pixels wide.
+
+    Args:
+        reach: (r,) distances from the middle, pixels.
     """
     mean = rays.mean(1)
     apart = reach[:-1] * 2 * math.pi / RAYS
@@ -53,6 +60,11 @@ def rim_and_gap_levels(reach: Array, rays: Array) -> tuple[float, float, int]:
 def edge_crossings(reach: Array, rays: Array, half: float, rim: int) -> Array:
     """(ray,) where each first falls below a level beyond the rim; nan where it does
     not.
+
+    Args:
+        reach: (r,) distances from the middle, pixels.
+        rays: (r, rays) levels along the rays.
+        half: level of half of the step.
     """
     found = np.full(rays.shape[1], math.nan)
     for j in range(rays.shape[1]):
@@ -91,6 +103,10 @@ def blur_variance(reach: Array, rays: Array, smooth: float) -> float:
     in a blur of 2. So radius and blur are those of which the same reading gives the
     same radius and the same steepness.
     A dark top is no disc's.
+
+    Args:
+        reach: (r,) distances from the middle, pixels.
+        smooth: standard deviation by which rays are smoothed, pixels.
     """
     mean = rays.mean(1)
     half, share, inner, outer = _reading(reach, mean, smooth=0.0)
@@ -120,6 +136,12 @@ def is_wide_disc(
 ) -> bool:
     """Whether a disc is wider than so many blurs; by default, so wide that its middle
     is not lowered.
+
+    Args:
+        radius: radius, pixels.
+        variance: of the blur, square pixels.
+        smooth: standard deviation by which rays are smoothed, pixels.
+        times: blurs that a wide disc is wider than.
     """
     return radius > times * math.hypot(math.sqrt(variance), smooth)
 
@@ -129,6 +151,11 @@ def deblur_radius(
 ) -> tuple[float, float]:
     """(radius of the disc that is read at a radius in a blur, its change with what is
     read), in pixels.
+
+    Args:
+        reach: (r,) distances from the middle, pixels.
+        variance: of the blur, square pixels.
+        smooth: standard deviation by which rays are smoothed, pixels.
     """
     true, step = radius, 0.1
     for _ in range(_TURNS):

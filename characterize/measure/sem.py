@@ -143,6 +143,10 @@ def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
     """Diameters of all whole pillars on the lattice of a top-down micrograph, rims
     brighter than the gaps.
 
+    Args:
+        image: (y, x) picture.
+        about: pixel, pitch and edge bias of the picture.
+
     Raises:
         CaptureError: no lattice (of the stated pitch), or no picture of one channel.
     """
@@ -242,6 +246,9 @@ def instrument_pixel_nm(path: Path) -> float | None:
     Read are Zeiss SmartSEM (tag 34118, ``AP_PIXEL_SIZE``) and FEI / Thermo Fisher
     (tags 34680 and 34682, ``PixelWidth`` of ``[Scan]``, m).
 
+    Args:
+        path: the file.
+
     Returns:
         None for other files.
 
@@ -276,6 +283,10 @@ def instrument_pixel_nm(path: Path) -> float | None:
 def scale_from_bar(image: Array, bar_nm: float) -> float:
     """pixel_nm from a scale bar: the longest run of saturated pixels in a row of the
     lowest quarter.
+
+    Args:
+        image: (y, x) picture.
+        bar_nm: length of the scale bar, nm.
 
     Raises:
         CaptureError: no bar of at least 20 pixels.

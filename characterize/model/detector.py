@@ -182,6 +182,8 @@ def detector_transfers(
     diameter where that is ``sized``.
 
     Args:
+        grid: fine samples under the pixels.
+        crosstalk_px: standard deviation of blur, pixels.
         sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over
             the source's. kind: of the sums.
     """
@@ -221,12 +223,19 @@ def _half_step(grid: DetectorGrid) -> Array:
 def fine_enough(pixel_um: float, highest: float) -> int:
     """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled
     at twice that or above.
+
+    Args:
+        pixel_um: pitch of the pixels, um.
     """
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
 
 def required_oversampling(lens: Lens, pixel_um: float) -> int:
-    """Samples along a pixel's side that are fine enough for the light of a lens."""
+    """Samples along a pixel's side that are fine enough for the light of a lens.
+
+    Args:
+        pixel_um: pitch of the pixels, um.
+    """
     sine = lens.diameters.radius_um / math.hypot(
         lens.diameters.radius_um, lens.reduced_um
     )
@@ -234,12 +243,22 @@ def required_oversampling(lens: Lens, pixel_um: float) -> int:
 
 
 def pixel_transfer(fy: Array, fx: Array, pixel_um: float) -> Array:
-    """Transfer of a square pixel: sinc(fx p) sinc(fy p)."""
+    """Transfer of a square pixel: sinc(fx p) sinc(fy p).
+
+    Args:
+        pixel_um: pitch of the pixels, um.
+    """
     return np.asarray(np.sinc(fx * pixel_um) * np.sinc(fy * pixel_um))
 
 
 def gaussian_transfer(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Array]:
-    """Transfer exp(-2 pi² f² sigma²) of a Gaussian blur, and its derivative by sigma."""
+    """Transfer exp(-2 pi² f² sigma²) of a Gaussian blur, and its derivative by sigma.
+
+    Args:
+        fy: cycles/um along y.
+        fx: cycles/um along x.
+        sigma_um: standard deviation of the blur, um.
+    """
     q = 4 * np.pi**2 * (fx**2 + fy**2)
     value = np.exp(-q * sigma_um**2 / 2)
     return value, -q * sigma_um * value
@@ -248,6 +267,11 @@ def gaussian_transfer(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Arr
 def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
     """Transfer 2 J1(u) / u, u = pi f D, of an evenly lit disc, and its derivative by D:
     -2 J2(u) / D.
+
+    Args:
+        fy: cycles/um along y.
+        fx: cycles/um along x.
+        diameter_um: diameter, um.
     """
     u = np.pi * np.hypot(fx, fy) * diameter_um
     safe = np.maximum(u, 1e-6)
@@ -260,6 +284,11 @@ def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Arra
 def ball_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:
     """Transfer 3 (sin u - u cos u) / u³, u = pi f D, of an evenly glowing ball seen in
     projection.
+
+    Args:
+        fy: cycles/um along y.
+        fx: cycles/um along x.
+        diameter_um: diameter, um.
     """
     u = np.maximum(np.pi * np.hypot(fx, fy) * diameter_um, 1e-3)
     return np.asarray(3 * (np.sin(u) - u * np.cos(u)) / u**3)

@@ -26,7 +26,12 @@ def even_nodes(count: int, pull: float, low: float, high: float) -> Array:
 def even_interpolation(
     count: int, pull: float, span: tuple[float, float], values: Array
 ) -> Array:
-    """(*values, count) interpolation from :func:`even_nodes` places."""
+    """(*values, count) interpolation from :func:`even_nodes` places.
+
+    Args:
+        pull: how far the nodes are drawn apart.
+        span: (low, high) of the places.
+    """
     low, high = span
     t = (2 * values - low - high) / (high - low)
     return np.asarray(
@@ -38,12 +43,21 @@ def node_stretch(count: int, tolerance: float) -> float:
     """Of :func:`even_nodes`: how near its branch may come to the ends of the nodes, for
     a
     wave as steep as they hold.
+
+    Args:
+        count: of the nodes.
+        tolerance: relative error that is allowed.
     """
     return 1 / math.cosh((math.log(1e5 / tolerance) + count / 60) / count)
 
 
 def node_density(count: int, tolerance: float) -> float:
-    """Of :func:`even_nodes` places in the middle over that of Gauss-Legendre nodes."""
+    """Of :func:`even_nodes` places in the middle over that of Gauss-Legendre nodes.
+
+    Args:
+        count: how many are asked for.
+        tolerance: relative error that is allowed.
+    """
     pulled = node_stretch(count, tolerance)
     return math.asin(pulled) / pulled
 
@@ -53,7 +67,12 @@ def is_mirror_symmetric(
 ) -> bool:
     """Whether pillars, the path of a chief ray and the shadow of a stop are alike to
     both sides of both axes: a quarter
-    of them tells all."""
+    of them tells all.
+
+    Args:
+        diameters: the pillars of the lens.
+        tangents: (x, y) of the chief ray.
+    """
     d = diameters.diameter_um
     plain = (
         diameters.angle_rad is None

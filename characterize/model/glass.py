@@ -229,6 +229,8 @@ def source_paths(
     (frames,), um, less that to its centre.
 
     Args:
+        x_um: places on the lens along x.
+        y_um: places on the lens along y.
         tangents: (x, y) of the chief ray of a source on the axis, in air.
         values: all parameters, of which source_x_um, source_y_um, glass_um and the
             tilts of the glass are used.
@@ -275,6 +277,8 @@ def extra_path(
     and three of Newton's steps from the straight ray leave less than 1e-9 um.
 
     Args:
+        x_um: places on the lens along x.
+        y_um: places on the lens along y.
         tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z =
             ``depth_um``.
         values: all parameters, of which glass_um and its tilts are used.

@@ -226,7 +226,11 @@ def wrapped_phasors(phase: Array, kind: Any = np.complex64) -> Array:
 
 
 def extra_digits(tolerance: float) -> float:
-    """ln of how much more is asked than the usual 5e-4; 0 where less is."""
+    """ln of how much more is asked than the usual 5e-4; 0 where less is.
+
+    Args:
+        tolerance: relative error that is asked for.
+    """
     return max(0.0, math.log(_USUAL / tolerance))
 
 
@@ -244,7 +248,11 @@ def complex_precision(tolerance: float) -> Any:
 
 
 def real_of(kind: Any) -> Any:
-    """Real numbers in the precision of complex ones."""
+    """Real numbers in the precision of complex ones.
+
+    Args:
+        kind: number type.
+    """
     return np.empty(0, kind).real.dtype
 
 

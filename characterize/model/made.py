@@ -46,6 +46,8 @@ def as_built_transmission(
     wave-front aberrations.
 
     Args:
+        lens: the design.
+        response: what height, index and sidewall do to the pillars.
         x: all parameters, in the order of ``parameters.NAMES``.
         noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence,
             where the proxy knows angles.
@@ -122,6 +124,9 @@ def built_lens(design: Lens, x: Array) -> Lens:
     Height, index, sidewall and wave-front errors are no diameters:
     :func:`as_built_transmission` and
     :func:`psf_stack` hold them.
+
+    Args:
+        x: all parameters.
     """
     d = design.diameters
     bias = _on_pillars(d, process_state_of(x).bias_um)
@@ -161,6 +166,10 @@ def psf_stack(
     crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the
     chief ray, beside that of the
     view. Accuracy: ``error`` of the record, relative L2.
+
+    Args:
+        response: what height, index and sidewall do to the pillars.
+        tolerance: relative error that is allowed.
     """
     from metalens import psf
 

@@ -387,6 +387,9 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
     long waves (``made.coarser``).
 
     The distance may be wrong by a quarter, so that no search runs into the lens.
+
+    Args:
+        names: of the parameters.
     """
     wave = lens.wavelength_um
     factors = [
@@ -410,6 +413,10 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
 def type_b_sigma(name: str, lens: Lens) -> float:
     """Standard deviation of a parameter, or of what none describes, that is reckoned
     with where nobody states it.
+
+    Args:
+        name: of a parameter, or of an unfitted effect.
+        lens: the design.
     """
     if name in PLACE:
         return usual_parameters([name], lens)[0].unstated
@@ -443,6 +450,9 @@ def unfitted_sizes(known: dict[str, KnownValue], lens: Lens) -> dict[str, float]
 def parameter_vector(values: Mapping[str, float] | None = None) -> Array:
     """(parameters,) starts, with some set by name.
 
+    Args:
+        values: by name.
+
     Raises:
         ConfigError: an unknown name.
     """
@@ -461,5 +471,9 @@ def parameter_vector(values: Mapping[str, float] | None = None) -> Array:
 
 
 def process_state_of(x: Array) -> State:
-    """The made lens that all parameters mean; what belongs to the bench is left out."""
+    """The made lens that all parameters mean; what belongs to the bench is left out.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+    """
     return State(x[_CAUSES])

@@ -391,13 +391,23 @@ def of_lens(
     span: ChangeRange | None = None,
     angle_rad: float = 0.0,
 ) -> PillarResponse:
-    """The pillars of a lens, of one size or of two."""
+    """The pillars of a lens, of one size or of two.
+
+    Args:
+        response: slopes of the pillars.
+        span: largest changes that are held.
+        angle_rad: angle of incidence or field angle, rad.
+    """
     kind = PillarResponse if lens.pairs is None else PairedPillars
     return kind(lens, response, span=span, angle_rad=angle_rad)
 
 
 def pillar_change_of(x: Array) -> PillarChange:
-    """The pillars' change that the parameters mean."""
+    """The pillars' change that the parameters mean.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+    """
     return PillarChange(
         tuple(process_state_of(x).answers().tolist()),
         float(x[PLACE["wavelength_nm"]]) * 1e-3,
@@ -407,6 +417,9 @@ def pillar_change_of(x: Array) -> PillarChange:
 def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
     """Angle of incidence for a field angle (x, y): 0 where the proxy holds at normal
     incidence only.
+
+    Args:
+        angle_rad: angle of incidence or field angle, rad.
     """
     tilt = math.atan(math.hypot(*(math.tan(a) for a in angle_rad)))
     return tilt if proxy.max_angle_rad > 0 else 0.0

@@ -77,6 +77,11 @@ class FrameSetting:
 def true_depth(x: Array, setting: FrameSetting, centre_um: float) -> Array:
     """(n,) source depths after stage zero and scale; the scale acts about the middle of
     the stage.
+
+    Args:
+        x: all parameters.
+        setting: depths, angles and window of the frames.
+        centre_um: middle of the stage, um.
     """
     stated = setting.depth_um
     depth = (
@@ -97,6 +102,12 @@ def pixel_brightness(
 ) -> Array:
     """(n,) electrons in a pixel for light of unit density from ``reference_um``, by
     gain, exposure and depth.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+        setting: depths, angles and window of the frames.
+        centre_um: middle of the stage, um.
+        films: media before and behind the lens.
     """
     depth = films.apparent_um(true_depth(x, setting, centre_um))
     gain = np.exp(x[PLACE["log_gain"]]) * (setting.fill * setting.pixel_um) ** 2
@@ -111,13 +122,24 @@ def brightness_slopes(
     """(n,) relative changes of :func:`pixel_brightness` by the stage: light falls as
     the
     square of the depth.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+        setting: depths, angles and window of the frames.
+        centre_um: middle of the stage, um.
+        films: media before and behind the lens.
     """
     rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))
     return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
 
 
 def background_planes(x: Array, setting: FrameSetting) -> Array:
-    """(n, rows, columns) electrons of the background, a plane in every frame."""
+    """(n, rows, columns) electrons of the background, a plane in every frame.
+
+    Args:
+        x: all parameters, in the order of ``PARAMETERS``.
+        setting: depths, angles and window of the frames.
+    """
     edge_y, edge_x = setting.edges
     along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
@@ -130,6 +152,10 @@ LIGHT = ("light_x", "light_y", "light_r")
 def light_maps(u: Array, v: Array) -> Array:
     """(3, *shape) ln of the irradiance at lens places over the radius, for one unit of
     each of ``LIGHT``.
+
+    Args:
+        u: x on the lens over its radius.
+        v: y on the lens over its radius.
     """
     return np.stack([u, v, u * u + v * v - 0.5])
 

@@ -20,7 +20,12 @@ _GRID = 61
 
 
 def thin_plate_basis(u: Array, v: Array, count: int = MODES) -> Array:
-    """(count, *shape) modes at lens places over the radius, of unit rms on the disc."""
+    """(count, *shape) modes at lens places over the radius, of unit rms on the disc.
+
+    Args:
+        u: x on the lens over its radius.
+        v: y on the lens over its radius.
+    """
     weights, taken, _ = _modes()
     splines, known = _splines(u, v), _known(u, v)
     return np.asarray(

@@ -208,6 +208,10 @@ class WindowOperators:
 def real_complex_product(weights: Array, values: Array) -> Array:
     """(m, k) product of real (m, n) and complex (n, k) numbers: half the work of one of
     complex numbers.
+
+    Args:
+        weights: (m, n) real.
+        values: (n, k) complex.
     """
     return np.asarray(
         (weights @ np.ascontiguousarray(values).view(weights.dtype)).view(values.dtype)
@@ -229,6 +233,8 @@ def axis_operators(
     along one axis.
 
     Args:
+        k: wave number, rad/um.
+        tolerance: relative error of the field.
         by: path to a place of the window, :meth:`Kernel.by_x` or :meth:`Kernel.by_y`.
         nodes: (n,) direction cosines. at_um: (m,) even samples of the window. band: of
             the field, rad/um.

@@ -26,6 +26,9 @@ def order_score(data: FitImages) -> float:
     Mean correlation of planes that follow each other, against that of the most alike
     ones; both above the mean of all.
     nan where all planes look alike, or fewer than six.
+
+    Args:
+        data: frames, masks and noise that are fitted.
     """
     n = len(data.electrons)
     if n < 6:
@@ -43,6 +46,11 @@ def order_score(data: FitImages) -> float:
 def unexplained_share(nrmse: float, data: FitImages, background: float) -> float:
     """Share of the light that a prediction misses beyond the noise of single pixels,
     which is seen at dark places.
+
+    Args:
+        nrmse: normalised error of the prediction.
+        data: frames, masks and noise that are fitted.
+        background: level of a frame without light.
     """
     steps = np.diff(data.electrons, axis=0)[
         data.usable[1:] & data.usable[:-1]
@@ -59,6 +67,7 @@ def pupil_problems(
     """What makes a pupil no result, in words.
 
     Args:
+        data: frames, masks and noise that are fitted.
         ncc: correlation with the planes left out, else with all. share: of the light
             that is :func:`unexplained_share` there.
         stopped: why the fit stopped before it converged; empty where it did.
@@ -87,6 +96,9 @@ def pupil_problems(
 def pupil_warnings(share: float, stopped: str) -> list[str]:
     """What a pupil that is not refused still leaves to explain, in words; ``share`` of
     the light is missed.
+
+    Args:
+        stopped: why the fit stopped, empty where it converged.
     """
     words = (
         [f"not converged ({stopped}), though it predicts the images well"]

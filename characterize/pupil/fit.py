@@ -84,6 +84,8 @@ def fit_pupil(
     some planes, tested on others.
 
     Args:
+        capture: frames in counts.
+        spec: what is known of optics and stage.
         sparse: of which planes alone: every second, third ...
         insist: return a pupil that fails its checks (problems filled) instead of
             refusing it.
@@ -142,7 +144,13 @@ def fit_pupil(
 def save(
     path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None
 ) -> None:
-    """Write a pupil file (kind ``pupil``)."""
+    """Write a pupil file (kind ``pupil``).
+
+    Args:
+        path: the file to write.
+        fit: the fitted pupil.
+        provenance: inputs and settings, for the record.
+    """
     arrays = {
         key: getattr(fit, key)
         for key in (

@@ -41,6 +41,8 @@ def fit_free_settings(
     factors are differences of images.
 
     Args:
+        position_um: (n,) stated stage positions, um.
+        data: frames, masks and noise that are fitted.
         coarse: parameters of a model of few orders from which to start.
         step_um: stated mean step of the whole stack.
     """
@@ -135,7 +137,12 @@ class _Images:
 
 
 def freed_text(spec: PupilSpec, found: Optics) -> list[str]:
-    """What was freed beside what was stated, in words."""
+    """What was freed beside what was stated, in words.
+
+    Args:
+        spec: what is known of optics and stage.
+        found: fitted optics.
+    """
     words = []
     for name, value, sigma in found:
         before = getattr(spec, name)

@@ -28,7 +28,13 @@ class StackAgreement:
 def measure_agreement(
     predicted: Array, data: FitImages, background: float
 ) -> StackAgreement:
-    """Agreement over usable, unsaturated pixels."""
+    """Agreement over usable, unsaturated pixels.
+
+    Args:
+        predicted: (n, y, x) predicted planes.
+        data: frames, masks and noise that are fitted.
+        background: level of a frame without light.
+    """
     keep = data.usable & ~data.saturated
     a, b = predicted[keep], data.electrons[keep]
     planes = [
@@ -44,6 +50,11 @@ def predict_by_splines(
 ) -> Array:
     """(hidden, y, x) light of planes left out by cubic splines through the others: what
     no physics predicts.
+
+    Args:
+        position: (n,) positions of the planes.
+        data: frames, masks and noise that are fitted.
+        seen: planes that are known.
     """
     order = seen[np.argsort(position[seen])]
     light = np.where(

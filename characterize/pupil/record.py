@@ -455,6 +455,10 @@ def phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) -> Arra
 
     Linear between the file's pixels, of the complex number: jumps by 2 pi are none.
 
+    Args:
+        path: image of the mask.
+        turn_rad: by which the mask is turned, rad.
+
     Raises:
         CaptureError: no square picture of finite numbers.
     """
@@ -490,6 +494,10 @@ def phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) -> Arra
 def stage_sigma_um(spec: PupilSpec, position_um: Array) -> float:
     """By which single planes of a whole stack stand off: as stated, else a tenth of the
     mean step.
+
+    Args:
+        spec: what is known of optics and stage.
+        position_um: (n,) stated positions, um.
     """
     if not math.isnan(spec.stage_sigma_um):
         return spec.stage_sigma_um

@@ -29,13 +29,20 @@ def zernike_indices(lowest: int, highest: int) -> list[Index]:
 
 
 def zernike_name(index: Index) -> str:
-    """Usual name where there is one, else ``Z(n, m)``."""
+    """Usual name where there is one, else ``Z(n, m)``.
+
+    Args:
+        index: (n, m) radial and azimuthal order.
+    """
     return _NAMES.get(index, f"Z({index[0]}, {index[1]})")
 
 
 def zernike_polynomial(index: Index, rho: Array, theta: Array) -> Array:
     """Z_n^m at polar coordinates of the unit disc: sqrt(n + 1) (sqrt 2 if m) R(rho)
     cos(m theta), or sin for m < 0.
+
+    Args:
+        index: (n, m) radial and azimuthal order.
     """
     n, m = index
     k = abs(m)
@@ -52,7 +59,12 @@ def zernike_polynomial(index: Index, rho: Array, theta: Array) -> Array:
 
 
 def zernike_basis(which: list[Index], x: Array, y: Array) -> Array:
-    """(len(which), *shape) polynomials at Cartesian coordinates of the unit disc."""
+    """(len(which), *shape) polynomials at Cartesian coordinates of the unit disc.
+
+    Args:
+        x: x in the pupil over its radius.
+        y: y in the pupil over its radius.
+    """
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
     return (
         np.stack([zernike_polynomial(index, rho, theta) for index in which])
