@@ -118,6 +118,9 @@ def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
 
     Columns are parted by commas, or by semicolons, tabs or blanks with decimal commas.
 
+    Args:
+        path: of a table of two columns.
+
     Raises:
         ProcessError: missing file, a line that is not two numbers (line named), or no
             line at all.

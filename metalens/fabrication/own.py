@@ -83,6 +83,11 @@ def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, Own
 
     Their table knows both sizes, so that nothing is left of a bias of all edges:
     ``edges`` are 0.
+
+    Args:
+        lens: the lens.
+        width_um: (n,) sizes along x, um.
+        length_um: (n,) sizes along y, um.
     """
     cells = [
         (cell_of_sizes(lens.cell, float(w), float(d)), float(w))
@@ -123,6 +128,9 @@ def _judged(coarse: Array, fine: Array) -> OwnRates:
 def polarization_weights(lens: "Lens") -> Array:
     """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of, its
     geometric phase aside.
+
+    Args:
+        lens: the lens.
     """
     if lens.hand:
         come = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)

@@ -463,6 +463,9 @@ def coarser(wavelength_um: float) -> float:
     wavelength, so that errors of one kind
     turn the phase alike; lenses of shorter waves come from the same writers and
     etchers, with their nanometres.
+
+    Args:
+        wavelength_um: vacuum wavelength, um.
     """
     return max(1.0, wavelength_um / USUAL_UM)
 
@@ -470,6 +473,10 @@ def coarser(wavelength_um: float) -> float:
 def larger(name: str, wavelength_um: float) -> float:
     """By which prior and bounds of a row are multiplied for a wavelength:
     :func:`coarser` of what is given in nm.
+
+    Args:
+        name: of a row of the table.
+        wavelength_um: vacuum wavelength, um.
     """
     return coarser(wavelength_um) if name.endswith("_nm") else 1.0
 
@@ -477,7 +484,11 @@ def larger(name: str, wavelength_um: float) -> float:
 def of_kind(
     kind: type[CDError] | type[ResponseError] | type[WavefrontError],
 ) -> Iterator[tuple[int, Perturbation]]:
-    """(place in the table, row) of the causes that act in one way, in order."""
+    """(place in the table, row) of the causes that act in one way, in order.
+
+    Args:
+        kind: CDError, ResponseError or WavefrontError.
+    """
     return (
         (n, row) for n, row in enumerate(PERTURBATIONS) if isinstance(row.acts, kind)
     )
@@ -486,7 +497,11 @@ def of_kind(
 def named(
     kind: type[CDError] | type[ResponseError] | type[WavefrontError],
 ) -> tuple[str, ...]:
-    """Names of the causes that act in one way, in order."""
+    """Names of the causes that act in one way, in order.
+
+    Args:
+        kind: CDError, ResponseError or WavefrontError.
+    """
     return tuple(row.name for _, row in of_kind(kind))
 
 
@@ -503,7 +518,11 @@ def with_missing(rows: Sequence[Array]) -> Array:
 def lacking(cell: Cell) -> tuple[str, ...]:
     """Names of the causes that pillars of this kind cannot have: a round one has no
     length and no turn, one
-    without layers no pedestal."""
+    without layers no pedestal.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+    """
     size = cell.pitch_um / 2
     rows = [
         row

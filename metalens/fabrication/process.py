@@ -194,7 +194,12 @@ class Draw:
 
 
 def draws(spread: Spread, count: int, *, seed: int) -> list[Draw]:
-    """``count`` lenses of a process: normal amounts, gradients in any direction."""
+    """``count`` lenses of a process: normal amounts, gradients in any direction.
+
+    Args:
+        spread: standard deviations of the process.
+        seed: of the random generator.
+    """
     random, stated = np.random.default_rng(seed), spread.stated
     sigma = np.array(list(stated.values()))
     normal, turns = (
@@ -221,6 +226,9 @@ class Printed:
 def of_process(path: str | Path) -> Printed:
     """These entries of a PROCESS.toml; CSV files that it names lie beside it. The rest
     is left to ``layout``.
+
+    Args:
+        path: of PROCESS.toml.
 
     Raises:
         ConfigError: missing file, not TOML, or a wrong entry, with file and key.

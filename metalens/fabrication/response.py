@@ -194,6 +194,9 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     round on a square lattice those of their own shape, by exact derivatives of a solver
     (seconds a lens).
 
+    Args:
+        degree: of the polynomials over the diameter.
+
     Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by
     index; interference between
     foot and top is left out. The cell solvers say it better, at seconds a lens. Of
@@ -275,6 +278,13 @@ def guide(
     Anchored at the thinnest pillar by the effective medium of thin cylinders across the
     field (Rayleigh 1892, two
     dimensions).
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        proxy: phase and |T| over the diameter.
+        wavelength_um: vacuum wavelength, um.
+        diameter_um: (n,) diameters at which it is evaluated, um.
+        degree: of the polynomials over the diameter.
     """
     from metalens.cell import materials
 
@@ -317,6 +327,10 @@ def designed(
     Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 1e-3 to 1): by
     diameter, and by wavelength as far again as the proxy reaches, then held; of one
     wavelength they hold at all.
+
+    Args:
+        wavelength_um: vacuum wavelength, um.
+        angle_rad: angle of incidence in air, rad.
     """
     low, high = proxy.wavelengths_um
     inside = min(max(wavelength_um, low), high)
@@ -352,6 +366,10 @@ def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
 
     Beyond the diameters that a solver was asked for, its last word goes on with the
     proxy.
+
+    Args:
+        response: derivatives of ln t by the pillar-response errors.
+        diameter_um: (*shape) diameters, um.
     """
     slopes = np.asarray(response.at(diameter_um))
     solved = response.solved if isinstance(response, Sensitivity) else None
@@ -369,6 +387,10 @@ def biased(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | flo
 
     Of second order: the derivative is taken half-way. 1 for shapes that keep their
     form.
+
+    Args:
+        response: derivatives of ln t by the pillar-response errors.
+        bias_um: displacement of the diameter by moved edges, um.
     """
     rate = response.by_edges(np.asarray(d_um - np.asarray(bias_um) / 2))
     return 1.0 if rate is None else np.exp(bias_um * rate)
@@ -391,6 +413,10 @@ def transmission(
         answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
             bias_um: what of the diameters is
             bias, of all edges alike, and no size of the design (:func:`biased`).
+        proxy: phase and |T| over the diameter.
+        d_um: (*shape) diameters, um.
+        wavelength_um: vacuum wavelength, um.
+        angle_rad: angle of incidence in air, rad.
     """
     changed = answer(proxy, response, d_um).factor(answers) * biased(
         response, d_um, bias_um

@@ -32,6 +32,9 @@ def fill_response(
 
     Args:
         at: wavelength in um, angle of incidence in rad.
+        lens: whose pillars respond.
+        phase: (y, x) array that is filled, rad.
+        level: (y, x) array that is filled.
 
     Raises:
         DomainError: a diameter, the wavelength or the angle lies outside the proxy's
@@ -65,6 +68,12 @@ def fill_response_of(
     """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad
     that is
     added.
+
+    Args:
+        proxy: phase and |T| over the diameter.
+        d: (y, x) sizes, um; 0 where there is no pillar.
+        at: wavelength in um, angle of incidence in rad.
+        level: (y, x) array that is filled.
     """
     loop, numbers = _fill, response_polynomials(proxy, d, at)
     turn = np.zeros((len(d), 0)) if turned is None else turned
@@ -78,7 +87,13 @@ def response_polynomials(
 ) -> Polynomials:
     """What :func:`evaluate_row` takes of these diameters, for a wavelength in um and an
     angle in rad; raises as
-    :func:`fill_response`."""
+    :func:`fill_response`.
+
+    Args:
+        proxy: phase and |T| over the diameter.
+        diameter_um: (y, x) sizes, um; 0 where there is no pillar.
+        at: wavelength in um and angle in rad.
+    """
     phase, level = proxy.at(*at), proxy.level_at(*at)
     most = float(np.max(diameter_um, initial=0.0))
     if most > 0:
@@ -94,7 +109,14 @@ def response_polynomials(
     fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
 def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
-    """Phase in rad and |T| of a part of a row; x: work."""
+    """Phase in rad and |T| of a part of a row; x: work.
+
+    Args:
+        d: (n,) diameters, um.
+        numbers: polynomials of phase and |T|.
+        phase: (n,) that is filled, rad.
+        level: (n,) that is filled.
+    """
     scale, shift, power, ceiling, in_phase, in_level = numbers
     for j in range(d.size):
         x[j] = scale * d[j]

@@ -27,6 +27,9 @@ _RIM = 4  # points: a cubic spline forgets an edge as 0.27^points
 def check_export_format(path: str | Path) -> None:
     """Refuse a file name that says no known format.
 
+    Args:
+        path: whose ending says the format.
+
     Raises:
         LensError: naming the formats there are.
     """
@@ -45,6 +48,9 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     transmission for light along x.
     ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture,
     unwrapped, in mm.
+
+    Args:
+        path: target; its ending says the format.
 
     Returns:
         largest difference in phase (rad) between the pillars and what a program
@@ -80,7 +86,11 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
 
 
 def lens_arrays(lens: Lens) -> dict[str, Array]:
-    """Axes, diameters, wrapped phase and magnitude of every pillar, by name."""
+    """Axes, diameters, wrapped phase and magnitude of every pillar, by name.
+
+    Args:
+        lens: the lens.
+    """
     d = lens.diameters
     return {
         "x_um": d.x_um,
@@ -214,6 +224,9 @@ def unwrap_phase(lens: Lens) -> Array:
     Along the middle column first, then along every row to both sides: exact where
     neighbours differ by less than half
     a turn.
+
+    Args:
+        lens: the lens.
 
     Raises:
         LensError: gaps along the way, or neighbours half a turn apart whichever way

@@ -23,6 +23,9 @@ def lens_picture(lens: Lens) -> bytes:
     A pixel has the phase of the mean of exp(iφ) over its sites and fades where the
     phase turns within it, so that no
     lenses appear that are none.
+
+    Args:
+        lens: the lens.
     """
     figure, (left, right) = report.make_figure(1, 2, size=(9.6, 4.4))
     _phase(figure, left, lens)

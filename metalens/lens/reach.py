@@ -32,6 +32,10 @@ class ApertureSummary:
 def defocus_per_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """1 / z of a source less that of best focus, 1/um, films in front taken as the air
     that bends light as much.
+
+    Args:
+        lens: the lens.
+        depth_um: distance of a source in front of the lens, um.
     """
     return 1 / _reduced(lens, depth_um) - 1 / _reduced(lens, lens.source_distance_um)
 
@@ -39,6 +43,10 @@ def defocus_per_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z -
     1/z0|.
+
+    Args:
+        lens: the lens.
+        depth_um: distance of a source in front of the lens, um.
     """
     return (
         _lit(lens, _aperture(lens).radius_um)
@@ -50,12 +58,19 @@ def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
     """Distance in air that bends paraxial light as much as the media between pillars
     and sensor.
+
+    Args:
+        lens: the lens.
     """
     return lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).reduced_um
 
 
 def diffraction_um(lens: Lens | ApertureSummary) -> float:
-    """Wavelength over the paraxial numerical aperture of the image side, um."""
+    """Wavelength over the paraxial numerical aperture of the image side, um.
+
+    Args:
+        lens: the lens.
+    """
     return lens.wavelength_um * sensor_reach_um(lens) / _widest(lens)
 
 
@@ -64,6 +79,10 @@ def window_um(
 ) -> float:
     """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst
     of these depths; 3 digits.
+
+    Args:
+        lens: the lens.
+        depths_um: distances of sources, um.
     """
     blur = max(blur_um(lens, depth) for depth in depths_um)
     return _rounded(max(airy * diffraction_um(lens), BLURS * blur), 3)
@@ -72,12 +91,19 @@ def window_um(
 def disc_um(lens: Lens | ApertureSummary) -> float:
     """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2
     digits.
+
+    Args:
+        lens: the lens.
     """
     return _rounded(ENCIRCLED * diffraction_um(lens), 2)
 
 
 def pixel_um(lens: Lens | ApertureSummary) -> float:
-    """Pixels that show most of what a spot tells: 0.88 wavelength / NA, 2 digits."""
+    """Pixels that show most of what a spot tells: 0.88 wavelength / NA, 2 digits.
+
+    Args:
+        lens: the lens.
+    """
     return _rounded(PIXEL * diffraction_um(lens), 2)
 
 
@@ -87,6 +113,10 @@ def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 
     Short enough that the image's change over it is a derivative; never above a fiftieth
     of the depth.
+
+    Args:
+        lens: the lens.
+        depth_um: distance of the source, um.
     """
     step = (
         2
@@ -100,6 +130,10 @@ def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 def sample_um(lens: Lens | ApertureSummary, pixel_um: float) -> float:
     """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a
     pixel; 2 digits.
+
+    Args:
+        lens: the lens.
+        pixel_um: pitch of the pixels, um.
     """
     sine = math.sin(math.atan(_widest(lens) / sensor_reach_um(lens)))
     return _rounded(min(SAMPLE * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)

@@ -192,13 +192,20 @@ class Lens:
 
 
 def save(path: str | Path, lens: Lens) -> None:
-    """Write a lens file (kind ``lens``); diameters keep their dtype."""
+    """Write a lens file (kind ``lens``); diameters keep their dtype.
+
+    Args:
+        path: target, replaced atomically.
+    """
     records.save_record(path, "lens", lens)
 
 
 @typed_reader
 def load(path: str | Path) -> Lens:
     """Read a lens file.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not a lens file; LensError: its diameters are invalid.
@@ -209,6 +216,9 @@ def load(path: str | Path) -> Lens:
 @typed_reader
 def load_plain(path: str | Path) -> Lens:
     """As :func:`load`, for what knows only round or fixed pillars on a square lattice.
+
+    Args:
+        path: of the file.
 
     Raises:
         LensError: another lattice, or pillars that are turned one by one.
@@ -235,6 +245,9 @@ def load_out_of_core(path: str | Path) -> Lens:
 
     ``diameters.diameter_um`` is then an HDF5 data set: blocks of its rows are arrays,
     ``numpy.asarray`` reads all of it.
+
+    Args:
+        path: of the file.
     """
     large = False
     if Path(path).is_file():  # what else it is tells the loader, and what is damaged

@@ -154,6 +154,9 @@ def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
     """Refuse a sweep over two sizes that cannot be computed, before anything is
     computed.
 
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+
     Raises:
         ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
             with a ratio of its own, pillars
@@ -182,6 +185,9 @@ def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
 def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
     """(least, largest) size along x and along y.
 
+    Args:
+        sweep: settings of the library.
+
     Raises:
         ConfigError: not both are given.
     """
@@ -195,6 +201,10 @@ def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]
 def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
     """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square
     lattice, not turned.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
     """
     quarter = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
     return (
@@ -205,13 +215,20 @@ def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
 
 
 def save(path: str | Path, library: AxesLibrary) -> None:
-    """Write a library file (kind ``axes-library``)."""
+    """Write a library file (kind ``axes-library``).
+
+    Args:
+        path: target, replaced atomically.
+    """
     records.save_record(path, KIND, library)
 
 
 @typed_reader
 def load(path: str | Path) -> AxesLibrary:
     """Read a library over two sizes.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not such a file; DomainError: its arrays do not fit together.
@@ -242,6 +259,7 @@ def interpolate_table(
         nodes: (m,) and (n,) rising sizes along x and y; values: (m, n, components)
             there.
         places: (p,) and (q,) sizes, within the nodes, evenly spaced.
+        tolerance: of t; sets the residual of the rational fits.
     """
     (x, y), (at_x, at_y) = nodes, places
     first = _both(x, y, values, at_x, at_y, tolerance)
@@ -385,6 +403,7 @@ def sweep_two_sizes(
         settings: ``diameters_um`` and ``lengths_um`` are the ranges along x and y,
             ``samples`` the entries along the
             longer of them. console, checkpoint: as for :func:`metalens.library.sweep`.
+        cell: unit cell with its materials, shape and lattice.
 
     Accuracy: the bar of an entry adds the truncation error of the solver, carried as a
     small shift of the sizes, and
@@ -432,6 +451,9 @@ def sweep_two_sizes(
 def size_entries(sweep: Sweep) -> tuple[Array, Array]:
     """Evenly spaced sizes along x and y, with one step; the shorter range may end
     before its largest size.
+
+    Args:
+        sweep: settings with both ranges.
     """
     spans = size_ranges(sweep)
     step = max(high - low for low, high in spans) / (sweep.samples - 1)

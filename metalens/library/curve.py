@@ -157,6 +157,11 @@ def starting_diameters(
 ) -> list[float]:
     """Diameters that :func:`sample_adaptively` solves first: Chebyshev points with both
     ends.
+
+    Args:
+        low_um: least size, um.
+        high_um: largest size, um.
+        count: of points.
     """
     middle, half = (low_um + high_um) / 2, (high_um - low_um) / 2
     start = middle - half * np.cos(np.pi * np.arange(count) / (count - 1))
@@ -184,6 +189,9 @@ def sample_adaptively(
         most: solves at most; where they do not suffice ``converged`` is False.
         cheaper_um: (any,) diameters that cost less, taken where they tell half as much
             as the best, or more.
+        low_um: least size, um.
+        high_um: largest size, um.
+        tolerance: deviation at which predictions are accepted.
     """
     cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
     cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
@@ -220,7 +228,12 @@ def sample_adaptively(
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:
-    """The rational curve through exact solves, and the rivals that judge it."""
+    """The rational curve through exact solves, and the rivals that judge it.
+
+    Args:
+        nodes: the exact solves.
+        tolerance: that the nodes were chosen for.
+    """
     x, y = nodes.diameter_um, nodes.response
     best, simpler = _fits(x, y, tolerance)
     shorter = tuple(

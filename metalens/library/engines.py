@@ -29,6 +29,10 @@ def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
     upright), ``rcwa`` for others.
 
     Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        engine: what is asked for: auto, rcwa or modal.
     """
     if engine == "modal" and not cell.round:
         raise CellError(
@@ -42,7 +46,13 @@ def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
 def solve_to_tolerance(
     cell: Cell, light: Incidence, *, tolerance: float, engine: str
 ) -> Callable[[float], Response]:
-    """Response at a diameter, refined until its own error estimate meets the tolerance."""
+    """Response at a diameter, refined until its own error estimate meets the tolerance.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        light: plane wave that comes.
+        engine: auto, rcwa or modal.
+    """
     if engine == "modal":
         return functools.partial(_modal, cell, light, tolerance)
     return functools.partial(_rcwa, cell, light, tolerance, None)
@@ -59,6 +69,12 @@ def solver_at_fixed_discretization(
     """As :func:`solve_to_tolerance`, on one discretisation for all diameters of
     ``span_um``, so
     far as it goes.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        light: plane wave that comes.
+        tolerance: error of t that is asked for.
+        engine: auto, rcwa or modal.
     """
     return solvers_at_common_discretization(
         cell, [light], span_um, tolerance=tolerance, engine=engine
@@ -85,6 +101,11 @@ def solvers_at_common_discretization(
     resonance, where the error is many times that elsewhere, the next mesh takes over.
     The jump there is the true error
     of the coarser mesh, some tenth of its bar.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        span_um: (least, largest) size, um.
+        engine: auto, rcwa or modal.
     """
     if cell.height_um == 0 or (
         engine == "modal" and not has_upright_walls(cell, engine)
@@ -113,6 +134,9 @@ def solvers_at_common_discretization(
 def has_upright_walls(cell: Cell, engine: str) -> bool:
     """Whether the modal engine solves the pillar by itself: its lights of one direction
     then share modes and a mesh.
+
+    Args:
+        cell: unit cell.
     """
     return engine == "modal" and not cell.sidewall_rad
 
@@ -122,7 +146,12 @@ def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> 
     there is, by the errors of
     the nodes that came of it (the
     first ones as a curve begins with): a pillar solved by itself has no less error
-    then."""
+    then.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        tolerance: error of t that is asked for.
+    """
     return not cell.round and bool(errors[PROBES].max() > tolerance)
 
 

@@ -58,6 +58,11 @@ def sweep_plane_waves(
 ) -> list[Incidence]:
     """Every distinct plane wave; ``normal``: what the polarisations are at normal
     incidence.
+
+    Args:
+        sweep: settings of the library.
+        wavelengths_um: vacuum wavelengths, um.
+        angles_deg: angles of incidence in air.
     """
     found = [
         plane_wave(w, a, p, normal)
@@ -74,7 +79,14 @@ def plane_wave(
     polarization: Polarization,
     normal: Normal = ALIKE,
 ) -> Incidence:
-    """The plane wave of an entry."""
+    """The plane wave of an entry.
+
+    Args:
+        wavelength_um: vacuum wavelength, um.
+        angle_deg: angle of incidence in air.
+        polarization: s or p; x or y at normal incidence.
+        normal: polarisation at normal incidence that stands for s and for p.
+    """
     return Incidence(
         wavelength_um,
         math.radians(angle_deg),
@@ -95,6 +107,9 @@ def complete_sweep(
     poles: (k, 2) diameter and half-width of the resonances of every solved curve. Where
     a narrow one moves from one
     node to the next, the diameters it passes have an error of 1: they must be solved.
+
+    Args:
+        normal: polarisation at normal incidence that stands for s and for p.
     """
     rows = dict(solved)
     sharp = {light: found[found[:, 1] < NARROW_UM] for light, found in poles.items()}

@@ -148,6 +148,9 @@ def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyF
     entries allow only a
     domain that misses the tolerances, ``shortfall`` says so.
 
+    Args:
+        wanted: tolerances and limits of the fit.
+
     Raises:
         DomainError: no stretch of diameters without resonance holds enough entries.
     """
@@ -217,6 +220,9 @@ def _fitted(
 def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
     """Root mean square of the error bars of t, relative to |t|, of the entries at some
     of a library's diameters.
+
+    Args:
+        diameter_um: of the entries, um.
     """
     some = np.isin(library.diameter_um, diameter_um)
     return float(
@@ -266,6 +272,9 @@ def _shorter(
 def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> Proxy:
     """The proxy of a library alone; :func:`fit` gives its table of error against
     coefficients too.
+
+    Args:
+        wanted: tolerances and limits of the fit.
     """
     return fit(library, wanted).proxy
 
@@ -307,6 +316,9 @@ def _longest(
 def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
     """By how much a proxy misses its tolerances, for a person; empty where it meets
     them.
+
+    Args:
+        wanted: tolerances and limits of the fit.
     """
     if tolerance_ratio(proxy, wanted) <= 1:
         return ""
@@ -319,7 +331,12 @@ def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
 
 
 def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
-    """The larger error in units of its tolerance."""
+    """The larger error in units of its tolerance.
+
+    Args:
+        proxy: phase and |T| over the diameter.
+        wanted: tolerances and limits of the fit.
+    """
     phase, level = wanted.tolerances
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
@@ -349,6 +366,9 @@ def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
 def fit_terms(data: FitData, power: int, terms: int) -> Proxy:
     """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
     many for |T|.
+
+    Args:
+        data: phase and |T| of the entries.
     """
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)

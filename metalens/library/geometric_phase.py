@@ -98,6 +98,9 @@ class GeometricPhase:
 def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
     """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1)
     through Jones matrices.
+
+    Args:
+        t: (..., 2, 2) Jones matrices in x and y.
     """
     come = np.array([1.0, 1j * hand]) / math.sqrt(2)
     leave = t @ come
@@ -107,6 +110,9 @@ def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
 def mirror_jones(t: Array) -> Array:
     """Jones matrices of the mirror image (y to -y): those of the pillar turned the
     other way.
+
+    Args:
+        t: (..., 2, 2) Jones matrices in x and y.
     """
     return np.asarray(t * np.array([[1.0, -1.0], [-1.0, 1.0]]))
 
@@ -114,6 +120,9 @@ def mirror_jones(t: Array) -> Array:
 def period_rad(cell: Cell) -> float:
     """Turn after which lattice and pillar are those of angle 0, turned as a whole, the
     axes of the pillar aside.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
     """
     return {"square": math.pi / 2, "hexagonal": math.pi / 3}.get(
         cell.lattice.kind, math.pi
@@ -123,6 +132,10 @@ def period_rad(cell: Cell) -> float:
 def check_geometric_phase(cell: Cell, size_um: float) -> None:
     """Refuse pillars that carry no geometric phase, and those whose mirrors do not lie
     along x and y.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        size_um: of the pillar, um.
 
     Raises:
         CellError: the shape is the same along both axes, is turned already, or has no
@@ -149,6 +162,12 @@ def solve_rotations(
 ) -> GeometricPhase:
     """Solve the pillar turned in its lattice, over one period; half of it follows from
     the mirror of the lattice.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        size_um: of the pillar, um.
+        wavelength_um: vacuum wavelength, um.
+        tolerance: error of t that is asked for.
 
     Raises:
         CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or

@@ -38,6 +38,12 @@ def invert_phase(
     """Diameters on a curve of the phase; see :meth:`metalens.proxy.Proxy.diameter_um`.
 
     excluded_um: (least, largest) of diameters that are moved to the nearer end.
+
+    Args:
+        p: phase over the diameter.
+        phase_rad: (*shape) wanted phases, rad.
+        within_um: (least, largest) diameter that is considered, um.
+        gap: refuse or nearest, for phases that no pillar has.
     """
     low, high = within_um or (p.low, p.high)
     if not p.low - 1e-9 <= low < high <= p.high + 1e-9:

@@ -29,7 +29,13 @@ DEG, NM = 180 / np.pi, 1e3
 def write_study(
     folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
 ) -> None:
-    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist."""
+    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist.
+
+    Args:
+        study: what is compared.
+        verdicts: of all its cells.
+        command: that wrote the page, shown in it.
+    """
     values = {"study": asdict(study), "verdicts": [asdict(v) for v in verdicts]}
     store.write_text(
         folder / "cell_study.json",
@@ -44,6 +50,11 @@ def write_study(
 def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
     """Turns covered over pitch and height, a panel a wavelength; the line is one full
     turn.
+
+    Args:
+        path: of the PNG.
+        study: what is compared.
+        verdicts: of all its cells.
     """
     figure = Figure(figsize=(9, 3.6), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(study.wavelengths_um), sharey=True, squeeze=False)[
@@ -82,6 +93,11 @@ def library_figure(
 ) -> None:
     """Phase and |t| with error bars, the bars by themselves beside the tolerance, and
     what the proxy leaves.
+
+    Args:
+        path: of the PNG.
+        library: the swept cell.
+        made: the fit of its proxy; None where there is none.
     """
     figure = Figure(figsize=(7.5, 8.5), layout="constrained", dpi=110)
     phase, level, bars, rest = figure.subplots(
@@ -153,7 +169,12 @@ def _write(figure: Figure, path: Path) -> None:
 
 
 def axes_library_figure(path: Path, library: "AxesLibrary") -> None:
-    """PNG of the first wavelength; pairs of sizes above the tolerance are blank."""
+    """PNG of the first wavelength; pairs of sizes above the tolerance are blank.
+
+    Args:
+        path: of the PNG.
+        library: over two sizes.
+    """
     canvas, panels = report.make_figure(2, 3, size=(11, 6.6))
     t, usable = library.t[0], library.usable[0]
     for row, name in enumerate("xy"):

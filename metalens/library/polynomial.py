@@ -209,6 +209,9 @@ def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
 def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
     """Refuse diameters (NumPy or torch, um) outside the domain of ``p``.
 
+    Args:
+        diameter: array or tensor of diameters, um.
+
     Raises:
         DomainError: naming both ranges.
     """

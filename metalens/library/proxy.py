@@ -24,6 +24,9 @@ MOST_ERROR = 0.1
 def height_hint(height_um: float, turns: float) -> str:
     """What would cover a turn of phase where pillars of this height cover less
     (``turns``), for a person.
+
+    Args:
+        height_um: of the pillars today, um.
     """
     return (
         f"take pillars of about {height_um / max(turns, 0.05):.3g} um ({height_um:g} um now; phase grows with the "

@@ -264,6 +264,9 @@ class PillarLibrary:
 def check_sweep(cell: Cell, sweep: Sweep) -> None:
     """Refuse a sweep that cannot be computed, before anything is computed.
 
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+
     Raises:
         CellError: pillars touch, or diffraction orders propagate in the cover (named).
         MaterialError: a wavelength outside the range of a material.
@@ -281,6 +284,10 @@ def check_sweep(cell: Cell, sweep: Sweep) -> None:
 def check_light(cell: Cell, sweep: Sweep) -> None:
     """Refuse wavelengths that a material does not hold, half-spaces that absorb, and
     orders that propagate in the cover.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
 
     Raises:
         CellError, MaterialError: as :func:`check_sweep`.
@@ -308,13 +315,20 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
 
 
 def save(path: str | Path, library: PillarLibrary) -> None:
-    """Write a library file (kind ``library``)."""
+    """Write a library file (kind ``library``).
+
+    Args:
+        path: target, replaced atomically.
+    """
     records.save_record(path, "library", library)
 
 
 @typed_reader
 def load(path: str | Path) -> PillarLibrary:
     """Read a library file.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not a library file; DomainError: its arrays do not fit together.

@@ -51,6 +51,10 @@ def longest_monotonic_branch(
     |t|. With ``across_resonances`` it goes on behind narrow resonances, without the
     entries nearer to one than ``least_half_width_um`` or two half-widths.
 
+    Args:
+        library: the swept cell.
+        within_um: (least, largest) diameter that is considered, um.
+
     Raises:
         DomainError: fewer than 12 entries in any such stretch; the message says what is
             in the way.

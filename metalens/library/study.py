@@ -143,6 +143,8 @@ def run_study(
     Args:
         journal: of the curves that an interrupted run has solved; the verdicts are the
             same.
+        study: what is compared.
+        console: where progress is shown.
 
     Raises:
         CellError: a pitch at which diffraction orders propagate in the cover; it is
@@ -238,7 +240,13 @@ def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
 def judge_cell(
     study: CellStudy, cell: Cell, wavelength_um: float, curve: ResponseCurve
 ) -> CellVerdict:
-    """The smooth stretch that covers most phase on one curve."""
+    """The smooth stretch that covers most phase on one curve.
+
+    Args:
+        study: what is compared.
+        cell: unit cell with its materials, shape and lattice.
+        wavelength_um: of the curve, um.
+    """
     d = np.linspace(
         curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES
     )
@@ -284,6 +292,10 @@ def judge_cell(
 def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
     """Angle of incidence in air up to which no other order propagates on either side:
     sin = wavelength / spacing of rows - largest n.
+
+    Args:
+        cell: whose substrate and cover count.
+        wavelength_um: vacuum wavelength, um.
     """
     n = max(
         index(material, wavelength_um).real for material in (cell.substrate, cell.cover)
@@ -319,6 +331,10 @@ def study_markdown(
 ) -> str:
     """The study as a page with one table a wavelength: turns covered (least |t|), pitch
     across, height down.
+
+    Args:
+        verdicts: of all its cells.
+        command: that wrote the page, shown in it.
     """
     lines = [
         "# Cell study",
@@ -350,6 +366,10 @@ def study_markdown(
 def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
     """On how many stretches an error bar of t lies above the tolerance, in words; empty
     where on none.
+
+    Args:
+        study: what is compared.
+        verdicts: of all its cells.
     """
     every = [v for v in verdicts if v.turns > 0]
     missed = [v for v in every if v.error > study.tolerance]
@@ -426,7 +446,12 @@ def best_cell(
 ) -> tuple[float, float] | None:
     """(pitch, height) in um that covers a full turn at every wavelength with most turns
     at the worst of them, at the
-    least height; None where no cell does."""
+    least height; None where no cell does.
+
+    Args:
+        study: what is compared.
+        verdicts: of its cells.
+    """
     by_cell: dict[tuple[float, float], list[float]] = {}
     for v in _own(study, verdicts):
         by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
@@ -470,6 +495,9 @@ def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
 def round_to_tolerance(value: object) -> object:
     """Six significant digits: what the tolerance carries, and the same text on any
     machine.
+
+    Args:
+        value: a number, text, list or dictionary.
     """
     if isinstance(value, float):
         return float(f"{value:.6g}")

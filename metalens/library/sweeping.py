@@ -50,6 +50,7 @@ def sweep(
         console: where progress is shown.
         checkpoint: file for finished curves; a sweep that was interrupted goes on from
             it, to the same result.
+        cell: unit cell with its materials, shape and lattice.
 
     Raises:
         CellError, MaterialError: see :func:`metalens.library.record.check_sweep`.

@@ -43,6 +43,13 @@ def curves_task(
     Lights of one wavelength and direction share the mesh, and the homogeneous modes at
     the diameters that every curve
     begins with.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        lights: plane waves that come.
+        span_um: (least, largest) size, um.
+        tolerance: error of t that is asked for.
+        engine: auto, rcwa or modal.
     """
     return _task("curves", cell, lights, tolerance, engine) | {"span_um": list(span_um)}
 
@@ -55,7 +62,14 @@ def points_task(
     tolerance: float,
     engine: str,
 ) -> Task:
-    """Exact solves at given diameters, each refined to the tolerance."""
+    """Exact solves at given diameters, each refined to the tolerance.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        light: plane wave that comes.
+        diameters_um: sizes to solve, um.
+        engine: auto, rcwa or modal.
+    """
     return _task("points", cell, [light], tolerance, engine) | {
         "diameters_um": diameters_um
     }
@@ -66,6 +80,13 @@ def jones_task(
 ) -> Task:
     """Both polarisations of one pillar at normal incidence, at a fixed truncation; the
     result has a row an element.
+
+    Args:
+        cell: unit cell with its materials, shape and lattice.
+        size_um: of the pillar along x, um.
+        wavelength_um: vacuum wavelength, um.
+        tolerance: error of t that is asked for.
+        reach: largest diffraction order along an axis.
     """
     light = Incidence(wavelength_um)
     return _task("jones", cell, [light], tolerance, "rcwa") | {
@@ -148,6 +169,10 @@ def run_tasks(
     tasks: list[Task], *, processes: int | None = None
 ) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task as it is done, on all cores.
+
+    Args:
+        tasks: as the functions above make them.
+        processes: workers; None: one a core.
 
     Raises:
         MetalensError: what a task raised, of the same class; WorkerError: a worker
