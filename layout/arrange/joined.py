@@ -2,12 +2,9 @@
 wafer of dies.
 """
 
-import csv
-import io
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +14,6 @@ from layout.formats import handover
 from layout.formats.library import CellReference, MaskCell, MaskLibrary, Orientation
 from layout.mask.fields import FieldPlan
 from layout.process.process import LayerNumber
-from metalens.core import store
 from metalens.core.errors import ProcessError
 
 PER_UM = 1000 / UNIT_NM
@@ -168,24 +164,10 @@ def _take(
 
 # write fields
 
-FIELD_HEAD = (*handover.FIELD_HEAD, "part")
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedField:
-    """A write field of a lens on the die: middle and sides, pillars in it."""
-
-    part: str
-    x_um: float
-    y_um: float
-    width_um: float
-    height_um: float
-    pillars: int
-
 
 def place_fields(
     placed: Sequence[PartPlacement], splits: Mapping[str, FieldPlan]
-) -> Iterator[PlacedField]:
+) -> Iterator[handover.WriteStep]:
     """Write fields of all lenses on the die, part by part in their order of writing.
 
     A field has sides along x and y: copies that are turned by no quarter have none
@@ -209,13 +191,13 @@ def place_fields(
                 for n, step in enumerate(steps):
                     sides = step.width_um, step.height_um
                     wide, high = sides if level else sides[::-1]
-                    yield PlacedField(
-                        one.part.name,
+                    yield handover.WriteStep(
                         float(x[n]) + left / PER_UM,
                         float(y[n]) + up / PER_UM,
                         wide,
                         high,
                         step.pillars,
+                        one.part.name,
                     )
 
 
@@ -234,18 +216,3 @@ def without_fields(
         if one.part.name in splits
         and not all(copies.turn.quarter for copies in one.copies(one.part.top))
     ]
-
-
-def write_fields(fields: Sequence[PlacedField], path: str | Path) -> None:
-    """The fields of a die in their order, as CSV.
-
-    Args:
-        path: of the CSV file.
-    """
-    text = io.StringIO()
-    out = csv.writer(text, lineterminator="\n")
-    out.writerow(FIELD_HEAD)
-    for number, step in enumerate(fields, 1):
-        sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
-        out.writerow([number, *(f"{v:.4f}" for v in sizes), step.pillars, step.part])
-    store.write_text(path, text.getvalue())

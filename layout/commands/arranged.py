@@ -295,7 +295,7 @@ def _accompany(work: FloorplanWork, made: MaskLibrary) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
     work.areas_um2 = made.areas_um2()
     fields = list(joined.place_fields(work.placed, work.splits))
-    joined.write_fields(fields, work.folder / "fields.csv")
+    handover.write_fields(fields, work.folder / "fields.csv")
     work.notes += [
         f"{name}: copies that are turned by no quarter have no write fields"
         for name in joined.without_fields(work.placed, work.splits)

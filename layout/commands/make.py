@@ -272,7 +272,7 @@ def _accompany(job: LayoutJob, shots: dict[str, bytes], target: Path) -> None:
     write_lyp(job.plan, target / "mask.lyp")
     write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
-    handover.write_fields(job.fields, target / "fields.csv")
+    handover.write_fields(handover.field_sequence(job.fields), target / "fields.csv")
     store.write_text(target / "job.txt", job.sheet)
     if job.made_rows is not None:
         lenses.save(target / "made.h5", job.made_rows.lens(job.source))

@@ -9,7 +9,7 @@ current gives the time.
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,50 +30,53 @@ _OPEN = "________"
 
 @dataclass(frozen=True, slots=True)
 class WriteStep:
-    """One write field, in the order of writing: middle and sides (lens axis at 0, +y
-    up), pillars in it.
+    """One write field, in the order of writing.
+
+    x_um, y_um: its middle, +y up; of a lens about its axis.
+    width_um, height_um: its sides.
+    pillars: in it.
+    part: of an arrangement that it belongs to.
     """
 
-    sequence: int
     x_um: float
     y_um: float
     width_um: float
     height_um: float
     pillars: int
+    part: str = ""
 
 
 def field_sequence(split: FieldPlan) -> list[WriteStep]:
-    """All fields that hold pillars.
+    """All fields that hold pillars, row by row and back.
 
     Args:
         split: write fields of a lens.
     """
     x, y = split.x_um.tolist(), split.y_um.tolist()
-    made: list[WriteStep] = []
+    made = []
     for i, row in enumerate(split.pillars):
         held = np.flatnonzero(row)
         for j in (held if i % 2 == 0 else held[::-1]).tolist():
-            middle_x, middle_y = (x[j] + x[j + 1]) / 2, (y[i] + y[i + 1]) / 2
+            middle = (x[j] + x[j + 1]) / 2, (y[i] + y[i + 1]) / 2
             wide, high = x[j + 1] - x[j], y[i + 1] - y[i]
-            made.append(
-                WriteStep(len(made) + 1, middle_x, middle_y, wide, high, int(row[j]))
-            )
+            made.append(WriteStep(*middle, wide, high, int(row[j])))
     return made
 
 
-def write_fields(split: FieldPlan, path: str | Path) -> None:
+def write_fields(steps: Sequence[WriteStep], path: str | Path) -> None:
     """The fields in their order, as CSV.
 
     Args:
-        split: write fields of a lens.
+        steps: of a lens, or of all parts of an arrangement.
         path: of the CSV file.
     """
-    text = io.StringIO()
+    text, parts = io.StringIO(), any(step.part for step in steps)
     out = csv.writer(text, lineterminator="\n")
-    out.writerow(FIELD_HEAD)
-    for step in field_sequence(split):
+    out.writerow([*FIELD_HEAD, "part"] if parts else FIELD_HEAD)
+    for number, step in enumerate(steps, 1):
         sizes = (step.x_um, step.y_um, step.width_um, step.height_um)
-        out.writerow([step.sequence, *(f"{v:.4f}" for v in sizes), step.pillars])
+        row = [number, *(f"{v:.4f}" for v in sizes), step.pillars]
+        out.writerow([*row, step.part] if parts else row)
     store.write_text(path, text.getvalue())
 
 

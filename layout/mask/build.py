@@ -184,7 +184,7 @@ def wafer_mark(
         ProcessError: as :func:`plan`.
     """
     made = draw_mask(source, process, name=name, furniture="none")
-    bare = die.wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
+    bare = die.add_wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
     return dataclasses.replace(made, plan=bare)
 
 

@@ -123,7 +123,7 @@ def open_aperture(plan: MaskPlan, process: Process, *, radius_um: float) -> Mask
     )
 
 
-def wafer_mark(
+def add_wafer_mark(
     plan: MaskPlan, process: Process, *, mark_um: float, width_um: float
 ) -> MaskPlan:
     """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells

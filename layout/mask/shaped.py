@@ -30,7 +30,6 @@ from metalens.lens import DiameterMap, Lens
 from metalens.library.axes import cell_of_sizes
 
 _LENGTHS = 1 << 20  # above any drawn size in nm
-_TABLED = 1 << 20  # keys below are counted and numbered by a table, others by sorting
 
 
 def shape_classes(
@@ -52,7 +51,7 @@ def shape_classes(
     turns = _turns(cell, d, process)
     counts: dict[int, int] = {}
     for _, block in _keys(d, process, turns):
-        for key, count in zip(*_counted(block), strict=True):
+        for key, count in zip(*np.unique(block, return_counts=True), strict=True):
             counts[int(key)] = counts.get(int(key), 0) + int(count)
     used = np.array(sorted(key for key in counts if key), np.int64)
     if not len(used):
@@ -62,8 +61,9 @@ def shape_classes(
             f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
         )
     kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
+    every = np.r_[0, used]
     numbered = (
-        (first, _numbered(block, used, kind))
+        (first, np.searchsorted(every, block).astype(kind))
         for first, block in _keys(d, process, turns)
     )
     sites = hold_on_disk(d.diameter_um.shape, kind, numbered)
@@ -112,25 +112,6 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
                 np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
             )
         yield first, np.where(design > 0, drawn * turns + turn, 0)
-
-
-def _counted(block: Array) -> tuple[Array, Array]:
-    """Keys of a block, ascending, and how often each stands in it."""
-    if block.max(initial=0) >= _TABLED:
-        return np.unique(block, return_counts=True)
-    found = np.bincount(block.ravel())
-    keys = np.flatnonzero(found)
-    return keys, found[keys]
-
-
-def _numbered(block: Array, used: Array, kind: np.dtype[Any]) -> Array:
-    """Place of every key among those in use, from 1; 0 for no pillar."""
-    if block.max(initial=0) >= _TABLED:
-        return np.where(block > 0, np.searchsorted(used, block) + 1, 0).astype(kind)
-    small = used[used < _TABLED]
-    table = np.zeros(int(small.max(initial=0)) + 1, kind)
-    table[small] = np.arange(1, len(small) + 1)
-    return table[block]
 
 
 def _steps(

@@ -16,7 +16,6 @@ leave ``own`` as it is, so that the table is smooth in turn and size.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -38,41 +37,6 @@ _MOST_PIXELS = 1200  # along a side
 _HALVINGS = 34
 
 
-class DrawnKinds(Protocol):
-    """Kinds of pillars, entry 0 for none."""
-
-    @property
-    def diameter_um(self) -> Array:
-        """(entries,) of the circle of equal area."""
-
-    @property
-    def area_um2(self) -> Array:
-        """(entries,) areas."""
-
-    @property
-    def wider_um2(self) -> Array:
-        """(entries,) added to the squared width of a Gaussian: mean squared distances
-        from the middle, over the area of
-        the pillar that gives plus over the edge that sees.
-        """
-
-    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """(entries,) ``own`` at unit dose, and its fall per um that all edges move out;
-        0 where not ``used``.
-        """
-
-    def edge_um(self, entry: int) -> Array:
-        """(n, 2) places along the edges, from the site."""
-
-    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """(...) exposure at (..., 2) places from the site, by one Gaussian, at unit
-        dose.
-        """
-
-    def widest(self, used: Array, steps_um: Array) -> list[int]:
-        """Entries that come nearest to others at these (n, 2) steps."""
-
-
 @dataclass(frozen=True, eq=False)
 class DrawnDiscs:
     """Round pillars. diameter_um: (entries,)."""
@@ -90,7 +54,16 @@ class DrawnDiscs:
         return np.asarray(1.5 * self.diameter_um**2 / 4)
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`DrawnKinds`, exact."""
+        """Exposure of the edge by the pillar itself, and its fall; exact.
+
+        Args:
+            used: (entries,) which occur.
+            point: exposure of a beam.
+
+        Returns:
+            (entries,) ``own`` at unit dose, and its fall per um that all edges move
+            out; 0 where not used.
+        """
         d, terms = (
             np.where(used, self.diameter_um, 0.0),
             list(zip(point.widths_um, point.weights, strict=True)),
@@ -101,13 +74,19 @@ class DrawnDiscs:
         return np.asarray(own), np.where(used, slope, 0)
 
     def edge_um(self, entry: int) -> Array:
-        """As in :class:`DrawnKinds`."""
+        """(n, 2) places along the edges, from the site."""
         return np.asarray(
             self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1)
         )
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """As in :class:`DrawnKinds`, exact."""
+        """Exposure by one Gaussian at unit dose, exact.
+
+        Args:
+            entry: kind of the pillar.
+            at_um: (..., 2) places from its site.
+            width_um: 1/e radius.
+        """
         return disc_exposure(
             np.hypot(at_um[..., 0], at_um[..., 1]), self.diameter_um[entry], width_um
         )
@@ -139,7 +118,7 @@ class DrawnOutlines:
         return np.array([_wider(each) if each else 0.0 for each in self.contours])
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`DrawnKinds`; to 5e-4 of itself (pixels of a sixth of the
+        """As of :class:`DrawnDiscs`; to 5e-4 of itself (pixels of a sixth of the
         narrowest
         Gaussian).
         """
@@ -149,11 +128,11 @@ class DrawnOutlines:
         return found[0], found[1]
 
     def edge_um(self, entry: int) -> Array:
-        """As in :class:`DrawnKinds`, evenly spaced."""
+        """As of :class:`DrawnDiscs`, evenly spaced."""
         return points_along_edges(self.contours[entry], _SEEN)
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """As in :class:`DrawnKinds`; four Gauss points to 0.8 widths, 1e-6."""
+        """As of :class:`DrawnDiscs`; four Gauss points to 0.8 widths, 1e-6."""
         places = at_um.reshape(-1, 2)
         y, weight, crossing = _lines(self.contours[entry], width_um)
         bell = (
@@ -172,6 +151,9 @@ class DrawnOutlines:
             [(np.concatenate(list(self.contours[k])) @ steps_um.T).max(0) for k in some]
         )
         return sorted({some[k] for k in far.argmax(0).tolist()})
+
+
+DrawnKinds = DrawnDiscs | DrawnOutlines
 
 
 def _wider(contours: Contours) -> float:

@@ -21,6 +21,7 @@ from layout.mask.plan import (
 )
 from layout.process.process import DesignRules, KeepOutZone
 from layout.shapes import convex, polygon
+from tests.referees.convex import convex_gap
 
 LOOSE = DesignRules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
 
@@ -129,7 +130,7 @@ def test_gap_is_the_least_of_all_pairs_by_brute_force(rows):
     plan = plan_of([100, 180, 240, 300, 350, 390], rows)
     found = check_plan(plan, LOOSE)
     gaps = [
-        convex.convex_gap(
+        convex_gap(
             plan.classes[k - 1].outline, plan.classes[m - 1].outline, u - x, v - y
         )
         for (x, y, k), (u, v, m) in itertools.combinations(sites(plan), 2)

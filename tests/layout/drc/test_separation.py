@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.drc.geometry import contour_edges, measure_separation
-from layout.shapes import convex
+from tests.referees.convex import convex_gap
 
 ANGLE = np.array([(0, 0), (900, 0), (900, 100), (120, 100), (120, 700), (0, 700)])
 HOLE = [
@@ -78,8 +78,6 @@ def test_convex_ones_are_as_far_apart_as_lines_between_them_say():
     edges = [contour_edges([shape]) for shape in shapes]
     found, _ = measure_separation(edges, one, two, np.column_stack([dx, dy]))
     some = zip(one.tolist(), two.tolist(), dx.tolist(), dy.tolist(), strict=True)
-    wanted = [
-        max(convex.convex_gap(shapes[a], shapes[b], x, y), 0.0) for a, b, x, y in some
-    ]
+    wanted = [max(convex_gap(shapes[a], shapes[b], x, y), 0.0) for a, b, x, y in some]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
     assert 30 < np.count_nonzero(found == 0) < 300
