@@ -84,6 +84,7 @@ def propose_correction(
 
     Args:
         x: all parameters of the fit. old: bias that the present mask was drawn with.
+        design: as designed. response: of the pillars to height, index and side wall.
 
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
@@ -121,6 +122,12 @@ def bias_table(
     """The bias table alone, without a look at the pillars: what many draws of a
     posterior are asked for.
 
+    Args:
+        design: as designed. x: all parameters of a lens, in the fit's order.
+        response: of the pillars to height, index and side wall.
+        old: of the present mask. range_um: least and largest diameter of the design.
+        knots: of the table.
+
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
     """
@@ -146,6 +153,7 @@ def next_lenses(
     Args:
         x_fit: what the correction was made from. x_true: what the process really does;
             both all parameters.
+        plan: proposed correction of the next mask.
     """
     tabled = _drawn_with(made.design, plan, x_fit)
     full = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
@@ -175,6 +183,9 @@ def next_lenses(
 def loss_reason(before: LensProposal, after: LensProposal) -> str:
     """Why a step of the correction is not written: the simulated lens is worse with it;
     empty where it is not.
+
+    Args:
+        before: lens without the step of the correction. after: lens with it.
     """
     if after.strehl >= before.strehl:
         return ""
@@ -187,6 +198,9 @@ def loss_reason(before: LensProposal, after: LensProposal) -> str:
 def wavefront_overlap(one: Array, other: Array) -> float:
     """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a>
     <b, b>), best piston.
+
+    Args:
+        other: the one it is compared with.
     """
     cross = abs(np.vdot(one, other)) ** 2
     return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
@@ -195,6 +209,9 @@ def wavefront_overlap(one: Array, other: Array) -> float:
 def uneven_nm(x: Array) -> Array:
     """(places,) nm that the corrected map takes off at the axis, half-way and along the
     rim, of all parameters.
+
+    Args:
+        x: all parameters of a lens, in the fit's order.
     """
     turn = 2 * np.pi * np.arange(_RAYS) / _RAYS
     rho = np.repeat([0.5, 1.0], _RAYS)
@@ -209,6 +226,9 @@ def write_correction(
 ) -> None:
     """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5
     where it is ``evened``.
+
+    Args:
+        folder: of the files. plan: proposed correction of the next mask.
     """
     from metalens import lens as lenses
 
@@ -226,6 +246,9 @@ def write_correction(
 
 def present_bias(path: Path | None) -> Bias:
     """The bias that a mask was drawn with, from its PROCESS.toml; none without a file.
+
+    Args:
+        path: of the file; None without one.
 
     Raises:
         ConfigError, ProcessError: as :func:`metalens.fabrication.of_process`.
@@ -309,6 +332,9 @@ def _with_diameters(
 def table_rows(plan: MaskCorrection) -> list[tuple[Any, ...]]:
     """Rows of the table for people: drawn diameter, present bias, new bias, designed
     and aimed diameter, nm.
+
+    Args:
+        plan: proposed correction of the next mask.
     """
     columns = (
         plan.drawn_nm,

@@ -44,7 +44,11 @@ class NetworkAccuracy:
         return float(self.error_mm[:, :2].mean())
 
     def interval_mm(self, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
-        """95 % interval of ``slip_mm`` by a bootstrap over frames."""
+        """95 % interval of ``slip_mm`` by a bootstrap over frames.
+
+        Args:
+            draws: resamples of the bootstrap. seed: of the random generator.
+        """
         low, high = bootstrap_interval(
             self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed
         )
@@ -72,7 +76,11 @@ class NetworkAccuracy:
 
 
 def measure_accuracy(answers: Predictions, seen: SensorFrames) -> NetworkAccuracy:
-    """Errors of answers against the truth of their frames."""
+    """Errors of answers against the truth of their frames.
+
+    Args:
+        seen: frames of the sensor with their truth.
+    """
     return NetworkAccuracy(
         (answers.slip_mm - seen.slip_mm).abs(), answers.iou, seen.above
     )

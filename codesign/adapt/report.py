@@ -46,7 +46,11 @@ class RetrainingResults:
 
 
 def write_retraining_page(path: Path, story: RetrainingResults) -> None:
-    """Write report.html."""
+    """Write report.html.
+
+    Args:
+        path: of the file. story: everything that the page shows.
+    """
     o = story.outcome
     keys = [
         KeyFigure("slippage error, nominal lens", f"{o.nominal.slip_mm:.3f} mm"),
@@ -122,7 +126,11 @@ def _accuracy(story: RetrainingResults) -> Section:
 
 
 def plot_error_bars(outcome: RetrainingOutcome) -> bytes:
-    """Slippage error of every case as PNG."""
+    """Slippage error of every case as PNG.
+
+    Args:
+        outcome: accuracy of all cases.
+    """
     rows = outcome.rows()
     figure, axes = report.make_figure(size=(6.4, 2.6))
     place = np.arange(len(rows))[::-1]

@@ -41,6 +41,9 @@ def relative_inputs(
 ) -> dict[str, str | None]:
     """Where a retraining's run, fit and truth lie, as seen from its folder, for its
     result.
+
+    Args:
+        built: asbuilt.h5.
     """
     paths = {"run": run, "asbuilt": built, "truth": truth}
     return {
@@ -61,6 +64,9 @@ def run_of(path: Path) -> Path:
 def lens_of(path: Path) -> str:
     """Which lens forms the images: "as designed", or of a retraining "as fitted", or
     "as made" where that is known.
+
+    Args:
+        path: of the file.
     """
     folder = _folder(path)
     if not is_retraining(folder):

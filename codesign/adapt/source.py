@@ -45,6 +45,9 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
 
     The weights are those of the network's own file, fine-tuned where the run did so.
 
+    Args:
+        budget_mmacs: compute budget, million multiply-accumulates a frame.
+
     Raises:
         TrainingError: no run folder, half written, unfinished, of another version, or
             without such a budget.
@@ -84,12 +87,22 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
 
 
 def weights_file(folder: Path, budget_mmacs: float) -> Path:
-    """Where the weights of one network of a run lie."""
+    """Where the weights of one network of a run lie.
+
+    Args:
+        folder: of the files.
+        budget_mmacs: compute budget, million multiply-accumulates a frame.
+    """
     return folder / f"subnet_{budget_mmacs:g}.safetensors"
 
 
 def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
-    """The lens of one network of a run: the run's, or its own."""
+    """The lens of one network of a run: the run's, or its own.
+
+    Args:
+        folder: of the files. settings: of the run.
+        budget_mmacs: compute budget, million multiply-accumulates a frame.
+    """
     name = f"lens_{budget_mmacs:g}" if settings.search.inner_steps else "lens"
     return folder / f"{name}.h5"
 
@@ -99,6 +112,9 @@ def restore_weights(run: CodesignRun, row: dict[str, Any], folder: Path) -> None
 
     Without fine-tuning those are the checkpoint's own; networks with optics of their
     own (``search.inner_steps``) bring lens and pitch.
+
+    Args:
+        folder: of the files.
 
     Raises:
         TrainingError: the file is missing, cut short, or of another space.
@@ -132,6 +148,9 @@ def _no_retraining(folder: Path) -> None:
 def rows_of(folder: Path) -> list[dict[str, Any]]:
     """Rows of result.json, least budget first.
 
+    Args:
+        folder: of the files.
+
     Raises:
         TrainingError: the file is missing, cut short or of another version.
     """
@@ -158,6 +177,9 @@ def architecture_of(
 ) -> Architecture:
     """The architecture in a row of result.json.
 
+    Args:
+        entry: architecture in a row of result.json. folder: of the files.
+
     Raises:
         TrainingError: of another version, or outside the run's space.
     """
@@ -178,6 +200,10 @@ def architecture_of(
 def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
     """Refuse an as-built record of another lens, or of a fit that failed its own
     checks.
+
+    Args:
+        design: as designed. result: of the fit.
+        insist: accept a fit that failed its own checks.
 
     Raises:
         FitError: either of the two, with what to do.

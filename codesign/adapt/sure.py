@@ -99,6 +99,8 @@ def judge_correction(
         table: (knots,) of the bias table, or of what is taken off at some places of the
             lens, nm, of all parameters of
             one lens. part: which of them.
+        result: of the fit. wide_nm: largest standard deviation of a usable correction.
+        seed: of the random generator.
     """
     try:
         drawn = np.array(

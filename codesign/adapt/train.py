@@ -72,6 +72,9 @@ class LensPsfs:
 def gap_sigma_mm(worse: NetworkAccuracy, better: NetworkAccuracy) -> float:
     """Standard error of the difference of two mean slippage errors over the frames,
     which both cases share.
+
+    Args:
+        worse: case with the larger error. better: case with the smaller error.
     """
     apart = (worse.error_mm - better.error_mm).mean(1)
     return float(apart.std()) / math.sqrt(len(apart))
@@ -135,7 +138,12 @@ def lens_psfs(
     config: RetrainConfig,
     truth: HiddenLens | None = None,
 ) -> LensPsfs:
-    """PSFs of the nominal, fitted, drawn and (where known) true lens."""
+    """PSFs of the nominal, fitted, drawn and (where known) true lens.
+
+    Args:
+        made: lens ready for perturbations. result: of the fit.
+        config: of the retraining. truth: lens of a virtual bench; None of a real one.
+    """
     rows = list(
         built.posterior_parameters(
             result, config.draws + config.judge, seed=config.seed
@@ -158,6 +166,10 @@ def make_trainer(
 ) -> Trainer:
     """The inner loop of the run, from its trained weights and where it is placed, on
     given PSFs; only weights move.
+
+    Args:
+        source: finished run: its network, lens and sensor. config: of the retraining.
+        stacks: PSFs of made lenses.
     """
     settings, origin = source.settings, source.run.trainer
     fresh = make_model(
@@ -176,7 +188,11 @@ def make_trainer(
 
 
 def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
-    """The inner loop's settings for training on."""
+    """The inner loop's settings for training on.
+
+    Args:
+        config: of the retraining.
+    """
     still = LearningRateSchedule(0.0)
     return replace(
         inner, steps=config.steps, seed=inner.seed + APART * (config.seed + 1),
@@ -187,7 +203,12 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
 def make_job(
     source: FinishedRun, config: RetrainConfig, found: LensPsfs, name: str
 ) -> Trainer:
-    """The training of one of :data:`JOBS`."""
+    """The training of one of :data:`JOBS`.
+
+    Args:
+        source: finished run: its network, lens and sensor. config: of the retraining.
+        found: PSFs of the lenses in question. name: of the job.
+    """
     return make_trainer(
         source,
         config,
@@ -198,7 +219,11 @@ def make_job(
 
 
 def available_jobs(found: LensPsfs) -> tuple[str, ...]:
-    """Networks that can be trained: with the truth only where it is known."""
+    """Networks that can be trained: with the truth only where it is known.
+
+    Args:
+        found: PSFs of the lenses in question.
+    """
     return JOBS if found.known else JOBS[:2]
 
 
@@ -207,6 +232,10 @@ def run_job(
 ) -> Iterator[LogRecord]:
     """Run one job to its end, from where it stands, with checkpoints in ``path``; a
     record a step.
+
+    Args:
+        going: training with its network. settings: record that a resume compares.
+        every: steps from checkpoint to checkpoint.
     """
     for record in going.run():
         yield record
@@ -222,6 +251,10 @@ def recalibrate_on_lenses(
 
     Never on frames that judge: a network that nobody warned of the made lens knows none
     of its images.
+
+    Args:
+        going: training with its network.
+        source: finished run: its network, lens and sensor. batches: how many batches.
     """
     frames = []
     for number in range(batches):
@@ -262,7 +295,11 @@ class TestFrames:
 
 
 def render_test_frames(source: FinishedRun, config: RetrainConfig) -> TestFrames:
-    """The test frames of a run, that no training sees."""
+    """The test frames of a run, that no training sees.
+
+    Args:
+        source: finished run: its network, lens and sensor. config: of the retraining.
+    """
     scenes = source.run.scenes(TEST)
     size = source.settings.inner.batch
     return TestFrames(
@@ -287,6 +324,9 @@ def judge_network(
     Args:
         frames: of :func:`render_test_frames`, where several cases are judged.
         finer: judge on images formed at a quarter of the tolerance too.
+        going: training with its network.
+        source: finished run: its network, lens and sensor. config: of the retraining.
+        stacks: PSFs of made lenses.
     """
     recalibrate_on_lenses(going, source)
     frames = frames or render_test_frames(source, config)
@@ -324,7 +364,12 @@ def retraining_outcome(
     found: LensPsfs,
     trained: dict[str, Trainer],
 ) -> RetrainingOutcome:
-    """Accuracy of all cases, on the same test frames."""
+    """Accuracy of all cases, on the same test frames.
+
+    Args:
+        source: finished run: its network, lens and sensor. config: of the retraining.
+        found: PSFs of the lenses in question. trained: trainings by name of the job.
+    """
     nominal, frames = (found.nominal,), render_test_frames(source, config)
     untouched = make_trainer(source, config, nominal)
 
@@ -354,6 +399,7 @@ def retrain(
         folder: of ``metalens codesign``. result: of ``metalens fit`` for that run's
             lens.h5.
         truth: of the virtual bench, where there is one.
+        config: of the retraining; its defaults without it.
 
     Raises:
         TrainingError: the run is missing, half written or of another version.

@@ -77,7 +77,11 @@ def flatten_layers(frames: Frames, scale: Tensor) -> SingleSurfaceFrames:
 
 
 def frame_samples(frames: Frames | SingleSurfaceFrames) -> int:
-    """Samples along a side, margin included."""
+    """Samples along a side, margin included.
+
+    Args:
+        frames: rendered frames of two layers or of one.
+    """
     return int(
         (
             frames.light if isinstance(frames, SingleSurfaceFrames) else frames.radiance
@@ -93,6 +97,10 @@ def depth_um(
 ) -> Tensor:
     """(n, y, x) depth of what is seen at every sample without the margin: of the sheet
     that covers more of it.
+
+    Args:
+        frames: rendered frames of two layers or of one.
+        device: where the depth is wanted.
     """
     if isinstance(
         frames, SingleSurfaceFrames
@@ -124,6 +132,9 @@ def sensor_irradiance(
 ) -> Tensor:
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the
     kernels of ``optics``.
+
+    Args:
+        frames: rendered frames of two layers or of one.
     """
     device = (
         optics.stack.device if isinstance(optics, Imager) else optics.transfer.device

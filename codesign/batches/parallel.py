@@ -105,7 +105,11 @@ def _rows(record: Any, rows: slice) -> Any:
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replace every gradient by its mean over the processes."""
+    """Replace every gradient by its mean over the processes.
+
+    Args:
+        parameters: with gradients.
+    """
     if process_count() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
@@ -128,6 +132,9 @@ def shared_rows(count: int) -> Tensor:
 def gather_rows(part: Tensor, rows: Tensor, count: int) -> Tensor:
     """(count, ...) rows of all processes from those of each (:func:`shared_rows`);
     differentiable: every process's loss depends on every process's rows.
+
+    Args:
+        part: (rows, ...) of this process.
     """
     if process_count() == 1:
         return part
@@ -136,7 +143,11 @@ def gather_rows(part: Tensor, rows: Tensor, count: int) -> Tensor:
 
 
 def mean_of(values: list[float]) -> list[float]:
-    """Mean of numbers over the processes."""
+    """Mean of numbers over the processes.
+
+    Args:
+        values: of this process.
+    """
     if process_count() == 1:
         return values
     return [
@@ -146,7 +157,11 @@ def mean_of(values: list[float]) -> list[float]:
 
 
 def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
-    """``work`` of every item, done by one process each; all get all answers, in order."""
+    """``work`` of every item, done by one process each; all get all answers, in order.
+
+    Args:
+        items: to work on.
+    """
     found = torch.zeros(len(items), dtype=torch.float64)
     for i in range(process_rank(), len(items), process_count()):
         found[i] = work(items[i])
@@ -156,7 +171,12 @@ def share_work(work: Callable[[Any], float], items: Sequence[Any]) -> list[float
 def batch_norm(
     x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5
 ) -> Tensor:
-    """Batch normalisation with the statistics of all processes' frames; differentiable."""
+    """Batch normalisation with the statistics of all processes' frames; differentiable.
+
+    Args:
+        x: (batch, channels, y, x) features. weight: (channels,) scale.
+        bias: (channels,) offset. epsilon: added to the variance.
+    """
     count = x.numel() // x.shape[1] * process_count()
     mean = _summed(x.sum((0, 2, 3))) / count
     centred = x - mean[:, None, None]

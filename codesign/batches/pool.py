@@ -65,7 +65,11 @@ def render_pool(scenes: EyeScenes, count: int) -> FramePool:
 
 
 def save_pool(path: Path, pool: FramePool) -> None:
-    """Keep a pool (HDF5, kind ``pool``)."""
+    """Keep a pool (HDF5, kind ``pool``).
+
+    Args:
+        path: of the file.
+    """
     store.save(
         path, "pool", {name: getattr(pool, name) for name in FramePool.__slots__}
     )
@@ -74,6 +78,9 @@ def save_pool(path: Path, pool: FramePool) -> None:
 @typed_reader
 def load_pool(path: Path) -> FramePool:
     """A pool that was kept.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not a pool.
@@ -153,7 +160,11 @@ class PoolScenes:
         )
 
     def rows(self, rows: Array, generator: np.random.Generator) -> FrameBatch:
-        """The frames of these numbers, at scales drawn from ``generator``."""
+        """The frames of these numbers, at scales drawn from ``generator``.
+
+        Args:
+            rows: numbers of the frames.
+        """
         pool = self.held
         here, place = (
             torch.from_numpy(pool.here_um),

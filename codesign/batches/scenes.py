@@ -162,7 +162,11 @@ class EyeScenes:
         return PinholeCamera(self.settings.pixels + 2 * self.margin, self.sample_um)
 
     def states(self, step: int, size: int) -> EyeStates:
-        """Subjects and states of a step."""
+        """Subjects and states of a step.
+
+        Args:
+            size: frames of a step.
+        """
         plain = eye.draw_states(
             size, (self.seed, self.stream, step), motion=self.settings.motion
         )
@@ -178,6 +182,9 @@ class EyeScenes:
     def rendered(self, step: int, size: int) -> RenderedFrames:
         """Frames of a step with all labels, and with what the scenes' variety lets them
         wear.
+
+        Args:
+            size: frames of a step.
         """
         seed = (self.seed, self.stream, step, 3)
         return augmented_frames(
@@ -185,7 +192,11 @@ class EyeScenes:
         )
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """Frames of a step, as training takes them."""
+        """Frames of a step, as training takes them.
+
+        Args:
+            size: frames of a step.
+        """
         return as_batch(self.rendered(step, size), self.margin)
 
 
@@ -196,7 +207,12 @@ def augmented_frames(
     variety: float,
     seed: tuple[int, ...],
 ) -> RenderedFrames:
-    """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1."""
+    """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1.
+
+    Args:
+        states: subjects with gaze and slippage. rig: pose of camera and lamps.
+        camera: pixel grid of the frames. seed: of the random generator.
+    """
     found = draw_augmentations(len(states), variety, np.random.default_rng(seed))
     return render_dressed(states, found, rig=rig, camera=camera)
 
@@ -204,6 +220,9 @@ def augmented_frames(
 def widen_motion(variety: float) -> MotionRanges:
     """The usual ranges with looks and opening of the lids spread by a factor about the
     mean.
+
+    Args:
+        variety: factor on the spread of looks; above 1 with augmentations.
     """
     usual = MotionRanges()
     widest = max(1 - (1 - usual.aperture[0]) * variety, 0.1), usual.aperture[1]
@@ -215,6 +234,9 @@ def widen_motion(variety: float) -> MotionRanges:
 def widen_traits(variety: float) -> dict[str, SubjectTrait]:
     """Traits of :data:`LOOKS`, spread and limits widened about the mean, between
     :data:`LEAST` and :data:`MOST`.
+
+    Args:
+        variety: factor on the spread of looks; above 1 with augmentations.
     """
     found = {}
     for name in LOOKS:
@@ -242,6 +264,9 @@ def draw_depth_scales(
     cue is removed, as far as a
     factor of 1 +- ``spread`` reaches. A factor drawn on its own would leave most of the
     cue.
+
+    Args:
+        depth_um: (n, y, x) or (n,) depth before the lens. generator: of the draws.
     """
     wanted = torch.from_numpy(generator.uniform(*range_um, len(depth_um)))
     return (wanted / depth_um).clamp(1 - spread, 1 + spread)
@@ -250,6 +275,9 @@ def draw_depth_scales(
 def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
     """Rendered frames as a training batch: the mask without its margin, the slippage in
     mm.
+
+    Args:
+        made: rendered frames.
     """
     inside = slice(margin, made.pupil.shape[-1] - margin)
     frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
@@ -262,7 +290,12 @@ def as_batch(made: RenderedFrames, margin: int) -> FrameBatch:
 
 
 def pose_of(made: RenderedFrames, margin: int) -> EyePose:
-    """How the eyes of rendered frames stand."""
+    """How the eyes of rendered frames stand.
+
+    Args:
+        made: rendered frames.
+        margin: samples around the frame that are blurred in and not seen.
+    """
     size, labels = made.pupil.shape[-1], made.labels
     places = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
     points = (places - (size - 1) / 2) / (size - 2 * margin)

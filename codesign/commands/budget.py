@@ -30,6 +30,9 @@ from metalens.psf import Source, spectrum
 def run(options: Options) -> int:
     """Compute, write, report; exit 1 where the error of the device's image is above its
     tolerance.
+
+    Args:
+        options: of the command line.
     """
     target = options.output
     if target.suffix != ".h5":
@@ -58,6 +61,9 @@ def run(options: Options) -> int:
 def of_light(made: lens.Lens) -> str:
     """Of which light a budget is, where pillars of one size answer x and y apart; empty
     for others.
+
+    Args:
+        made: lens.
     """
     if not made.one_light:
         return ""
@@ -67,6 +73,9 @@ def of_light(made: lens.Lens) -> str:
 def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:
     """The sums, what was measured on the same frames and the ratio of the two, where a
     run was given.
+
+    Args:
+        rows: of the budget.
     """
     total = rows[-1]
     found = {"gaze_error_deg": math.degrees(total.gaze_rad), "psf_error": total.psf}
@@ -82,7 +91,11 @@ def budget_summary(rows: list[BudgetEntry]) -> dict[str, float]:
 def save_budget(
     path: Path, rows: list[BudgetEntry], provenance: store.Provenance
 ) -> None:
-    """Write a budget file (kind ``budget``)."""
+    """Write a budget file (kind ``budget``).
+
+    Args:
+        path: of the file. rows: of the budget. provenance: of the file.
+    """
     numbers = {
         name: np.array([getattr(r, name) for r in rows])
         for name in ("phase_rad", "psf", "gaze_rad")
@@ -97,6 +110,9 @@ def save_budget(
 @typed_reader
 def load_budget(path: Path) -> list[BudgetEntry]:
     """Read a budget file.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not a budget file.
@@ -175,7 +191,11 @@ def plot_budget(rows: list[BudgetEntry]) -> bytes:
 
 
 def budget_text(rows: list[BudgetEntry]) -> str:
-    """The table for a terminal."""
+    """The table for a terminal.
+
+    Args:
+        rows: of the budget.
+    """
     lines = [f"{'link':<30} {'phase/rad':>10} {'PSF':>9} {'gaze/deg':>10}  how"]
     for row in rows:
         link, phase, psf, gaze, method = budget_cells(row)

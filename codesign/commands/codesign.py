@@ -52,6 +52,9 @@ SHOWN = 8  # test frames that are kept with the answers
 def run(options: Options) -> int:
     """Train, search, finish; exit 1 where the error of the true image is above what the
     run asks for.
+
+    Args:
+        options: of the command line.
     """
     settings = _frozen(runs.load_run_settings(options.config), options.freeze)
     device = device_of(options.device)
@@ -328,6 +331,7 @@ def trained_lens(
 
     Args:
         coefficients_rad: (polynomials,) of the phase.
+        settings: of the lens and its image. provenance: of the file.
     """
     middle_um, light = settings.focus.wavelength_um, formed.source_of(settings)
     width_um = 0.0 if light is None else light.fwhm_nm * 1e-3

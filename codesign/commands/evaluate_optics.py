@@ -55,6 +55,9 @@ class OpticsSettings:
 def run(options: Options) -> int:
     """Measure, print, draw, write; exit 1 where an error of PSFs or images is above
     what is aimed at.
+
+    Args:
+        options: of the command line.
     """
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
@@ -181,6 +184,9 @@ def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> Non
 def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens]]:
     """The tuned hyperbolic lens and double helix, of the pillars and aperture of a
     lens, with their names.
+
+    Args:
+        setting: how lenses are measured.
     """
     radius, measured = (
         lens.diameters.radius_um + lens.diameters.pitch_um / 2,
@@ -210,7 +216,11 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
 
 
 def distinct_lens_names(names: list[str]) -> list[str]:
-    """Names of lenses, numbered where two files have the same stem."""
+    """Names of lenses, numbered where two files have the same stem.
+
+    Args:
+        names: stems of the files.
+    """
     return [
         name if names.count(name) == 1 else f"{name} ({i + 1})"
         for i, name in enumerate(names)

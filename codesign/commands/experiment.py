@@ -34,6 +34,9 @@ GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-ra
 def run(options: Options) -> int:
     """Show, read, calibrate, draw; exit 1 where the error of a run's images is above
     what the run asks for.
+
+    Args:
+        options: of the command line.
     """
     if not options.runs:
         raise ConfigError("no run to evaluate; give one run folder or more")
@@ -99,6 +102,9 @@ def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, An
     found; None of older runs.
 
     Of a retraining, those of the run that it went on from.
+
+    Args:
+        folders: of finished runs. names: of the runs.
     """
     return {
         name: json.loads(
@@ -111,6 +117,9 @@ def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, An
 def distinct_run_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """Names of the folders, of a network in a folder with its own, numbered where they
     repeat.
+
+    Args:
+        paths: of runs or retrainings.
     """
     places = (path.resolve() for path in paths)
     stems = [
@@ -129,6 +138,9 @@ def experiment_summary(
 ) -> dict[str, Any]:
     """Numbers of every run with intervals over subjects, and ratios of the first to the
     others.
+
+    Args:
+        results: one a run. config: subjects, stimuli, slippage and calibration.
     """
     per = [_per_subject(r) for r in results]
     rows = []
@@ -243,7 +255,11 @@ def _finer_words(row: dict[str, Any]) -> str:
 
 
 def experiment_table(values: dict[str, Any]) -> str:
-    """The numbers as text."""
+    """The numbers as text.
+
+    Args:
+        values: content of experiment.json.
+    """
     head = (
         f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}"
         f"{'axial/mm':>10}{'IoU':>7}{'finer image: axial/deg (ratio)':>32}"

@@ -35,6 +35,9 @@ def write_network_file(
     """Write a network of a run, cut to its architecture, for frames of the run's
     sensor.
 
+    Args:
+        path: of the file. net: elastic network.
+
     Raises:
         OSError: the target cannot be written.
     """

@@ -31,6 +31,9 @@ DIM_DB = 15.0
 def run(options: Options) -> int:
     """Measure what is missing, compare, write; exit 1 where a measurement's own check
     failed.
+
+    Args:
+        options: of the command line.
     """
     if len(options.runs) > len(ROLES):
         raise ConfigError(
@@ -95,6 +98,9 @@ def collect_measurements(
 ) -> dict[str, MeasuredNumber]:
     """Everything that was measured into ``folder``, and the rows of the runs and of
     those with a part frozen.
+
+    Args:
+        others: runs with a part frozen.
 
     Raises:
         StoreError, TrainingError: a measurement or a run is damaged or of another
@@ -181,7 +187,11 @@ def _named(folder: Path, name: str, run_dir: Path) -> Path:
 
 
 def claims_table(told: list[ClaimLine]) -> str:
-    """The lines as text."""
+    """The lines as text.
+
+    Args:
+        told: claims with their measurements.
+    """
     head = ("place", "what", "paper", "ours", "ratio", "conditions")
     return report.Table(head, [line.words() for line in told]).text
 

@@ -34,7 +34,11 @@ Given = tuple[FinishedRun, asbuilt.AsBuilt, lens.Lens, HiddenLens | None, Bias]
 def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 1 where the error of the images that judge
     is above what the run asks
-    for."""
+    for.
+
+    Args:
+        options: of the command line.
+    """
     source = retraining.load_finished_run(
         options.run_dir, budget_mmacs=options.settings.budget_mmacs
     )

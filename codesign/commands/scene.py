@@ -110,7 +110,11 @@ class SceneSettings:
 
 
 def run(options: Options) -> int:
-    """Render, write and show; exit 1 where the image's error is above what it aims at."""
+    """Render, write and show; exit 1 where the image's error is above what it aims at.
+
+    Args:
+        options: of the command line.
+    """
     settings = (
         SceneSettings()
         if options.config is None
@@ -250,7 +254,12 @@ def _table(made: RenderedFrames) -> str:
 def contact_sheet(
     made: RenderedFrames, path: Path, *, columns: int = 6, most: int = 24
 ) -> None:
-    """A picture of frames, with depth and pupil masks of the first row below."""
+    """A picture of frames, with depth and pupil masks of the first row below.
+
+    Args:
+        made: rendered frames. path: of the file. columns: frames across.
+        most: frames shown at most.
+    """
     import cv2
 
     light = made.pinhole()[:most].clamp(0, 1) ** (1 / 1.8)

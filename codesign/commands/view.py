@@ -32,6 +32,9 @@ LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
 def run_panels(path: Path) -> list[Panel]:
     """A run's folder, finished or not.
 
+    Args:
+        path: of the file.
+
     Raises:
         StoreError: a log or a result that is no JSON.
     """
@@ -205,7 +208,11 @@ def _bound(result: dict[str, Any]) -> list[Panel]:
 
 
 def prediction_panels(path: Path) -> list[Panel]:
-    """Test frames and what the networks said of them, beside the truth."""
+    """Test frames and what the networks said of them, beside the truth.
+
+    Args:
+        path: of the file.
+    """
     stored = store.load(path, "answers")
     held, count = stored.arrays, len(stored.arrays["frames"])
     names = [
@@ -301,6 +308,9 @@ def _networks(result: dict[str, Any]) -> list[Panel]:
 def scene_panels(path: Path) -> list[Panel]:
     """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of
     every frame.
+
+    Args:
+        path: of the file.
     """
     held = store.load(path, "scene").arrays
     count = len(held["radiance"])
@@ -365,7 +375,11 @@ def scene_panels(path: Path) -> list[Panel]:
 
 
 def layer_panels(path: Path) -> list[Panel]:
-    """The layers of one frame, as images are formed of them."""
+    """The layers of one frame, as images are formed of them.
+
+    Args:
+        path: of the file.
+    """
     held = store.load(path, "layers").arrays
     axis = [SliderAxis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
     return [
@@ -391,6 +405,9 @@ def layer_panels(path: Path) -> list[Panel]:
 def image_panels(path: Path) -> list[Panel]:
     """Scenes and what a lens makes of them, and the PSFs over field and depth that did
     it.
+
+    Args:
+        path: of the file.
     """
     stored = store.load(path, "image")
     held, about = stored.arrays, stored.attributes
@@ -433,7 +450,11 @@ def image_panels(path: Path) -> list[Panel]:
 
 
 def budget_panels(path: Path) -> list[Panel]:
-    """Every link from pillar to answer with its error."""
+    """Every link from pillar to answer with its error.
+
+    Args:
+        path: of the file.
+    """
     rows = [
         (
             row.link,

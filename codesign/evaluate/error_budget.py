@@ -124,6 +124,9 @@ class BudgetInputs:
 def image_difference(one: Imager, other: Imager) -> float:
     """Relative L2 difference of the PSFs of two images over field and depth, each PSF
     of sum 1.
+
+    Args:
+        one: image to compare. other: the image it is compared with.
     """
     return float((one.stack - other.stack).norm() / other.stack.norm())
 
@@ -159,7 +162,11 @@ class ImagingDevice:
 
     @torch.no_grad()
     def one_wavelength(self, wavelength_um: float) -> Imager:
-        """The image in light of one wavelength."""
+        """The image in light of one wavelength.
+
+        Args:
+            wavelength_um: of the light.
+        """
         waves = SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
         plan = replace(self.whole.plan, waves=waves)
         light = node_light(self.optics, plan).detach()
@@ -281,13 +288,21 @@ class NetworkReading:
         *,
         phase_rad: float = NONE,
     ) -> BudgetEntry:
-        """The entry of a change of the optics after the persons were calibrated."""
+        """The entry of a change of the optics after the persons were calibrated.
+
+        Args:
+            link: name of the row. base: image before the change.
+            method: how the entry is determined. phase_rad: phase error of the pillars.
+        """
         gaze, psf = self.turn_rad(optics, base), image_difference(optics, base)
         return BudgetEntry(link, phase_rad, psf, gaze, method)
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
         """Mean angle, rad, between the answers to noiseless frames through two optics;
         the persons stay calibrated.
+
+        Args:
+            base: image before the change.
         """
         trial = experiment.rows_of_trial(self.trial, self._rows)
         one, other = (
@@ -708,6 +723,10 @@ def refuse_other_lens(lens: Lens, optics: OpticsConfig) -> None:
 def scatter_rad(changed: Array, base: Array) -> float:
     """Standard deviation over pillars of the phase between two complex transmissions
     (pillars,); a common phase is no error.
+
+    Args:
+        changed: (pillars,) complex t of the changed pillars.
+        base: (pillars,) complex t of the design.
     """
     turn = changed * base.conj()
     mean = np.exp(1j * np.angle(turn)).sum()
@@ -719,6 +738,9 @@ def stored_response(
 ) -> Array:
     """(*at) complex t of a library at the nearest of its wavelengths, the mean of both
     polarisations; level and unwrapped phase are linear between its diameters.
+
+    Args:
+        at_um: diameters. wavelength_um: of the light.
     """
     near = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
     t = library.t[:, 0, near].mean(0)
@@ -732,6 +754,9 @@ def stored_response(
 def row_lengths(rows: NeighbourRows, pitch_um: float) -> list[int]:
     """Pillars of every row along the lattice of ``pitch_um``: it turns light by one
     wave over its length.
+
+    Args:
+        rows: rows of unlike pillars.
     """
     return [round(n) for n in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um]
 

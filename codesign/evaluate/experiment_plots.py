@@ -31,6 +31,10 @@ def plot_samples(
 ) -> bytes:
     """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is
     (green) and as it is read (red).
+
+    Args:
+        source: finished run: its network, lens and sensor.
+        config: subjects, stimuli, slippage and calibration.
     """
     scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
     prepared, slips = prepare_run(source, image=config.image), config.slips_mm
@@ -72,6 +76,9 @@ def plot_samples(
 def plot_ambiguity(result: RunResult) -> bytes:
     """Fig. 10: pupil centres of all stimuli under axial and lateral slippage, and their
     means with ranges.
+
+    Args:
+        result: of one run.
     """
     trial, percent = result.trial, result.centre * 100
     figure, axes = report.make_figure(1, 3, size=(10.5, 3.2))
@@ -112,6 +119,9 @@ def plot_ambiguity(result: RunResult) -> bytes:
 def plot_gaze_errors(results: Sequence[RunResult]) -> bytes:
     """Fig. 11: mean gaze error at every stimulus, as the size of its marker, under
     axial and lateral slippage.
+
+    Args:
+        results: one a run.
     """
     figure, axes = report.make_figure(1, 2, size=(10.5, 3.8))
     for ax, kind in zip(axes, (AXIAL, LATERAL), strict=True):

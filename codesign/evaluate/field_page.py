@@ -59,6 +59,9 @@ class FieldSetting:
     def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
         """A lens over the field, with what was left out from the first one and from
         other angles.
+
+        Args:
+            angles_deg: field angles where the setting has none.
         """
         return over_field(
             lens,
@@ -69,7 +72,11 @@ class FieldSetting:
 
 
 def field_values(found: OverField) -> dict[str, Any]:
-    """Every number of one lens, ready for JSON: None where there is none."""
+    """Every number of one lens, ready for JSON: None where there is none.
+
+    Args:
+        found: aberrations over the field.
+    """
     arrays = {
         name: _plain(np.asarray(getattr(found, name)))
         for name in found.__slots__
@@ -85,7 +92,11 @@ def _plain(array: Array) -> Any:
 
 
 def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
-    """Rays and light over the field angle, and the MTF."""
+    """Rays and light over the field angle, and the MTF.
+
+    Args:
+        seen: aberrations over the field by name of the lens.
+    """
     head = (
         "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
         "sharpest line T / µm", "S / µm", "vignetting / %", "illumination",
@@ -133,7 +144,11 @@ def _told(value: float, digits: int) -> str:
 
 
 def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
-    """Distortion, foci and light over the field angle."""
+    """Distortion, foci and light over the field angle.
+
+    Args:
+        seen: aberrations over the field by name of the lens.
+    """
     figure, panels = make_figure(1, 3, size=(10.5, 3.4))
     for name, one in seen.items():
         order = np.argsort(one.angles_deg)
@@ -167,7 +182,11 @@ def plot_over_field(seen: Mapping[str, OverField]) -> bytes:
 
 
 def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
-    """MTF over the field angle, a panel for each frequency."""
+    """MTF over the field angle, a panel for each frequency.
+
+    Args:
+        seen: aberrations over the field by name of the lens.
+    """
     frequencies = next(iter(seen.values())).frequencies_per_mm
     figure, panels = make_figure(
         1,

@@ -67,6 +67,9 @@ def states_of(
 ) -> tuple[EyeStates, ExperimentTrials]:
     """All frames of one subject: slippage states outermost, stimuli within.
 
+    Args:
+        config: subjects, stimuli, slippage and calibration. scenes: frames by number.
+
     Raises:
         ConfigError: slippage that takes the eye to the lens.
     """
@@ -117,6 +120,10 @@ def render_subject(
 ) -> RenderedFrames:
     """Frames of one subject with the variety of training, worn by a person: spectacles
     and make-up stay on from frame to frame, before the stage's own camera.
+
+    Args:
+        states: subjects with gaze and slippage.
+        config: subjects, stimuli, slippage and calibration. scenes: frames by number.
     """
     seed = (config.seed, subject, WORN)
     worn = drawn_of_people(
@@ -131,6 +138,10 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
 
     The visual axis lies nasal of and above the optic axis, by which eyes are turned;
     what that leaves is corrected.
+
+    Args:
+        states: subjects with gaze and slippage.
+        looks_deg: (n, 2) wanted gaze across and down. rig: pose of camera and lamps.
     """
     kappa = torch.stack([states.trait("kappa_x_rad"), states.trait("kappa_y_rad")], 1)
     straight = torch.zeros_like(states.mount_rad)
@@ -163,6 +174,8 @@ def image_frames(
 
     Args:
         sensor: of :func:`experiment_sensors`; the run's own without it.
+        source: finished run: its network, lens and sensor. made: rendered frames.
+        prepared: what forms the images.
     """
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
@@ -196,6 +209,9 @@ def experiment_sensors(
     Dim light is one exposure and one background for all runs: those at which a pixel of
     the first run has ``config.snr_db`` behind a lens of its aperture that images all
     light. What a lens loses, and a smaller aperture, costs it signal.
+
+    Args:
+        sources: runs to compare.
     """
     sensors = [source.run.trainer.sensor for source in sources]
     if config.snr_db is None:
@@ -233,6 +249,10 @@ def run_experiment(
     names: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, list[RunResult]]]:
     """Run the experiment, subject by subject.
+
+    Args:
+        sources: runs to compare. config: subjects, stimuli, slippage and calibration.
+        names: of the runs; numbered without it.
 
     Yields:
         (subjects done, one :class:`Result` a run); results are there with the last
@@ -299,7 +319,11 @@ def _answers(source: FinishedRun, seen: SensorFrames) -> Predictions:
 
 
 def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
-    """Frames of several subjects, one after the other."""
+    """Frames of several subjects, one after the other.
+
+    Args:
+        trials: one record a subject.
+    """
     return ExperimentTrials(
         *(
             np.concatenate([getattr(t, f) for t in trials])
@@ -309,7 +333,11 @@ def join_subjects(trials: Sequence[ExperimentTrials]) -> ExperimentTrials:
 
 
 def rows_of_trial(trial: ExperimentTrials, rows: Array) -> ExperimentTrials:
-    """Some of the frames; ``rows``: their numbers."""
+    """Some of the frames; ``rows``: their numbers.
+
+    Args:
+        trial: subject, stimulus and slippage of every frame.
+    """
     parts = (getattr(trial, name)[rows] for name in ExperimentTrials.__slots__)
     return ExperimentTrials(*parts)
 
@@ -344,6 +372,9 @@ def prepare_run(
     statistics of training frames, as
     they were formed.
 
+    Args:
+        source: finished run: its network, lens and sensor.
+
     Raises:
         SceneError: the true image of this lens cannot be formed at the run's
             ``optics.image_tolerance``.
@@ -369,6 +400,9 @@ def prepare_run(
 def finer_imager(source: FinishedRun) -> Imager | None:
     """The true image of a run's lens at a quarter of the run's tolerance; None where it
     cannot be formed so precisely, or the run was trained on a uniform image.
+
+    Args:
+        source: finished run: its network, lens and sensor.
     """
     settings = assess.finer_image(source.run.trainer.optics)
     if settings is None:
@@ -390,7 +424,12 @@ def finer_imager(source: FinishedRun) -> Imager | None:
 def sphere_calibrator(
     source: FinishedRun, config: ExperimentConfig
 ) -> SphereCalibrator:
-    """Calibrates before a run's camera by pupil and slippage alone."""
+    """Calibrates before a run's camera by pupil and slippage alone.
+
+    Args:
+        source: finished run: its network, lens and sensor.
+        config: subjects, stimuli, slippage and calibration.
+    """
     return SphereCalibrator(
         source.run.scenes(EXPERIMENT).rig, config.hidden, config.seed
     )
@@ -411,6 +450,10 @@ def run_calibrator(
     the same stage at places of their own between its ends: EACH of their frames, drawn
     at random, through the run's
     lens, light and noise.
+
+    Args:
+        source: finished run: its network, lens and sensor.
+        imager: what forms the images. sensor: with its exposure.
     """
     scenes = source.run.scenes(EXPERIMENT)
     found, looked = [], []
@@ -441,6 +484,9 @@ def run_calibrator(
 def read_from(kept: Sequence[Predictions], source: FinishedRun) -> NetworkReadings:
     """A run's answers to frames one after the other, in the units that gaze is
     calibrated in.
+
+    Args:
+        kept: one record a subject. source: finished run: its network, lens and sensor.
     """
     centre, slip = (
         torch.cat([getattr(a, f) for a in kept]).double().numpy()
@@ -500,6 +546,12 @@ def calibrated_gaze(
 ) -> tuple[Array, Array]:
     """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that
     it never saw.
+
+    Args:
+        read: pupil, slippage and axis as a network reads them.
+        trial: subject, stimulus and slippage of every frame.
+        config: subjects, stimuli, slippage and calibration.
+        how: way to calibrate a person.
     """
     judged = ~np.isin(np.arange(len(read)), calibration_frames(trial, config))
     return predicted_gaze(
@@ -515,6 +567,12 @@ def calibrate_subjects(
 ) -> dict[int, CalibratedPerson]:
     """Every subject's calibration by number, on the stimuli of
     :func:`calibration_frames`.
+
+    Args:
+        read: pupil, slippage and axis as a network reads them.
+        trial: subject, stimulus and slippage of every frame.
+        config: subjects, stimuli, slippage and calibration.
+        how: way to calibrate a person.
     """
     known = calibration_frames(trial, config)
     mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
@@ -528,7 +586,13 @@ def predicted_gaze(
     read: NetworkReadings,
     trial: ExperimentTrials,
 ) -> Array:
-    """(n, 2) gaze of frames, each by its subject's calibration."""
+    """(n, 2) gaze of frames, each by its subject's calibration.
+
+    Args:
+        people: calibrated persons by number of the subject.
+        read: pupil, slippage and axis as a network reads them.
+        trial: subject, stimulus and slippage of every frame.
+    """
     predicted = np.empty((len(read), 2))
     for subject in np.unique(trial.subject):
         rows = np.flatnonzero(trial.subject == subject)
@@ -539,6 +603,10 @@ def predicted_gaze(
 def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Array:
     """Numbers of the frames that subjects are calibrated on: a share of their stimuli,
     in every slippage state.
+
+    Args:
+        trial: subject, stimulus and slippage of every frame.
+        config: subjects, stimuli, slippage and calibration.
     """
     known = []
     for subject in np.unique(trial.subject):
@@ -559,6 +627,9 @@ def calibration_frames(trial: ExperimentTrials, config: ExperimentConfig) -> Arr
 def farthest_points(places: Array, count: int, *, first: int) -> Array:
     """(count,) numbers of places (n, 2) that cover them: each next one is the farthest
     from all before it.
+
+    Args:
+        first: number of the first place.
     """
     chosen = [first]
     while len(chosen) < count:

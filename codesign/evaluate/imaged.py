@@ -54,7 +54,11 @@ class ImagedFrames:
 
 
 def margin_of(pitch_um: float) -> int:
-    """Samples around a frame that are blurred into it."""
+    """Samples around a frame that are blurred into it.
+
+    Args:
+        pitch_um: of the pixels.
+    """
     return math.ceil(BLUR_UM / pitch_um)
 
 
@@ -69,6 +73,11 @@ def lens_imager(
     """The true image of a lens file on the samples of a camera, for frames with a
     margin (:func:`margin_of`) that hold
     these depths.
+
+    Args:
+        depths_um: nearest and farthest depth of the scenes.
+        fwhm_nm: spectral width of the light; 0 for one wavelength.
+        tolerance: relative L2 error allowed.
 
     Raises:
         SceneError: see :func:`metalens.image.imager`.
@@ -85,7 +94,11 @@ def lens_imager(
 
 
 def source_of(lens: Lens, fwhm_nm: float) -> Source | None:
-    """A diode about the design wavelength; None for one wavelength, a width of 0."""
+    """A diode about the design wavelength; None for one wavelength, a width of 0.
+
+    Args:
+        lens: to image with. fwhm_nm: spectral width of the light; 0 for one wavelength.
+    """
     return Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
 
 
@@ -153,7 +166,11 @@ def image_first_frames(
 
 
 def write_images(folder: Path, found: ImagedFrames, about: Provenance) -> None:
-    """image.h5 (kind ``image``) and image.png."""
+    """image.h5 (kind ``image``) and image.png.
+
+    Args:
+        folder: of the files. found: frames with their images. about: of the file.
+    """
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
     arrays = {name: np.asarray(getattr(found, name)) for name in names}
     said = {"pitch_um": found.pitch_um, "error": found.error} | {
@@ -164,7 +181,11 @@ def write_images(folder: Path, found: ImagedFrames, about: Provenance) -> None:
 
 
 def plot_image(found: ImagedFrames) -> bytes:
-    """The first frame: scene, image, and what the lens took away and added."""
+    """The first frame: scene, image, and what the lens took away and added.
+
+    Args:
+        found: frames with their images.
+    """
     figure, axes = report.make_figure(1, 3, size=(9.6, 3.3))
     apart = found.image[0] - found.scene[0]
     top, most = float(found.scene[0].max()), float(np.abs(apart).max())

@@ -230,6 +230,10 @@ def most_encircled(intensity: Tensor, sample_um: float, *, radius_um: float) -> 
 
     Off axis the core of a PSF is neither at the chief ray nor at the centroid, which
     haze pulls away.
+
+    Args:
+        intensity: (..., y, x) PSFs. sample_um: distance of the samples.
+        radius_um: of the circle.
     """
     n = intensity.shape[-1]
     grid = (
@@ -290,6 +294,10 @@ def scene_energies(
     sums). The steps are the paper's
     kind of perturbation, not infinitesimal ones.
 
+    Args:
+        states: subjects with gaze and slippage.
+        settings: of the scenes; their defaults without it.
+
     Raises:
         SceneError: no lens is given, or they differ in their sensor distance.
     """
@@ -319,6 +327,9 @@ def lens_imager(
 ) -> Imager:
     """The true image of a lens at one wavelength, on the pixels of the scenes and over
     the depths that they hold.
+
+    Args:
+        views: rendered views of the scenes. settings: of the scenes.
     """
     window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
     grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
@@ -326,7 +337,11 @@ def lens_imager(
 
 
 def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
-    """Nearest and farthest surface that is seen, um."""
+    """Nearest and farthest surface that is seen, um.
+
+    Args:
+        views: rendered views of the scenes.
+    """
     seen = torch.cat([v.frames.depth_um[v.frames.coverage > 0] for v in views])
     return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
@@ -337,7 +352,11 @@ def scene_views(
     *,
     sensor_distance_um: float = 2000.0,
 ) -> SeparabilityTriplets:
-    """Anchor, gaze and slip views of the states."""
+    """Anchor, gaze and slip views of the states.
+
+    Args:
+        settings: of the scenes. sensor_distance_um: lens to sensor.
+    """
     return render_triplets(
         states,
         gaze_step_rad=math.radians(settings.gaze_step_deg),
@@ -354,7 +373,13 @@ def energies_of(
     light: float = 1.0,
     image_error: float = math.nan,
 ) -> SceneEnergy:
-    """Table 1 of any PSFs, see :func:`scene_energies`."""
+    """Table 1 of any PSFs, see :func:`scene_energies`.
+
+    Args:
+        optics: what forms the images. views: anchor, gaze and slip views.
+        light: share of the light that the PSFs' windows hold.
+        image_error: relative L2 error of the images.
+    """
     seen = [v.frames for v in (views.anchor, views.gaze, views.slip)]
     images = [optics(f) for f in seen]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)

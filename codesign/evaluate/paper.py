@@ -135,6 +135,9 @@ def claim_lines(
 def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     """Measurements in an experiment.json whose runs are named by :data:`ROLES`.
 
+    Args:
+        path: of the file.
+
     Raises:
         StoreError: no such file, or of another version.
     """
@@ -173,6 +176,9 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
 def of_dim(bright: Path, dim: Path) -> dict[str, MeasuredNumber]:
     """The 15 dB test from an experiment in good light and one in dim light.
 
+    Args:
+        bright: experiment.json in good light.
+
     Raises:
         StoreError: no such file, or of another version.
     """
@@ -197,6 +203,9 @@ def of_dim(bright: Path, dim: Path) -> dict[str, MeasuredNumber]:
 def of_optics(path: Path) -> dict[str, MeasuredNumber]:
     """Measurements in an optics.json whose lenses are named by :data:`ROLES`,
     hyperbolic first.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: no such file, or of another version.

@@ -39,6 +39,9 @@ class RunKind:
 def kind_of(folder: Path) -> RunKind:
     """Read from result.json.
 
+    Args:
+        folder: of the files.
+
     Raises:
         TrainingError: no finished run, or of another version.
     """
@@ -50,6 +53,9 @@ def kind_of(folder: Path) -> RunKind:
 def image_tolerance(folders: Sequence[Path]) -> float:
     """Of the true image that lenses of these runs are compared by: the largest that one
     of them is imaged at.
+
+    Args:
+        folders: of finished runs.
     """
     return max(
         runs.load_run_settings(folder / "run.toml").optics.image_tolerance
@@ -63,6 +69,9 @@ def gaze_errors(
 ) -> list[dict[str, Any]]:
     """Gaze errors of every network of a finished run on people whom training never saw;
     least compute first.
+
+    Args:
+        folder: of the files. each: frames a person. seed: of the random generator.
 
     Raises:
         TrainingError: no finished run, half written, or of another version.
@@ -122,6 +131,9 @@ def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
     """Table 2 from gaze.json, {folder: {rows of :func:`gaze_errors`}}: the first run is
     the
     proposed one. Networks of others are not rebuilt here.
+
+    Args:
+        told: content of gaze.json.
     """
     for entry in told.values():
         rows = entry["rows"]
@@ -165,6 +177,9 @@ def of_ablations(
 
 def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """(part, rows) of every run in which exactly one part was frozen.
+
+    Args:
+        folders: of finished runs.
 
     Raises:
         TrainingError: two runs with the same part frozen.

@@ -24,7 +24,12 @@ HALF = 0.1875  # half width of the slices that is shown, of the window
 def plot_axial_information(
     axial: Mapping[str, AxialInformation], setting: ResolvedSettings
 ) -> bytes:
-    """I(z) over depth on axis, a panel for each binning."""
+    """I(z) over depth on axis, a panel for each binning.
+
+    Args:
+        axial: axial information by name of the lens.
+        setting: how the lenses were measured.
+    """
     depths = np.linspace(*setting.depths_mm, setting.count)
     count = len(setting.binnings)
     figure, panels = make_figure(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
@@ -45,7 +50,12 @@ def plot_axial_information(
 def plot_depth_slices(
     axial: Mapping[str, AxialInformation], setting: ResolvedSettings
 ) -> bytes:
-    """Light along x over depth, lenses down, binnings across."""
+    """Light along x over depth, lenses down, binnings across.
+
+    Args:
+        axial: axial information by name of the lens.
+        setting: how the lenses were measured.
+    """
     shape = (len(axial), len(setting.binnings))
     figure, panels = make_figure(
         *shape,
@@ -86,6 +96,9 @@ def plot_depth_slices(
 def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
     """The first scene through every lens: image, change with gaze, difference of gaze
     and slip.
+
+    Args:
+        energies: scene sensitivity by name of the lens.
     """
     titles = ("image", "(gaze − anchor)²", "(gaze − slip)²")
     figure, panels = make_figure(

@@ -201,6 +201,9 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
     """Render what all lenses of this sensor distance are judged on; size tells no
     depth.
 
+    Args:
+        config: of the reference reader. sensor_distance_um: lens to sensor.
+
     Raises:
         ConfigError: eyes out of the depths of the PSFs.
     """
@@ -232,6 +235,10 @@ def train_reader(
 ) -> ReaderResult:
     """Train the reader on images through ``optics`` and judge it; the same seed gives
     the same numbers.
+
+    Args:
+        seen: scenes to learn from, to calibrate and to judge.
+        config: of the reference reader.
     """
     threads.keep_memory()
     state = torch.get_rng_state()
@@ -258,6 +265,10 @@ def lens_frames(
 ) -> LensFrames:
     """``count`` frames of a stream through a lens onto the sensor, with noise of the
     batch's number.
+
+    Args:
+        optics: what forms the images. scenes: frames by number.
+        config: of the reference reader.
     """
     pixels, vergence, slip = [], [], []
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
@@ -375,7 +386,11 @@ def _judge(
 
 
 def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
-    """A row a lens."""
+    """A row a lens.
+
+    Args:
+        found: result by name of the lens. config: of the reference reader.
+    """
     light = f"{config.fwhm_nm:g} nm of light" if config.fwhm_nm else "one wavelength"
     caption = (
         f"Read by the reference reader: {config.frames} frames of {config.pixels} pixels of {config.pitch_um:g} µm, "
@@ -416,6 +431,9 @@ def judge_lenses(
     lenses: dict[str, Lens], config: ReaderConfig
 ) -> Iterator[tuple[str, ReaderResult]]:
     """Every lens by name, on the same scenes.
+
+    Args:
+        config: of the reference reader.
 
     Raises:
         ConfigError: lenses of different sensor distances (through films: reduced),

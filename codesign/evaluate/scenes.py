@@ -81,18 +81,33 @@ class SceneObjective:
     ) -> tuple[Tensor, Tensor]:
         """Eq. 6 without its last term, and the encircled energy at every depth (which
         the design holds instead).
+
+        Args:
+            phase_rad: (y, x) phase on the nodes of the pupil.
+            focus_um: source distance that the phase images onto the sensor.
+            generator: of the draws.
         """
         found, energy = self.evaluate(phase_rad, focus_um)
         return found.value, energy
 
     def judge(self, phase_rad: Tensor, focus_um: float) -> DesignScore:
-        """Minus Eq. 6 as the figure to climb."""
+        """Minus Eq. 6 as the figure to climb.
+
+        Args:
+            phase_rad: (y, x) phase on the nodes of the pupil.
+            focus_um: source distance that the phase images onto the sensor.
+        """
         with torch.no_grad():
             found, energy = self.evaluate(phase_rad, focus_um)
         return DesignScore(-found.value[None], energy)
 
     def evaluate(self, phase_rad: Tensor, focus_um: float) -> tuple[OpticsLoss, Tensor]:
-        """The loss with its parts, and the encircled energy at every depth."""
+        """The loss with its parts, and the encircled energy at every depth.
+
+        Args:
+            phase_rad: (y, x) phase on the nodes of the pupil.
+            focus_um: source distance that the phase images onto the sensor.
+        """
         sample = self.settings.sample_um
         samples = min(
             int((self.size + 2) * self.scenes.pitch_um / sample),

@@ -30,7 +30,11 @@ class ExperimentTrials:
     slip_mm: Array
 
     def group(self, kind: str) -> Array:
-        """(n,) frames of the axial or lateral states, the origin among both."""
+        """(n,) frames of the axial or lateral states, the origin among both.
+
+        Args:
+            kind: "axial" or "lateral".
+        """
         along = 2 if kind == AXIAL else 0
         other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
         return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
@@ -162,7 +166,11 @@ class RunResult:
         return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
 
     def gaze(self, kind: str) -> float:
-        """Mean gaze error over the judged frames of a group, deg."""
+        """Mean gaze error over the judged frames of a group, deg.
+
+        Args:
+            kind: "axial" or "lateral".
+        """
         return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
 
     @property
@@ -203,6 +211,9 @@ class RunResult:
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
         """(subjects,) means of (n,) values, of which nan are left out; nan where none
         is left.
+
+        Args:
+            chosen: (n,) frames that count; all without it.
         """
         keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
         mine = (

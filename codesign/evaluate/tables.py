@@ -30,7 +30,11 @@ PAPER_AXIAL = {  # Table 3, averaged over 16-26 mm
 def lens_ratios(
     scenes: Mapping[str, SceneEnergy],
 ) -> dict[str, dict[str, tuple[float, float, float]]]:
-    """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1."""
+    """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1.
+
+    Args:
+        scenes: scene sensitivity by name of the lens.
+    """
     first = next(iter(scenes.values()))
     return {
         name: {
@@ -46,7 +50,13 @@ def table_values(
     scenes: Mapping[str, SceneEnergy],
     setting: ResolvedSettings,
 ) -> dict[str, Any]:
-    """Every number of the tables, ready for JSON."""
+    """Every number of the tables, ready for JSON.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
     out: dict[str, Any] = {
         "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
         "angles_deg": list(setting.angles_deg),
@@ -78,7 +88,13 @@ def table_failures(
     scenes: Mapping[str, SceneEnergy],
     setting: ResolvedSettings,
 ) -> list[str]:
-    """What of the numbers misses its tolerance, in words."""
+    """What of the numbers misses its tolerance, in words.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
     asked = setting.tolerance
     above = [
         f"{name}: the PSFs' error {one.psf_error:.2g} is above axial.tolerance = {asked:g}"
@@ -97,7 +113,13 @@ def format_tables(
 ) -> list[Table]:
     """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the
     paper's numbers below each;
-    spread: what is said of lenses that do not focus, a line each."""
+    spread: what is said of lenses that do not focus, a line each.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
     return [_axial(axial, setting, spread), _scenes(scenes)]
 
 

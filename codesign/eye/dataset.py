@@ -25,6 +25,10 @@ def states_at(
 ) -> EyeStates:
     """State number i of the endless set of a seed: the same whoever asks for it, alone
     or among others.
+
+    Args:
+        indices: (n,) numbers of the states.
+        motion: ranges of the states; the usual ones without it.
     """
     parts = [eye.draw_states(1, (seed, int(i)), motion=motion) for i in indices]
     return EyeStates(
@@ -62,6 +66,12 @@ def render_triplets(
     camera: PinholeCamera | None = None,
 ) -> SeparabilityTriplets:
     """Finite-difference triplets in the linear regime, at one exposure.
+
+    Args:
+        states: subjects with gaze and slippage. directions: a gaze and a slip motion.
+        gaze_step_rad: step of the gaze. slip_step_um: step of the slippage.
+        rig: pose of camera and lamps; the default one without it.
+        camera: pixel grid; the default one without it.
 
     Accuracy:
         Divided by the default steps, the differences agree with the exact derivatives
@@ -137,6 +147,13 @@ def ambiguity_pairs(
     so that the centroid returns.
     Pairs that need a gaze outside the range, or whose pupil is cut by lid or frame, are
     left out.
+
+    Args:
+        count: how many. seed: of the random generator.
+        rig: pose of camera and lamps; the default one without it.
+        camera: pixel grid; the default one without it.
+        motion: ranges of the states; the usual ones without it.
+        least_slip_um: least distance of the two slippages of a pair.
 
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
@@ -237,6 +254,10 @@ def write_shard(
     """One HDF5 file (kind ``scene``) of frames, masks and labels: light and coverage in
     8 bits, depth in um.
 
+    Args:
+        path: of the file. rendered: frames to write. seed: of the random generator.
+        provenance: of the file.
+
     Accuracy: light to 1/510, coverage to 1/510, depth to 1 um (16 bits up to 65 mm).
     """
     f, labels = rendered.frames, rendered.labels
@@ -258,6 +279,9 @@ def write_shard(
 @typed_reader
 def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
     """Frames, pupil masks and labels by name of a shard.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: not a scene file.

@@ -65,6 +65,10 @@ def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
 def soft_patches(size: int, draws: Array) -> Tensor:
     """(y, x) in [0, 1): one to three ellipses of soft edges, half 5 to 25 % of the
     frame, striped as hair is.
+
+    Args:
+        size: side of the frame in pixels.
+        draws: (11,) uniform draws in [0, 1) of the frame.
     """
     x = ((torch.arange(size) + 0.5) / size - 0.5)[None]
     y, out = x.T, torch.zeros(size, size)

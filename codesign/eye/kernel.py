@@ -444,7 +444,15 @@ def frames(
     first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array,
     w: Array, light: Array, cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip
-    """Strips of frames from the first to before the end; see :func:`render`."""
+    """Strips of frames from the first to before the end; see :func:`render`.
+
+    Args:
+        parameters: (n, COUNT) of the frames. scale: (n,) factor of the depths.
+        bank: packed textures. u: (x,) tangents of the rays across.
+        w: (y,) tangents of the rays down. light: (n, 2, y, x) radiance to fill.
+        cover: (n, 2, y, x) coverage to fill. depth: (n, 2, y, x) depth to fill, um.
+        pupil: (n, 1, y, x) share of pupil to fill.
+    """
     strips = (len(w) + ROWS - 1) // ROWS
     x, words = np.empty(TILE, np.float32), np.empty(WORDS, np.int32)
     for job in range(first, end):

@@ -17,7 +17,11 @@ NEAREST_UM = 500.0
 
 
 def project_points(points_um: Tensor) -> Tensor:
-    """(..., 2) tangents x / z, y / z of points (..., 3)."""
+    """(..., 2) tangents x / z, y / z of points (..., 3).
+
+    Args:
+        points_um: (..., 3) points before the camera.
+    """
     return points_um[..., :2] / points_um[..., 2:].clamp_min(NEAREST_UM)
 
 
@@ -91,6 +95,7 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
     Args:
         p: (n, COUNT) parameters.
         iris_um: (n, m, 2) points in the plane of the iris.
+        steps: Newton steps at most.
 
     Returns:
         (n, m, 2) tangents; 1e-9 accurate where the cornea shows the point. For an eye

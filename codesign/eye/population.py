@@ -255,7 +255,11 @@ class EyeStates:
         return EyeStates(*(getattr(self, name)[rows] for name in self.__slots__))
 
     def trait(self, name: str) -> Tensor:
-        """(n,) values of one trait."""
+        """(n,) values of one trait.
+
+        Args:
+            name: of the entry.
+        """
         return self.traits[:, list(POPULATION).index(name)]
 
 
@@ -284,6 +288,9 @@ def draw_states(
     """Random subjects in random states; the same seed gives the same states.
 
     ``motion.scale`` s > 0 draws the scale factor of each state uniformly in 1 +- s.
+
+    Args:
+        count: how many.
     """
     rng, motion = np.random.default_rng(seed), motion or MotionRanges()
     columns = []
@@ -433,6 +440,9 @@ def _row(places: Mapping[int, Tensor]) -> Tensor:
 def mean_eye_um(rig: CameraRig) -> tuple[tuple[float, float, float], float]:
     """Rotation centre of the population's mean eye before this camera, and how far its
     pupil lies from that centre.
+
+    Args:
+        rig: pose of camera and lamps.
     """
     mean = {
         name: torch.tensor([trait.mean], dtype=torch.float64)
@@ -457,7 +467,12 @@ def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Te
 def eye_axes(
     states: EyeStates, rig: CameraRig, view: CameraView | None = None
 ) -> tuple[Tensor, Tensor]:
-    """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors."""
+    """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors.
+
+    Args:
+        states: subjects with gaze and slippage. rig: pose of camera and lamps.
+        view: other cameras than the rig's.
+    """
     axis, across, down = _turned(_face(rig, states, view), states)
     side, rise = (
         torch.tan(states.trait("kappa_x_rad")),

@@ -40,13 +40,21 @@ class PinholeCamera:
             )
 
     def tangents(self, rig: CameraRig) -> Array:
-        """(pixels,) tangents of the rays through the pixel centres along one side."""
+        """(pixels,) tangents of the rays through the pixel centres along one side.
+
+        Args:
+            rig: pose of camera and lamps.
+        """
         return (np.arange(self.pixels) - (self.pixels - 1) / 2) * (
             self.pitch_um / rig.sensor_distance_um
         )
 
     def position_px(self, tangent: Tensor, rig: CameraRig) -> Tensor:
-        """Pixel coordinates (x, y) of tangents; the first pixel's centre is 0."""
+        """Pixel coordinates (x, y) of tangents; the first pixel's centre is 0.
+
+        Args:
+            tangent: (..., 2) tangents of rays. rig: pose of camera and lamps.
+        """
         return (
             tangent * (rig.sensor_distance_um / self.pitch_um) + (self.pixels - 1) / 2
         )
@@ -124,6 +132,7 @@ def render(
             that of an eye so much smaller
             across at the same depth, as this rig's camera would see it: places of its
             labels shrink with it.
+        texture_seed: of the textures.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.

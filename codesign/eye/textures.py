@@ -20,6 +20,9 @@ KINDS = ("iris", "vein", "skin", "fine", "lash")
 def texture_bank(seed: int = 0) -> Array:
     """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants
     of a kind together; about 1 s.
+
+    Args:
+        seed: of the random generator.
     """
     makers = (_iris, _veins, _skin, _fine, _lashes)
     pictures = [
@@ -36,6 +39,9 @@ def texture_bank(seed: int = 0) -> Array:
 def packed_bank(seed: int = 0) -> Array:
     """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its
     right neighbour, flat.
+
+    Args:
+        seed: of the random generator.
     """
     steps = np.round(texture_bank(seed) * STEPS).astype(np.int32)
     out = ((steps & 0xFFFF) | (np.roll(steps, -1, axis=2) << 16)).ravel()
@@ -52,6 +58,9 @@ def periodic_noise(
 ) -> Array:
     """Periodic Gaussian noise of unit deviation, amplitude 1 / f^power, ``stretch``
     times longer along y.
+
+    Args:
+        rng: of the draws. shape: (y, x) of the noise.
     """
     fy = np.fft.fftfreq(shape[0])[:, None] * shape[0] * stretch
     fx = np.fft.rfftfreq(shape[1])[None] * shape[1]

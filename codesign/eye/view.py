@@ -40,6 +40,9 @@ class CameraView:
 def face_axes(elevation_rad: float) -> Tensor:
     """(3, 3) rows right, down and out of the face in the frame of a camera that sees it
     from this far below.
+
+    Args:
+        elevation_rad: of the face's normal above the camera's direction.
     """
     s, c = math.sin(elevation_rad), math.cos(elevation_rad)
     return torch.tensor(
@@ -50,6 +53,10 @@ def face_axes(elevation_rad: float) -> Tensor:
 def seen_axes(elevation_rad: float, view: CameraView) -> Tensor:
     """(n, 3, 3) of :func:`face_axes` as these cameras see them: Rz(roll) [axes after
     Ry(side) at elevation - tilt].
+
+    Args:
+        elevation_rad: of the face's normal above the camera's direction.
+        view: cameras, one a frame.
     """
     elevation = elevation_rad - view.tilt_rad
     (s, c), (a, b) = ((torch.sin(v), torch.cos(v)) for v in (elevation, view.side_rad))

@@ -206,6 +206,8 @@ def drawn_of_people(
 
     Args:
         who: (n,) number of the person in each frame, from 0.
+        variety: factor on the spread of looks; above 1 with augmentations.
+        seed: of the random generator.
     """
     people = draw_augmentations(
         int(who.max()) + 1, variety, np.random.default_rng((*seed, 0))
@@ -238,7 +240,12 @@ def render_dressed(
     rig: CameraRig,
     camera: PinholeCamera,
 ) -> RenderedFrames:
-    """Frames of states with all that they have; bare ones where nothing is on."""
+    """Frames of states with all that they have; bare ones where nothing is on.
+
+    Args:
+        worn: augmentations of every frame. rig: pose of camera and lamps.
+        camera: pixel grid of the frames.
+    """
     if not any(size.any() for size in worn.size.values()):
         return render(states, rig=rig, camera=camera)
     plain = render(
@@ -251,7 +258,11 @@ def render_dressed(
 
 
 def augmented_cameras(worn: DrawnAugmentations) -> CameraView:
-    """The cameras that the frames are rendered from."""
+    """The cameras that the frames are rendered from.
+
+    Args:
+        worn: augmentations of every frame.
+    """
     tilt, side, roll, wide = (torch.from_numpy(worn.size[name]) for name in VIEWS)
     return CameraView(
         torch.deg2rad(tilt),
@@ -262,7 +273,11 @@ def augmented_cameras(worn: DrawnAugmentations) -> CameraView:
 
 
 def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
-    """The states with the irises that some frames have."""
+    """The states with the irises that some frames have.
+
+    Args:
+        worn: augmentations of every frame.
+    """
     traits, size = states.traits.clone(), torch.from_numpy(worn.size["iris"])
     traits[:, list(POPULATION).index("iris")] *= torch.where(size > 0, size, 1.0)
     return replace(states, traits=traits)
@@ -277,6 +292,9 @@ def apply_augmentations(
     Light, coverage and depth of both sheets change, and the pupil's mask where
     something hides or moves it; of the
     labels the centroid and the visible share of the pupil follow.
+
+    Args:
+        made: rendered frames.
     """
     if not any(worn.size[name].any() for name in CAUSES if name not in BEFORE):
         return made
@@ -532,6 +550,10 @@ def _recorded(
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     """(k, k) weights, of sum 1, of a picture that moves evenly along a line of this
     length through the middle.
+
+    Args:
+        length_px: length of the motion in pixels.
+        angle_rad: angle of the light to the axis, or of the line in the image.
     """
     reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))

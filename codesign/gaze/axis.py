@@ -65,6 +65,7 @@ def optical_axis(
         pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the
             lens axis.
         slip_mm: (batch, 3) displacement of the camera.
+        geometry: of the person.
     """
     x, y = pupil_mm[..., 0], pupil_mm[..., 1]
     ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
@@ -84,7 +85,11 @@ def optical_axis(
 
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:
-    """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|)."""
+    """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|).
+
+    Args:
+        one: to compare. other: the one it is compared with.
+    """
     a, b = (
         one / one.norm(dim=-1, keepdim=True),
         other / other.norm(dim=-1, keepdim=True),

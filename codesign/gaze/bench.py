@@ -64,7 +64,11 @@ class PeopleFrames:
         return len(self.states) // self.people
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """Frames of a step."""
+        """Frames of a step.
+
+        Args:
+            size: frames of a batch.
+        """
         rows = slice(step * size, (step + 1) * size)
         made = render_dressed(
             self.states[rows],
@@ -80,6 +84,9 @@ def simulate_people(
 ) -> PeopleFrames:
     """``count`` people who look and slip in ``each`` ways; one mounting of the camera a
     person, no change of scale.
+
+    Args:
+        scenes: frames by number. seed: of the random generator.
     """
     subjects = eye.draw_states(count, (seed, 21), motion=scenes.settings.motion)
     moves = eye.draw_states(count * each, (seed, 22), motion=scenes.settings.motion)
@@ -128,6 +135,7 @@ def read_of(
             3) of the head.
         axis: (n, 3) optic axis in the camera's frame; None of a network that tells
             none.
+        test: people, their frames and where they look.
     """
     edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
     angles = (
@@ -141,7 +149,11 @@ def read_of(
 
 
 def looked_deg(test: PeopleFrames) -> Array:
-    """(n, 2) angles of the visual axes, across and down in the frame of the face."""
+    """(n, 2) angles of the visual axes, across and down in the frame of the face.
+
+    Args:
+        test: people, their frames and where they look.
+    """
     return face_angles(test.labels.visual_axis.numpy(), test.scenes.rig.elevation_rad)
 
 
@@ -149,6 +161,10 @@ def learn_from_people(
     before: PeopleFrames, read: NetworkReadings
 ) -> shared.PopulationPrior:
     """What the frames of other people tell of gaze, by which a person is calibrated.
+
+    Args:
+        before: people who calibrated before.
+        read: pupil, slippage and axis as a network reads them.
 
     Raises:
         TrainingError: too few people or frames, or readings without an axis.
@@ -172,6 +188,7 @@ def calibrated_error_deg(
         how: people are calibrated; without it by the spherical-eye solver and residual
             regressor (paper Sec. 3.3).
         share: part of each person's frames that calibrates.
+        test: people, their frames and where they look.
     """
     how, known = (
         how or SphereCalibrator(test.scenes.rig),
@@ -199,6 +216,8 @@ def gaze_errors(
         how: people are calibrated; without it by pupil and slippage alone, as for the
             floor.
         share: part of each person's frames that calibrates.
+        test: people, their frames and where they look.
+        read: pupil, slippage and axis as a network reads them.
 
     Raises:
         TrainingError: a share that leaves less than 3 frames to calibrate or none to

@@ -31,6 +31,9 @@ def save_people(
     """Write a file of kind ``people``: β, τ² and σ² in deg and deg², middle and spread
     of the readings in deg and mm.
 
+    Args:
+        path: of the file. provenance: of the file.
+
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
@@ -47,6 +50,9 @@ def save_people(
 @typed_reader
 def load_people(path: Path) -> PopulationPrior:
     """Read a file of kind ``people``.
+
+    Args:
+        path: of the file.
 
     Raises:
         StoreError: no such file, another kind, or entries that no people can have.

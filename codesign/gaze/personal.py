@@ -57,7 +57,11 @@ class PersonalGaze:
     rest: ResidualRegressor | None
 
     def sphere(self, pupil_mm: Array, slip_mm: Array) -> Array:
-        """(n, 2) gaze of the fitted sphere alone, deg."""
+        """(n, 2) gaze of the fitted sphere alone, deg.
+
+        Args:
+            pupil_mm: (n, 2) pupil on the sensor. slip_mm: (n, 3) slippage.
+        """
         x, y, z = np.asarray(self.mean.centre_mm) + self.own[:3]
         geometry = EyeGeometry(
             (x, y, z), self.mean.radius_mm + self.own[3], self.mean.sensor_distance_mm
@@ -91,6 +95,9 @@ class SphereCalibrator:
     def person(self, read: NetworkReadings, gaze_deg: Array) -> PersonalGaze:
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
 
+        Args:
+            read: pupil, slippage and axis as a network reads them.
+
         Raises:
             TrainingError: fewer than 3 points.
         """
@@ -105,7 +112,11 @@ class SphereCalibrator:
 
 
 def mean_geometry(rig: CameraRig) -> EyeGeometry:
-    """The population's mean eye before this camera."""
+    """The population's mean eye before this camera.
+
+    Args:
+        rig: pose of camera and lamps.
+    """
     centre, radius = eye.mean_eye_um(rig)
     x, y, z = (1e-3 * v for v in centre)
     return EyeGeometry((x, y, z), 1e-3 * radius, 1e-3 * rig.sensor_distance_um)
@@ -128,6 +139,7 @@ def calibrate_person(
             displacement of the head.
         gaze_deg: (n, 2) where the person looked, across and down. hidden: neurons of
             the regressor; 0 for none.
+        rig: pose of camera and lamps. seed: of the random generator.
 
     Raises:
         TrainingError: fewer than 3 points.
@@ -194,7 +206,11 @@ def _penalty(
 
 
 def angle_deg(one: Array, other: Array) -> Array:
-    """(n,) angle between directions given by their angles across and down, deg."""
+    """(n,) angle between directions given by their angles across and down, deg.
+
+    Args:
+        one: to compare. other: the one it is compared with.
+    """
     a, b = (torch.from_numpy(gaze_direction(np.radians(v))) for v in (one, other))
     return np.asarray(np.degrees(angle_rad(a, b).numpy()))
 
@@ -202,6 +218,9 @@ def angle_deg(one: Array, other: Array) -> Array:
 def gaze_direction(angles_rad: Array) -> Array:
     """(n, 3) unit vectors right, down and out of the face, of angles (n, 2) across and
     down.
+
+    Args:
+        angles_rad: (n, 2) across and down.
     """
     x, y = angles_rad.T
     return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], 1)

@@ -47,12 +47,20 @@ class PersonCalibrator(Protocol):
     """A way to calibrate people."""
 
     def person(self, read: NetworkReadings, gaze_deg: Array) -> CalibratedPerson:
-        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down."""
+        """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
+
+        Args:
+            read: pupil, slippage and axis as a network reads them.
+        """
 
 
 def face_angles(direction: Array, elevation_rad: float) -> Array:
     """(n, 2) angles across and down, deg, in the frame of the face, of directions (n,
     3) in the camera's.
+
+    Args:
+        direction: (n, 3) unit vectors in the camera's frame.
+        elevation_rad: of the face's normal above the camera's direction.
     """
     right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
     return np.asarray(

@@ -49,6 +49,7 @@ def fit_regressor(
         features: (n, f). targets: (n, t). penalty: of the squared weights, relative to
             the squared error of a point.
         steps: evaluations that the search may take.
+        hidden: neurons of the hidden layer. seed: of the random generator.
 
     Raises:
         TrainingError: fewer than 3 points.

@@ -136,11 +136,18 @@ class PopulationPrior:
     spread: Array
 
     def terms(self, read: NetworkReadings) -> Array:
-        """(n, 36) the constant, the readings in their units, and their products."""
+        """(n, 36) the constant, the readings in their units, and their products.
+
+        Args:
+            read: pupil, slippage and axis as a network reads them.
+        """
         return _terms(_together(read), self.middle, self.spread)
 
     def person(self, read: NetworkReadings, gaze_deg: Array) -> "MixedModelPerson":
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
+
+        Args:
+            read: pupil, slippage and axis as a network reads them.
 
         Raises:
             TrainingError: fewer than 3 points, or readings without an axis.

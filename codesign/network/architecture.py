@@ -124,6 +124,9 @@ class Architecture:
 def round_channels(channels: float, divisor: int = 8) -> int:
     """Channels rounded to a multiple of ``divisor``, never losing more than a tenth
     (MobileNet convention).
+
+    Args:
+        channels: wanted number of channels.
     """
     rounded = max(divisor, int(channels + divisor / 2) // divisor * divisor)
     return rounded + divisor if rounded < 0.9 * channels else rounded
@@ -162,14 +165,22 @@ def check_architecture(space: SearchSpace, architecture: Architecture) -> Archit
 
 
 def stem_channels(space: SearchSpace, architecture: Architecture) -> int:
-    """Channels after the first convolution."""
+    """Channels after the first convolution.
+
+    Args:
+        space: architectures to choose from. architecture: member of the search space.
+    """
     return round_channels(space.stem_channels * architecture.width)
 
 
 def active_blocks(
     space: SearchSpace, architecture: Architecture
 ) -> list[list[BlockSpec]]:
-    """The active blocks, stage by stage."""
+    """The active blocks, stage by stage.
+
+    Args:
+        space: architectures to choose from. architecture: member of the search space.
+    """
     inputs = stem_channels(space, architecture)
     deepest = max(space.depths)
     result = []
@@ -200,19 +211,31 @@ def active_blocks(
 
 
 def largest_architecture(space: SearchSpace) -> Architecture:
-    """The member that holds all others as slices."""
+    """The member that holds all others as slices.
+
+    Args:
+        space: architectures to choose from.
+    """
     return _uniform(space, max)
 
 
 def smallest_architecture(space: SearchSpace) -> Architecture:
-    """The cheapest member."""
+    """The cheapest member.
+
+    Args:
+        space: architectures to choose from.
+    """
     return _uniform(space, min)
 
 
 def sample_architecture(
     space: SearchSpace, generator: np.random.Generator
 ) -> Architecture:
-    """A member drawn evenly over every choice."""
+    """A member drawn evenly over every choice.
+
+    Args:
+        space: architectures to choose from. generator: of the draws.
+    """
     return Architecture(
         depths=tuple(int(v) for v in generator.choice(space.depths, len(space.stages))),
         kernels=tuple(int(v) for v in generator.choice(space.kernels, space.slots)),
@@ -235,6 +258,9 @@ def mutate_architecture(
 
     Where no active entry changed, one that can change is drawn from its other values.
     The only member of a space is its own neighbour.
+
+    Args:
+        architecture: member of the search space. generator: of the draws.
     """
     other = sample_architecture(space, generator)
     child = replace(
@@ -278,7 +304,11 @@ def _neighbours(space: SearchSpace, architecture: Architecture) -> list[Architec
 
 
 def search_resolutions(space: SearchSpace) -> tuple[float, ...]:
-    """The input scales that the search tries, 0.1 apart."""
+    """The input scales that the search tries, 0.1 apart.
+
+    Args:
+        space: architectures to choose from.
+    """
     low, high = space.resolution
     count = int((high - low) / 0.1 + 1e-9) + 1
     return tuple(round(low + 0.1 * i, 3) for i in range(count))
@@ -289,6 +319,9 @@ def canonical_architecture(
 ) -> Architecture:
     """The same network with every idle slot set to the least choice: equal networks
     compare equal.
+
+    Args:
+        space: architectures to choose from. architecture: member of the search space.
     """
     used = [
         j < depth for depth in architecture.depths for j in range(max(space.depths))

@@ -62,7 +62,11 @@ def blur_branch_macs(size: int) -> int:
 
 
 def content_macs(channels: int) -> int:
-    """Multiply-accumulates that :class:`InformedBranch` adds, for frames of any size."""
+    """Multiply-accumulates that :class:`InformedBranch` adds, for frames of any size.
+
+    Args:
+        channels: number of channels.
+    """
     return GRID**2 * (channels * HIDDEN[0] + HIDDEN[1] * 2)
 
 
@@ -88,6 +92,9 @@ def window_weights(size: int) -> Tensor:
 def window_vergence(depth_um: Tensor) -> Tensor:
     """(batch, GRID, GRID) mean 1 / depth of every window, in the units of the branch,
     from (batch, y, x) depths.
+
+    Args:
+        depth_um: (n, y, x) or (n,) depth before the lens.
     """
     rows, columns = (window_weights(int(n)).to(depth_um) for n in depth_um.shape[-2:])
     vergence = (1e6 / depth_um - VERGENCE_PER_M) / VERGENCE_UNIT_PER_M
@@ -95,7 +102,11 @@ def window_vergence(depth_um: Tensor) -> Tensor:
 
 
 def depth_mm(vergence: Tensor) -> Tensor:
-    """Depth in mm of vergences in the units of the branch, between 5 mm and 1 m."""
+    """Depth in mm of vergences in the units of the branch, between 5 mm and 1 m.
+
+    Args:
+        vergence: of any shape, as the network has it.
+    """
     return 1e3 / (vergence * VERGENCE_UNIT_PER_M + VERGENCE_PER_M).clamp(1, 200)
 
 

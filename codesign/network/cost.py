@@ -61,7 +61,12 @@ class MacPolynomial:
 def backbone_cost(
     stem: int, rows: Iterable[BlockSpec], *, inputs: int = 1, stem_kernel: int = 3
 ) -> MacPolynomial:
-    """Cost of a stem of stride 2 and the blocks behind it."""
+    """Cost of a stem of stride 2 and the blocks behind it.
+
+    Args:
+        rows: blocks in order. inputs: channels of the input.
+        stem_kernel: side of the stem's kernel.
+    """
     per_pixel, constant, stride = {2: inputs * stem * stem_kernel**2}, 0, 2
     for block in rows:
         if block.hidden != block.inputs:
@@ -74,7 +79,11 @@ def backbone_cost(
 
 
 def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomial:
-    """Cost of backbone, blur branch, perception head and calibration head."""
+    """Cost of backbone, blur branch, perception head and calibration head.
+
+    Args:
+        space: architectures to choose from. architecture: member of the search space.
+    """
     rows = active_blocks(space, architecture)
     body = backbone_cost(
         stem_channels(space, architecture), [b for row in rows for b in row]
@@ -100,6 +109,9 @@ def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomia
 def lateral_strides(space: SearchSpace) -> list[tuple[int, int]]:
     """(stage, total stride) of the features that the mask is decoded from: the last
     stage of every stride.
+
+    Args:
+        space: architectures to choose from.
     """
     stride, last = 2, {}
     for i, stage in enumerate(space.stages):
@@ -109,12 +121,20 @@ def lateral_strides(space: SearchSpace) -> list[tuple[int, int]]:
 
 
 def total_stride(space: SearchSpace) -> int:
-    """Stride of the last feature map."""
+    """Stride of the last feature map.
+
+    Args:
+        space: architectures to choose from.
+    """
     return lateral_strides(space)[-1][1]
 
 
 def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
     """Pixels along the edge of the network's input: window / pitch, scaled.
+
+    Args:
+        window_um: edge of the image. pitch_um: of the pixels.
+        resolution: pixels that the network keeps, of the sensor's along a side.
 
     Raises:
         ConfigError: less than 16 pixels remain.
@@ -132,7 +152,12 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
 
 
 def coarsest_um(window_um: float, resolution: float) -> float:
-    """Largest pitch that :func:`input_size` takes."""
+    """Largest pitch that :func:`input_size` takes.
+
+    Args:
+        window_um: edge of the image.
+        resolution: pixels that the network keeps, of the sensor's along a side.
+    """
     return window_um * resolution / LEAST_SIZE
 
 
@@ -144,6 +169,7 @@ def macs_of_size(
 
     Args:
         size: pixels along the edge of the input, 16 or more, scalar.
+        space: architectures to choose from. architecture: member of the search space.
     """
     return interpolate_counts(network_cost(space, architecture).at, size)
 
@@ -197,6 +223,8 @@ def macs(
     Args:
         pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on
             the sensor.
+        architecture: member of the search space.
+        space: architectures to choose from; the default space without it.
 
     Raises:
         ConfigError: a pitch that leaves less than 16 pixels.

@@ -95,6 +95,10 @@ def write_onnx(
     Every input and output says in the file what it is, in which unit; so do the file's
     properties of the camera.
 
+    Args:
+        path: of the file. net: network of one architecture.
+        scale: units of the outputs.
+
     Accuracy:
         onnxruntime against torch, float32 through some forty layers in another order:
         1e-4 of a logit, mm or degree.

@@ -22,6 +22,7 @@ def dice_loss(logits: Tensor, mask: Tensor, *, smooth: float = 1.0) -> Tensor:
 
     Args:
         logits: (batch, y, x). mask: (batch, y, x) coverage in [0, 1], of the same size.
+        smooth: added to both areas.
     """
     probability = torch.sigmoid(logits)
     both = (probability * mask).sum((1, 2))
@@ -77,6 +78,7 @@ def uncertainty_loss(found: Prediction, truth: Tensor) -> Tensor:
 
     Args:
         truth: (batch, 3) slippage in units of its scale.
+        found: of the network.
     """
     if found.slip_log_sd is None:
         return found.slip.new_zeros(())
@@ -96,6 +98,10 @@ def task_loss(
 ) -> Tensor:
     """L_task = L_seg + lambda_slip L_calib; a network without a mask is held to the
     pupil's centre in its place.
+
+    Args:
+        found: of the network. slip_mm: (batch, 3) true slippage.
+        scale_mm: (3,) unit of the network's slippage. slip_weight: of the slippage.
     """
     seen = (
         segmentation_loss(found.mask_logits, mask)
@@ -119,6 +125,9 @@ def depth_reading_loss(
     Args:
         vergence: (batch, y, x) of the windows
             (:func:`codesign.network.blur.window_vergence`).
+        found: of the network. slip_mm: (batch, 3) true slippage.
+        scale_mm: (3,) unit of the network's slippage.
+        depth_weight: of the depths of windows.
     """
     told = (
         found.slip.new_zeros(())
@@ -142,6 +151,8 @@ def pose_loss(
     Args:
         axis: (batch, 3) unit vectors. points: (batch, points, 2) as a fraction of the
             image from its middle.
+        found: of the network. axis_weight: of the optic axis.
+        point_weight: of the landmarks.
     """
     if found.points is None or found.axis is None:
         return found.slip.new_zeros(())
@@ -166,6 +177,8 @@ def position_loss(
     Args:
         centre: (batch, 2) x, y as a fraction of the frame from its middle. mask:
             (batch, y, x) coverage.
+        unit: length that the loss divides by.
+        knee: from which the loss is linear, in units.
     """
     total = mask.sum((1, 2))
     y, x = (
@@ -184,12 +197,20 @@ def position_loss(
 
 
 def over_budget(macs: Tensor, budget: float) -> Tensor:
-    """[C_total - C_budget]_+ relative to the budget (paper Eq. 10)."""
+    """[C_total - C_budget]_+ relative to the budget (paper Eq. 10).
+
+    Args:
+        macs: multiply-accumulates of every member.
+    """
     return F.relu(macs / budget - 1)
 
 
 def resize_mask(mask: Tensor, like: Tensor) -> Tensor:
-    """Mask coverage averaged onto the grid of the logits."""
+    """Mask coverage averaged onto the grid of the logits.
+
+    Args:
+        mask: (batch, y, x) coverage. like: (batch, y, x) on the wanted grid.
+    """
     if mask.shape[-2:] == like.shape[-2:]:
         return mask
     return F.interpolate(mask[:, None], size=like.shape[-2:], mode="area")[:, 0]
@@ -216,6 +237,9 @@ def mask_in_frame(mask: Tensor, wide: float) -> Tensor:
 def at_pixels(logits: Tensor, mask: Tensor, pixels: int) -> tuple[Tensor, Tensor]:
     """Logits, interpolated, and the mask's coverage, averaged, on a grid of ``pixels``
     along a side.
+
+    Args:
+        logits: (batch, y, x) log odds of the pupil.
     """
     size = (pixels, pixels)
     logits = F.interpolate(

@@ -67,6 +67,9 @@ class RunningNorm(nn.Module):
 def keep_running_means(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
     """Every running mean of a network with a copy of it as it is now, for
     :func:`put_back`.
+
+    Args:
+        net: network.
     """
     found = [
         b for m in net.modules() if isinstance(m, RunningNorm) for b in m.buffers()

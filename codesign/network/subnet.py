@@ -48,6 +48,7 @@ def restore_weights(net: Supernet, state: Mapping[str, Tensor]) -> None:
 
     Args:
         state: weights by name as :meth:`Subnet.state_dict` has them.
+        net: elastic network.
 
     Raises:
         TrainingError: a weight that the supernet lacks, or one larger than its own.

@@ -76,7 +76,12 @@ class Prediction:
 
 
 def apply_activation(x: Tensor, kind: Activation | None) -> Tensor:
-    """The activation alone."""
+    """The activation alone.
+
+    Args:
+        x: (batch, channels, y, x) features.
+        kind: name of the activation; None for the identity.
+    """
     return x if kind is None else F.relu(x) if kind == "relu" else F.hardswish(x)
 
 
@@ -97,7 +102,12 @@ class SlicedNorm(nn.Module):
         self.measuring = False
 
     def forward(self, x: Tensor, act: Activation | None = None) -> Tensor:
-        """Normalised, and the activation of it."""
+        """Normalised, and the activation of it.
+
+        Args:
+            x: (batch, channels, y, x) features.
+            act: activation after the norm; None for none.
+        """
         count = x.shape[1]
         weight, bias = self.weight[:count], self.bias[:count]
         if self.measuring:
@@ -323,6 +333,9 @@ class Supernet(nn.Module):
     def counts(self, architecture: Architecture, sizes: Array) -> Array:
         """Multiply-accumulates of a member for square frames of these sizes after
         scaling (integers), exact.
+
+        Args:
+            architecture: member of the search space.
         """
         return network_cost(self.space, architecture).at(sizes)
 
@@ -331,7 +344,11 @@ class Supernet(nn.Module):
 
 
 def resize_frames(frames: Tensor, resolution: float) -> Tensor:
-    """Frames resized to ``resolution`` of their size (to the nearest pixel)."""
+    """Frames resized to ``resolution`` of their size (to the nearest pixel).
+
+    Args:
+        frames: (batch, 1, y, x) standardised frames of the sensor.
+    """
     height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
     return resample_image(frames, (height, width))
 
@@ -343,6 +360,9 @@ def soft_argmax(logits: Tensor) -> Tensor:
     Probabilities below 0.05 are left out, so that the sea of background does not pull
     the centre; an empty mask
     gives (0, 0) with a finite gradient.
+
+    Args:
+        logits: (batch, y, x) log odds of the pupil.
     """
     probability = torch.sigmoid(logits)
     weight = F.relu(probability - 0.05)
@@ -387,6 +407,9 @@ def recalibrate_batch_norm(
 
     Running means (:class:`codesign.network.running.RunningNorm`) belong to all
     architectures and stay.
+
+    Args:
+        net: network.
 
     Raises:
         TrainingError: no batch was given.

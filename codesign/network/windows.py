@@ -52,7 +52,11 @@ STEP_MACS = SAMPLES**2 * (len(REACHES) * sum(len(taps) for taps in STEPS) + 4)
 
 
 def step_of(size: int) -> int:
-    """Pixels from window to window; a window is two of them wide."""
+    """Pixels from window to window; a window is two of them wide.
+
+    Args:
+        size: side of the frame in pixels.
+    """
     return max(size // (GRID + 1), 1)
 
 
@@ -71,6 +75,9 @@ def hann_filters(size: int) -> tuple[Tensor, Tensor]:
     the second half of a window.
 
     From its middle on: cosines are even about it, sines are odd.
+
+    Args:
+        size: side of the frame in pixels.
     """
     step = step_of(size)
     place = torch.arange(step, dtype=torch.float64)[:, None] + 0.5
@@ -164,6 +171,9 @@ def window_content(maps: Tensor) -> Tensor:
 def resample_image(x: Tensor, size: tuple[int, int]) -> Tensor:
     """(batch, channels, *size): averaged by whole factors, then interpolated where the
     size is no divisor.
+
+    Args:
+        x: (batch, channels, y, x) features.
     """
     factor = [
         max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)

@@ -60,13 +60,20 @@ def of_lens(x: Array) -> Array:
 def posterior_parameters(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
     """All parameters of ``count`` lenses that the fit holds possible, as far as their
     light goes.
+
+    Args:
+        built: of the fit. seed: of the random generator.
     """
     for row in built.lens_samples(count, seed=seed):
         yield built.parameters(row)
 
 
 def psf_error(one: PixelPsfStack, other: PixelPsfStack) -> float:
-    """Relative L2 difference of two stacks of PSFs, each PSF of sum 1."""
+    """Relative L2 difference of two stacks of PSFs, each PSF of sum 1.
+
+    Args:
+        one: stack to compare. other: the stack it is compared with.
+    """
     a, b = (
         s.intensity.double() / s.intensity.double().sum((-2, -1), keepdim=True)
         for s in (one, other)
@@ -97,7 +104,11 @@ class PillarCells:
     added_rad: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
-        """The hyperbolic phase that the design aims at."""
+        """The hyperbolic phase that the design aims at.
+
+        Args:
+            x_um: x on the lens. y_um: y on the lens.
+        """
         return SmoothWave(self.focus, self.radius_um).carrier_rad(x_um, y_um)
 
     def factor(
@@ -105,6 +116,10 @@ class PillarCells:
     ) -> Tensor | None:
         """The cells at the rays; pillars answer as at the design wavelength and
         straight on.
+
+        Args:
+            x_um: x on the lens. y_um: y on the lens. wavelength_um: of the light.
+            angle_rad: angle of the light to the axis, or of the line in the image.
         """
         at = (
             (v - c) / h
@@ -125,6 +140,10 @@ class PillarCells:
     def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
         """(y, x) complex t of every pillar, by which the error of gathering them is
         told.
+
+        Args:
+            wavelength_um: of the light.
+            angle_rad: angle of the light to the axis, or of the line in the image.
         """
         t = self.pillars()
         y, x = (
@@ -225,6 +244,9 @@ class MadeLens:
 
         A wrong lens-sensor distance counts as the defocus that it is. Zero beyond the
         rim.
+
+        Args:
+            x: all parameters of a lens, in the fit's order; None for the design.
         """
         known = of_lens(parameter_vector() if x is None else x)
         pupil = self._pupil(self.design.sensor_distance_um)
@@ -251,11 +273,17 @@ class MadeLens:
 
         Args:
             factor: (y, x) complex, of every pillar beside the state.
+            made: perturbations by the process.
         """
         return self._plane(made, self._gathered(made, factor=factor), factor)
 
     def pillars(self, made: State, *, factor: Array | None = None) -> Tensor:
-        """(y, x) complex t of every pillar in a process state, 0 where there is none."""
+        """(y, x) complex t of every pillar in a process state, 0 where there is none.
+
+        Args:
+            made: perturbations by the process.
+            factor: (y, x) complex, of every pillar beside the state.
+        """
         alone = self._gathered(made, 1, factor=factor)
         return torch.from_numpy(alone * self._carrier.conj())
 

@@ -48,7 +48,11 @@ class StartingPhase:
             )
 
     def phase_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
-        """The phase at any places of the lens, float64."""
+        """The phase at any places of the lens, float64.
+
+        Args:
+            x_um: x on the lens. y_um: y on the lens.
+        """
         x, y = x_um + torch.zeros_like(y_um), y_um + torch.zeros_like(x_um)
         total = torch.zeros_like(x, dtype=torch.float64)
         if not (self.zones or self.foci_um or (self.parts > 1 and self.apart_um)):
@@ -98,6 +102,9 @@ def phase_terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor
 
     free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity
     of n. radial: rho^2, rho^4, …
+
+    Args:
+        family: "free" or "radial".
     """
     square = x**2 + y**2
     rings = [

@@ -49,6 +49,9 @@ def source_of(settings: OpticsConfig) -> Source | None:
 
     A Gaussian line of width a behind a Gaussian filter of width b has the width a b /
     √(a² + b²).
+
+    Args:
+        settings: of the lens and its image.
     """
     width = settings.fwhm_nm
     if width and settings.filter_nm:
@@ -61,6 +64,11 @@ def wave_of(
 ) -> SmoothWave:
     """The lens plane of these coefficients for :func:`metalens.image.imager`;
     differentiable in them.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        error: assembly and process error of one lens; None for none.
     """
     split = settings.parts > 1 or settings.foci_mm
     if settings.polynomials or settings.zones or split or error is not None:
@@ -73,7 +81,11 @@ def wave_of(
 
 
 def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
-    """Square frames of ``frame`` samples, margin included."""
+    """Square frames of ``frame`` samples, margin included.
+
+    Args:
+        settings: of the lens and its image.
+    """
     side = frame - 2 * margin
     depths = settings.depths_mm[0] * 1e3, settings.depths_mm[1] * 1e3
     return Grid(
@@ -97,6 +109,8 @@ def make_imager(
         error: one draw of the lenses that are made. made: a lens that is made in place
             of the coefficients.
         device: where the frames are imaged, and the true image's PSFs are computed.
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
 
     Raises:
         TrainingError: of the lens that is made only PSFs of one chief ray are known,
@@ -207,6 +221,10 @@ class DifferentiableImager:
         """Add to the gradient of the coefficients what the light gathered, from the
         points and wavelengths drawn.
 
+        Args:
+            settings: of the lens and its image.
+            coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+
         Raises:
             ValueError: none were drawn: the light's own gradient is that of all nodes.
         """
@@ -226,7 +244,12 @@ def make_differentiable_imager(
 ) -> DifferentiableImager:
     """An imager with its nodes' light as a leaf, of the nodes that were drawn or of
     all; the relative illumination is
-    held, and the image is that of the kernels that there are."""
+    held, and the image is that of the kernels that there are.
+
+    Args:
+        settings: of the lens and its image. whole: prepared image of the lens.
+        pairs: field points and wavelengths that were drawn; None for all.
+    """
     with torch.no_grad():
         unit = normalised(
             torch.ones_like(whole.stack[..., :1, :1]),
@@ -241,7 +264,12 @@ def make_differentiable_imager(
 
 
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
-    """Wave, surroundings and distance of the lens."""
+    """Wave, surroundings and distance of the lens.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+    """
     moving = settings if coefficients_rad.numel() else replace(settings, polynomials=0)
     return _in_place(settings, wave_of(moving, coefficients_rad))
 
@@ -256,6 +284,12 @@ def apart(
 ) -> float:
     """Relative L2 difference of the uniform image of a texture in depth from its true
     image: the error of 'uniform'.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        frame: samples along a side, margin included.
+        margin: samples around the frame that are blurred in and not seen.
     """
     true = make_imager(
         replace(settings, image="true"), coefficients_rad, frame, margin=margin
@@ -289,7 +323,11 @@ def image_tolerance_problem(
 ) -> str:
     """Why the error of the true image is above ``optics.image_tolerance``; empty where
     it is not, or the image is
-    uniform, whose distance from the true one is told instead."""
+    uniform, whose distance from the true one is told instead.
+
+    Args:
+        settings: of the lens and its image. found: what forms the images.
+    """
     return found.above(settings.image_tolerance) if isinstance(found, Imager) else ""
 
 
@@ -304,6 +342,12 @@ def describe_image(
     lens cannot be formed, for the reason under ``problem``. above: why the true image's
     own estimate is above
     ``optics.image_tolerance``; empty where it is not.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        frame: samples along a side, margin included.
+        margin: samples around the frame that are blurred in and not seen.
     """
     found: dict[str, Any] = {
         "kind": settings.image,
@@ -326,7 +370,11 @@ def describe_image(
 
 
 def describe_image_text(found: dict[str, Any]) -> str:
-    """A line of :func:`describe_image`."""
+    """A line of :func:`describe_image`.
+
+    Args:
+        found: record of :func:`describe_image`.
+    """
     if found["error"] is None:
         return f"image: {found['kind']}; how far it is from the true image is not known: {found['problem']}"
     if found["kind"] == "uniform":

@@ -86,7 +86,11 @@ class LensErrors(_Entries):  # type: ignore[misc]
         return np.asarray(correlation * np.outer(self.deviations, self.deviations))
 
     def draw(self, generator: torch.Generator) -> "LensError | None":
-        """The errors of one lens; None where nothing varies."""
+        """The errors of one lens; None where nothing varies.
+
+        Args:
+            generator: of the draws.
+        """
         if not any(self.deviations):
             return None
         held = [
@@ -160,6 +164,10 @@ class PhaseRates:
 def wave_front_rad(state: State, u: Tensor, v: Tensor, rates: PhaseRates) -> Tensor:
     """Phase at lens places over the radius that all pillars share: their mean answer,
     and the causes that bend.
+
+    Args:
+        state: perturbations by the process. u: x over the radius of the lens.
+        v: y over the radius of the lens. rates: phase rates of the unit cell.
     """
     x, y = u.cpu().numpy(), v.cpu().numpy()
     shared = rates.mean[0] * (
@@ -171,6 +179,10 @@ def wave_front_rad(state: State, u: Tensor, v: Tensor, rates: PhaseRates) -> Ten
 def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
     """Variance of the pillars' phases about what they share, mean over the aperture
     (Gauss nodes: exact).
+
+    Args:
+        state: perturbations by the process. rates: phase rates of the unit cell.
+        rings: Gauss nodes over the radius.
     """
     node, weight = np.polynomial.legendre.leggauss(rings)
     radius, turn = (
@@ -194,6 +206,9 @@ def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
 def pillar_proxy(cell: Cell, wavelength_um: float) -> Proxy:
     """Phase and transmission of a cell's pillars as functions of their diameter, from
     a solved library (paper Eq. 2).
+
+    Args:
+        wavelength_um: of the light.
     """
     return library.proxy_of(library.sweep(cell, wavelengths_um=(wavelength_um,)))
 
@@ -201,6 +216,9 @@ def pillar_proxy(cell: Cell, wavelength_um: float) -> Proxy:
 @functools.lru_cache(maxsize=8)
 def phase_rates(cell: Cell, wavelength_um: float) -> PhaseRates:
     """Rates of a cell at a wavelength, over pillars whose phases fill a turn evenly.
+
+    Args:
+        wavelength_um: of the light.
 
     Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 %
     of the covariance with height.

@@ -256,7 +256,11 @@ class PixelPsfStack:
     plane: Optics | None = field(default=None, repr=False)
 
     def basis(self, tolerance: float) -> PsfBasis:
-        """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1)."""
+        """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1).
+
+        Args:
+            tolerance: relative L2 error allowed.
+        """
         total = self.intensity.sum((-2, -1), keepdim=True)
         return basis(self.intensity / total, self.depths_um, tolerance=tolerance)
 
@@ -322,6 +326,10 @@ def lens_psf_stack(
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
     """(nodes, nodes) phase on top of the hyperbolic focus: what the lens starts from,
     and the polynomials.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
     """
     phase = _start(settings)
     if settings.polynomials:
@@ -334,6 +342,10 @@ def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
 def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     """The trained phase as a function of pillar positions, for
     :func:`metalens.design.make`.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
     """
     count, family = settings.polynomials, settings.family
     mix = _polynomials(settings.pupil, count, family)[1] if count else torch.zeros(0, 0)
@@ -366,6 +378,9 @@ def prepare_transfers(
 ) -> UniformImager:
     """Transfer functions for square frames of ``frame`` samples rendered with
     ``margin`` to spare.
+
+    Args:
+        settings: of the lens and its image. made: PSFs over depth.
     """
     return uniform_imager(made.basis(settings.tolerance), (frame, frame), margin=margin)
 
@@ -497,6 +512,12 @@ def phase_at(
 ) -> Tensor:
     """Phase on top of the hyperbolic focus at any places, float64; differentiable in
     the coefficients.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
+        x_um: x on the lens. y_um: y on the lens.
+        error: assembly and process error of one lens; None for none.
     """
     rim = settings.aperture_mm * 500
     total = settings.start.phase_rad(x_um, y_um)
@@ -547,6 +568,9 @@ def scatter_loss(settings: OpticsConfig, light: Tensor, variance: float) -> Tens
     With the phases of a lens spread evenly over a turn, an error of variance V leaves
     exp(-V) of the light in the
     image (Marechal) and sends the rest straight on, over the shadow of the aperture.
+
+    Args:
+        settings: of the lens and its image.
     """
     kept = math.exp(-variance)
     shadow = settings.sample_um**2 / (math.pi * (settings.aperture_mm * 500) ** 2)

@@ -52,6 +52,9 @@ class AmbiguityScenes:
     def rows(self, step: int, size: int) -> slice:
         """States of a step.
 
+        Args:
+            size: frames of a batch.
+
         Raises:
             TrainingError: there are fewer.
         """
@@ -62,7 +65,11 @@ class AmbiguityScenes:
         return slice(step * size, (step + 1) * size)
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """Frames of a step."""
+        """Frames of a step.
+
+        Args:
+            size: frames of a batch.
+        """
         rows = self.rows(step, size)
         made = render_dressed(
             self.states[rows],

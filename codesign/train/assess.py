@@ -67,6 +67,9 @@ FINER = 4  # by which the image that checks a result is formed more precisely
 def finer_image(settings: OpticsConfig) -> OpticsConfig | None:
     """The image that checks whether a result depends on the image's tolerance: a
     quarter of the tolerance of training; None of the uniform image, which has none.
+
+    Args:
+        settings: of the lens and its image.
     """
     if settings.image == "uniform":
         return None
@@ -83,6 +86,10 @@ def finer_frames(
     """:func:`sensor_frames` of the same scenes and noise on the :func:`finer_image`
     image; None
     where there is none, or this lens cannot be imaged so precisely.
+
+    Args:
+        trainer: with lens, sensor and network as they are. batches: how many batches.
+        stack: PSFs of a made lens in place of the trainer's own.
     """
     optics = finer_image(trainer.optics)
     if optics is None:
@@ -107,6 +114,8 @@ def sensor_frames(
 
     Args:
         optics: how the image is formed; as in training without it.
+        trainer: with lens, sensor and network as they are. scenes: frames by number.
+        batches: how many batches.
     """
     optics = optics or trainer.optics
     prepared: UniformImager | Imager | None = None
@@ -175,6 +184,10 @@ def predict_frames(
 ) -> Predictions:
     """Answers with the batch statistics that the network holds (see
     :func:`codesign.network.supernet.recalibrate_batch_norm`).
+
+    Args:
+        net: elastic network. architecture: member of the search space.
+        seen: frames of the sensor with their truth. inner: settings of training.
     """
     training = net.training
     net.eval()
@@ -202,7 +215,11 @@ def predict_frames(
 
 
 def batched_frames(seen: SensorFrames) -> list[Tensor]:
-    """Frames a batch at a time."""
+    """Frames a batch at a time.
+
+    Args:
+        seen: frames of the sensor with their truth.
+    """
     return [
         seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)
     ]
@@ -211,6 +228,9 @@ def batched_frames(seen: SensorFrames) -> list[Tensor]:
 def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
     """Training frames through the lens as it is: batch statistics are measured on them,
     never on frames that are scored.
+
+    Args:
+        trainer: with lens, sensor and network as they are. batches: how many batches.
     """
     return batched_frames(sensor_frames(trainer, trainer.scenes, batches))
 
@@ -229,6 +249,8 @@ def assess_architecture(
     Args:
         measured: (batch, 1, y, x) frames each, on which its batch statistics are
             measured; see :func:`training_frames`.
+        net: elastic network. seen: frames of the sensor with their truth.
+        inner: settings of training.
     """
     recalibrate_batch_norm(net, architecture, measured)
     answers = predict_frames(net, architecture, seen, inner)

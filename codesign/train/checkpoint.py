@@ -28,6 +28,7 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
         state: nested dicts and lists of tensors, numbers, strings, booleans and None;
             keys are strings or integers.
         settings: the run's config record; kept as TOML so that a resume can compare it.
+        path: of the file.
 
     Raises:
         OSError: the target cannot be written, the disk is full (the old checkpoint
@@ -51,6 +52,9 @@ def save_network(
     """Write the weights of a network, and tensors ``beside`` them; the same weights
     give the same bytes.
 
+    Args:
+        path: of the file. net: network.
+
     Raises:
         OSError: the target cannot be written, the disk is full (the old file stays).
     """
@@ -67,6 +71,9 @@ def save_network(
 
 def load_network(path: str | Path) -> dict[str, Tensor]:
     """Weights by name of :func:`save_network`.
+
+    Args:
+        path: of the file.
 
     Raises:
         TrainingError: no such file, or not a network.
@@ -95,6 +102,9 @@ def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None
 
 def load(path: str | Path, *, settings: object) -> dict[str, Any]:
     """Read a training state back.
+
+    Args:
+        path: of the file.
 
     Raises:
         TrainingError: missing, truncated or foreign file, another version, or a run of

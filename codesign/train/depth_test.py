@@ -34,7 +34,11 @@ class DisplacedFrames:
         return int(getattr(self.scenes, "stream", 0))
 
     def batch(self, step: int, size: int) -> FrameBatch:
-        """Frames of a step; the labels are the old ones."""
+        """Frames of a step; the labels are the old ones.
+
+        Args:
+            size: frames of a batch.
+        """
         plain = self.scenes.batch(step, size)
         return replace(plain, frames=displace_frames(plain.frames, self.shift_um))
 
@@ -42,7 +46,11 @@ class DisplacedFrames:
 def displace_frames(
     frames: Frames | SingleSurfaceFrames, shift_um: float
 ) -> Frames | SingleSurfaceFrames:
-    """Frames with all depths larger by ``shift_um``."""
+    """Frames with all depths larger by ``shift_um``.
+
+    Args:
+        frames: rendered frames of two layers or of one.
+    """
     if isinstance(frames, Frames):
         return Frames(frames.radiance, frames.coverage, frames.depth_um + shift_um)
     far = frames.depth_um * frames.scale[:, None, None] + shift_um
@@ -82,6 +90,11 @@ def depth_response(
     it scores on natural frames.
     The batch statistics must be measured
     (:func:`codesign.network.supernet.recalibrate_batch_norm`).
+
+    Args:
+        trainer: with lens, sensor and network as they are. scenes: frames by number.
+        net: elastic network. architecture: member of the search space.
+        batches: how many batches. shift_um: of the depth of the PSFs.
     """
     here = _axial(trainer, scenes, net, architecture, batches)
     there = _axial(

@@ -87,7 +87,11 @@ class EvolutionState:
     generator: dict[str, Any] = field(default_factory=dict)
 
     def alive(self, plan: EvolutionSettings) -> tuple[EvaluatedCandidate, ...]:
-        """The members that may become parents."""
+        """The members that may become parents.
+
+        Args:
+            plan: of the search.
+        """
         return self.history[-plan.population :]
 
 
@@ -115,6 +119,7 @@ def evolve_population(
         evaluate: error of an architecture; each different network is evaluated once.
         count: its multiply-accumulates; only candidates within ``budget`` are
             evaluated.
+        plan: of the search. seed: of the random generator.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -161,6 +166,9 @@ def evolve_population(
 def check_budget(space: SearchSpace, count: Count, budget: float) -> None:
     """Refuse a budget below the smallest network.
 
+    Args:
+        count: multiply-accumulates of an architecture.
+
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
@@ -183,6 +191,10 @@ def search(
 ) -> tuple[EvaluatedCandidate, ...]:
     """A whole search: every candidate in order of birth; :func:`best_candidate` and
     :func:`pareto_front` read it.
+
+    Args:
+        plan: of the search. evaluate: error of an architecture.
+        count: multiply-accumulates of an architecture. seed: of the random generator.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -241,14 +253,22 @@ def _rank(error: float) -> float:
 
 
 def best_candidate(candidates: Sequence[EvaluatedCandidate]) -> EvaluatedCandidate:
-    """The candidate of least error; of equals, the cheapest."""
+    """The candidate of least error; of equals, the cheapest.
+
+    Args:
+        candidates: with error and cost.
+    """
     return min(candidates, key=lambda c: (_rank(c.error), c.macs))
 
 
 def pareto_front(
     candidates: Sequence[EvaluatedCandidate],
 ) -> tuple[EvaluatedCandidate, ...]:
-    """Candidates that no other beats in both error and cost, cheapest first."""
+    """Candidates that no other beats in both error and cost, cheapest first.
+
+    Args:
+        candidates: with error and cost.
+    """
     front: list[EvaluatedCandidate] = []
     for candidate in sorted(candidates, key=lambda c: (c.macs, _rank(c.error))):
         if np.isfinite(candidate.error) and (
@@ -272,6 +292,10 @@ def sample_sandwich(
     With a budget above 0 each sees its input at the highest resolution that the budget
     allows (:func:`largest_and_smallest`): what is
     never chosen is not trained. Where nothing fits, the smallest at least resolution.
+
+    Args:
+        space: architectures to choose from.
+        count: multiply-accumulates of an architecture. generator: of the draws.
     """
     if not budget:
         return [
@@ -302,6 +326,10 @@ def largest_and_smallest(
 
     Both at the highest resolution that the budget allows; the smallest at least
     resolution where nothing fits.
+
+    Args:
+        space: architectures to choose from.
+        count: multiply-accumulates of an architecture.
     """
     small = fit_resolution(space, smallest_architecture(space), count, budget)
     made = (
@@ -316,6 +344,10 @@ def fit_resolution(
 ) -> Architecture:
     """The architecture at the highest resolution that the budget allows; at the least
     if none does.
+
+    Args:
+        space: architectures to choose from.
+        count: multiply-accumulates of an architecture.
     """
     low, high = space.resolution
     whole = dataclasses.replace(architecture, resolution=high)
@@ -331,6 +363,9 @@ def fit_resolution(
 def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
     """Networks alike in all stages, large to smallest: width, then depth, then kernel
     and expansion are reduced.
+
+    Args:
+        space: architectures to choose from.
     """
     whole, least = largest_architecture(space), smallest_architecture(space)
     shallow = dataclasses.replace(whole, depths=least.depths)
@@ -341,7 +376,11 @@ def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
 
 
 def state_to_json(search: EvolutionState) -> str:
-    """The state as JSON text."""
+    """The state as JSON text.
+
+    Args:
+        search: with its history.
+    """
     history = [
         {**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs}
         for c in search.history

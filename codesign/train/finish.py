@@ -24,6 +24,9 @@ from metalens.core.errors import TrainingError
 def finish_budgets(run: CodesignRun) -> list[dict[str, Any]]:
     """The best of every budget on the test frames: one row a budget.
 
+    Args:
+        run: run with its model.
+
     Raises:
         TrainingError: a search has not ended.
     """
@@ -202,6 +205,9 @@ def conformal_quantiles(
 
     From frames that training, search and test never use: with them the network's
     uncertainty is calibrated (split conformal prediction).
+
+    Args:
+        answers: of the network. seen: frames of the sensor with their truth.
     """
     if answers.slip_sd_mm is None:
         return None
@@ -226,6 +232,11 @@ def uncertainty_summary(
 ) -> dict[str, float]:
     """What the network tells beside the slippage: coverage of its 90 % intervals, their
     width, depth of windows.
+
+    Args:
+        name: of the entry. answers: of the network.
+        seen: frames of the sensor with their truth.
+        reach: conformal quantile, in standard deviations.
     """
     row: dict[str, float] = {}
     if (wide := _wide(answers, reach)) is not None:

@@ -45,6 +45,9 @@ def read_out(
             pixels, are then the box: the
             gradient in the pitch is that of the reads alone.
         quiet: the expected electrons, without noise.
+        irradiance: (batch, y, x) light on the image grid.
+        sample_um: distance of the samples. pitch_um: () pitch of the pixels, um.
+        generator: of the draws.
     """
     here, moves = float(pitch_um.detach()), pitch_um.requires_grad
     pixel = replace(sensor, pitch_um=here)  # the full well is that of this pitch
@@ -103,6 +106,10 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
     the frame and tells places in
     it, so its labels are those of the frame
     (:func:`codesign.network.losses.mask_in_frame`).
+
+    Args:
+        samples: of the image along a side. sample_um: distance of the samples.
+        pitch_um: of the pixels.
     """
     wide = pixel_count(samples, sample_um, pitch_um) * pitch_um / (samples * sample_um)
     return 1.0 if abs(wide - 1) < 1e-9 else wide
@@ -111,7 +118,12 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
 def network_macs(
     net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor
 ) -> Tensor:
-    """Multiply-accumulates of one member at this pitch, differentiable."""
+    """Multiply-accumulates of one member at this pitch, differentiable.
+
+    Args:
+        net: elastic network. architecture: member of the search space.
+        window_um: edge of the image. pitch_um: () pitch of the pixels, um.
+    """
     size = window_um / pitch_um * architecture.resolution
     return cost.interpolate_counts(lambda sizes: net.counts(architecture, sizes), size)
 
@@ -125,6 +137,9 @@ def depth_information(made: PixelPsfStack) -> Tensor:
     is the least standard deviation of any reader that knows the statistics of the
     texture and nothing else of it
     (:func:`metalens.fisher.texture_information`): readers of real frames collect less.
+
+    Args:
+        made: PSFs over depth.
     """
     psfs = made.intensity
     spectrum = _texture(psfs.shape[-1]).to(psfs)
@@ -143,6 +158,9 @@ def depth_loss(made: PixelPsfStack, settings: OpticsConfig, *, energy: float) ->
 
     A texture's blur is what the network reads; the information of the PSF alone ranks
     lenses wrongly.
+
+    Args:
+        made: PSFs over depth. settings: of the lens and its image.
     """
     told, psfs = depth_information(made), made.intensity
     share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)

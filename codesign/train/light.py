@@ -69,6 +69,9 @@ class StepImaging:
     ) -> UniformImager | Imager:
         """The imager of a step for frames of ``frame`` samples, margin included;
         ``live``: the lens moves.
+
+        Args:
+            coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         """
         self._live = None
         if self.stacks:
@@ -86,6 +89,9 @@ class StepImaging:
     def pass_on(self, coefficients_rad: Tensor) -> None:
         """After the loss went backward: its gradient from the light to the
         coefficients, where it stopped there.
+
+        Args:
+            coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         """
         if self._live is not None:
             self._live.pass_on(self.optics, coefficients_rad)

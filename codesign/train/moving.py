@@ -36,7 +36,11 @@ class LearningRateSchedule:
             )
 
     def at(self, progress: float) -> float:
-        """Learning rate at this part of the run."""
+        """Learning rate at this part of the run.
+
+        Args:
+            progress: part of the run that is over, 0 to 1.
+        """
         if not self.start <= progress < self.end:
             return 0.0
         inside = (progress - self.start) / (self.end - self.start)
@@ -69,6 +73,9 @@ class TrainedModel:
     def hold(self, finest_um: float, coarsest_um: float) -> float | None:
         """Bring the pitch back between these; the one that it was held at, None where
         it was between them.
+
+        Args:
+            finest_um: least pitch. coarsest_um: largest pitch.
         """
         wanted = float(self.pitch_um.detach())
         with torch.no_grad():
@@ -89,7 +96,12 @@ def make_model(
     seed: int,
     space: SearchSpace | None = None,
 ) -> TrainedModel:
-    """A fresh model: network weights from the seed, a lens without added phase."""
+    """A fresh model: network weights from the seed, a lens without added phase.
+
+    Args:
+        settings: of the lens and its image. pitch_um: of the pixels.
+        space: architectures to choose from; the default space without it.
+    """
     torch.manual_seed(seed)
     net = Supernet(space)
     net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
@@ -103,6 +115,9 @@ def make_model(
 def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
     """Whether all gradients that there are have finite numbers alone; a device is asked
     once.
+
+    Args:
+        parameters: with gradients.
     """
     grads = [p.grad for p in parameters if p.grad is not None]
     places = {g.device for g in grads}
@@ -116,6 +131,9 @@ def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
 def laid_out(optimiser: torch.optim.Optimizer) -> None:
     """Moments laid out in memory as their parameters: a fused step walks through both
     in one order without asking.
+
+    Args:
+        optimiser: with its moments.
     """
     for parameter, kept in optimiser.state.items():
         for name, value in kept.items():

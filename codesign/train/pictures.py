@@ -63,6 +63,9 @@ def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
     Of a window of 1/f texture as wide as the PSFs, with noise of a thousandth of its
     power: see
     :func:`codesign.train.formation.depth_information`.
+
+    Args:
+        run: run with its model.
     """
     made = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
     told = depth_information(made)
@@ -75,6 +78,9 @@ def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
 
 def predictions_of_frames(ends: list[BudgetResult], count: int) -> dict[str, Array]:
     """The first test frames and what each network said of them.
+
+    Args:
+        ends: one a compute budget. count: how many.
 
     Returns:
         frames (n, y, x) as the network sees them; pupil (n, y, x) and slip_um (n, 3),

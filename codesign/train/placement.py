@@ -25,6 +25,9 @@ def device_of(wanted: Place) -> torch.device:
     """The device of a choice: under ``torchrun`` each process takes the GPU of its
     local number.
 
+    Args:
+        wanted: "auto", "cpu" or "cuda".
+
     Raises:
         ConfigError: a GPU is asked for where PyTorch finds none.
     """
@@ -60,6 +63,9 @@ def place_on_device(trainer: Trainer, device: torch.device) -> None:
 def follow_device(net: nn.Module, device: torch.device) -> None:
     """From now on frames on the processor are taken to ``device``, and what is
     predicted of those is brought back.
+
+    Args:
+        net: network.
     """
     brought = False
 

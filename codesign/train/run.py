@@ -139,6 +139,9 @@ class RunConfig:
 def load_run_settings(path: str | Path) -> RunConfig:
     """Read RUN.toml over its preset.
 
+    Args:
+        path: of the file.
+
     Raises:
         ConfigError: see :func:`metalens.core.config.load`; an unknown preset.
     """
@@ -180,13 +183,20 @@ class CodesignRun:
 
         Training counts smoothly with the pitch (:func:`network_macs`), up to a row of
         pixels less.
+
+        Args:
+            architecture: member of the search space.
         """
         pitch = float(self.trainer.model.pitch_um.detach())
         cost.input_size(self.window_um, pitch, architecture.resolution)
         return self.counted(architecture, pitch)
 
     def counted(self, architecture: Architecture, pitch_um: float) -> float:
-        """Multiply-accumulates of an architecture for the whole pixels of any pitch."""
+        """Multiply-accumulates of an architecture for the whole pixels of any pitch.
+
+        Args:
+            pitch_um: of the pixels.
+        """
         pixels = pixel_count(
             self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um
         )
@@ -208,6 +218,9 @@ class CodesignRun:
 def start_run(settings: RunConfig) -> CodesignRun:
     """A fresh run; its pool of frames, where there is one, is rendered when the first
     batch is asked for.
+
+    Args:
+        settings: of the run.
 
     Raises:
         TrainingError: a budget is below the smallest network at the pitch that the run
@@ -316,6 +329,10 @@ def finest_within(
 ) -> float | None:
     """The finest pitch within the budget, where the low one is beyond it; None where
     the high one is too.
+
+    Args:
+        count: multiply-accumulates at a pitch in um. low_um: finest pitch.
+        high_um: coarsest pitch.
     """
     if high_um <= low_um or count(high_um) > budget:
         return None
@@ -328,7 +345,11 @@ def finest_within(
 
 
 def save_run(path: Path, run: CodesignRun) -> None:
-    """Checkpoint: training state and the searches so far; written by one process alone."""
+    """Checkpoint: training state and the searches so far; written by one process alone.
+
+    Args:
+        path: of the file. run: run with its model.
+    """
     if parallel.process_rank():
         return
     state = {
@@ -340,6 +361,9 @@ def save_run(path: Path, run: CodesignRun) -> None:
 
 def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
     """Go on from a checkpoint.
+
+    Args:
+        path: of the file.
 
     Raises:
         TrainingError: no checkpoint, a damaged one, or one of other settings (the
@@ -355,7 +379,11 @@ def resume_run(path: Path, settings: RunConfig) -> CodesignRun:
 
 
 def train_run(run: CodesignRun, path: Path) -> Iterator[LogRecord]:
-    """Advance the training to its end, with checkpoints; a record a step."""
+    """Advance the training to its end, with checkpoints; a record a step.
+
+    Args:
+        run: run with its model. path: of the file.
+    """
     for record in run.trainer.run():
         # first the caller's log, then the checkpoint: a log never lacks a step that is
         # kept
@@ -368,5 +396,9 @@ def train_run(run: CodesignRun, path: Path) -> Iterator[LogRecord]:
 
 
 def lens_coefficients(run: CodesignRun) -> torch.Tensor:
-    """Polynomial coefficients of the trained lens, rad."""
+    """Polynomial coefficients of the trained lens, rad.
+
+    Args:
+        run: run with its model.
+    """
     return run.trainer.model.coefficients_rad.detach().clone()

@@ -22,6 +22,9 @@ def search(run: CodesignRun, path: Path) -> Iterator[tuple[float, EvaluatedCandi
     Candidates are judged by their gaze error in degrees, with the supernet's optics,
     pitch and weights, or with their own (``search.inner_steps``).
 
+    Args:
+        run: run with its model. path: of the file.
+
     Yields:
         (budget in MMACs, the candidate that was born).
     """

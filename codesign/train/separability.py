@@ -96,7 +96,12 @@ class FisherSeparability:
 
 
 def moved_states(states: EyeStates, config: SeparabilityConfig) -> list[EyeStates]:
-    """The anchors, then the same moved along every motion."""
+    """The anchors, then the same moved along every motion.
+
+    Args:
+        states: subjects with gaze and slippage.
+        config: motions, steps and weights of Eq. 6.
+    """
     out = [states]
     for name, axis, step in config.directions:
         values = getattr(states, name).clone()
@@ -110,6 +115,9 @@ def render_triplets(
 ) -> list[Frames]:
     """Frames of the anchors of a training step and of every motion, at the anchors'
     exposure.
+
+    Args:
+        scenes: frames by number. config: motions, steps and weights of Eq. 6.
     """
     anchors = replace(scenes, stream=STREAM).states(step, config.triplets)
     return [
@@ -134,6 +142,7 @@ def fisher_separability(
             frames on samples ``sample_um`` apart.
         encircled: share of the light that the lens keeps together, any shape.
         sensor: its pixels; their expected electrons are compared, without noise.
+        config: motions, steps and weights of Eq. 6.
     """
     anchor, *moved = (
         camera.mean_electrons(image(one), sample_um, sensor=sensor) for one in frames

@@ -36,6 +36,9 @@ def specialise_candidate(
     architecture alone, then its weights alone (``finetune_steps``).
 
     The same run, architecture and budget give the same result.
+
+    Args:
+        budget_mmacs: compute budget, million multiply-accumulates a frame.
     """
     settings, source = run.settings, run.trainer
     model = copy.deepcopy(source.model)
@@ -103,7 +106,11 @@ def _finest_um(
 
 
 def people_of(run: CodesignRun, stream: int, batches: int) -> bench.PeopleFrames:
-    """People of a stream, as many as fill these batches; two or more."""
+    """People of a stream, as many as fill these batches; two or more.
+
+    Args:
+        run: run with its model.
+    """
     frames = batches * run.settings.inner.batch
     count = max(2, frames // PEOPLE_EACH)
     seed = run.settings.inner.seed + 31 * (stream + 1)
@@ -111,7 +118,11 @@ def people_of(run: CodesignRun, stream: int, batches: int) -> bench.PeopleFrames
 
 
 def frames_of(trainer: Trainer, people: bench.PeopleFrames) -> assess.SensorFrames:
-    """Their frames through a trainer's lens and sensor."""
+    """Their frames through a trainer's lens and sensor.
+
+    Args:
+        people: people, their frames and where they look.
+    """
     size = trainer.inner.batch
     return assess.sensor_frames(trainer, people, math.ceil(len(people.states) / size))
 
@@ -122,7 +133,14 @@ def gaze_error_deg(
     people: bench.PeopleFrames,
     seen: assess.SensorFrames,
 ) -> float:
-    """Mean gaze error of a network whose batch statistics are measured."""
+    """Mean gaze error of a network whose batch statistics are measured.
+
+    Args:
+        trainer: with lens, sensor and network as they are.
+        architecture: member of the search space.
+        people: people, their frames and where they look.
+        seen: their frames on the sensor.
+    """
     answers = assess.predict_frames(
         trainer.model.net, architecture, seen, trainer.inner
     )
