@@ -156,7 +156,7 @@ class PairSensitivities:
 
     def at(self, width_um: Array, length_um: Array) -> Array:
         """(pillar-response errors, n) derivatives of ln t."""
-        found = _carried(
+        found = _interpolate_rates(
             (self.width_um, self.length_um), self.rates, (width_um, length_um)
         )
         return with_missing(list(found))
@@ -176,17 +176,17 @@ def pair_sensitivities(
     """
     kinds = Kinds.of(lens.diameters)
     pairs = np.stack([kinds.width_um, kinds.length_um], 1)
-    width, length = pairs[_apart(pairs, int(kinds.count.argmax()), count)].T
+    width, length = pairs[_farthest_points(pairs, int(kinds.count.argmax()), count)].T
     found = pair_rates(lens, width, length)
     return {
         light: PairSensitivities(
-            width, length, each.rates, each.error + _unseen(width, length, each.rates)
+            width, length, each.rates, each.error + _held_out_error(width, length, each.rates)
         )
         for light, each in found.items()
     }
 
 
-def _apart(points: Array, first: int, count: int) -> list[int]:
+def _farthest_points(points: Array, first: int, count: int) -> list[int]:
     """The first, then always the point that is farthest from all before it."""
     chosen, away = [first], np.linalg.norm(points - points[first], axis=1)
     while len(chosen) < count and away.max() > 0:
@@ -195,7 +195,7 @@ def _apart(points: Array, first: int, count: int) -> list[int]:
     return chosen
 
 
-def _carried(
+def _interpolate_rates(
     nodes: tuple[Array, Array], rates: Array, places: tuple[Array, Array]
 ) -> Array:
     """(causes, places) rates between the nodes."""
@@ -208,21 +208,21 @@ def _carried(
     )
 
 
-def _unseen(width_um: Array, length_um: Array, rates: Array) -> float:
+def _held_out_error(width_um: Array, length_um: Array, rates: Array) -> float:
     """Largest rms error over causes, relative, of the second half of the pairs from the
     first.
     """
     half = (len(width_um) + 1) // 2
     if half == len(width_um):
         return 0.0
-    seen, rest = slice(half), slice(half, None)
-    told = _carried(
-        (width_um[seen], length_um[seen]),
-        rates[:, seen],
-        (width_um[rest], length_um[rest]),
+    fitted, judged = slice(half), slice(half, None)
+    predicted = _interpolate_rates(
+        (width_um[fitted], length_um[fitted]),
+        rates[:, fitted],
+        (width_um[judged], length_um[judged]),
     )
-    off = np.linalg.norm(told - rates[:, rest], axis=1) / np.maximum(
-        np.linalg.norm(rates[:, rest], axis=1), 1e-9
+    off = np.linalg.norm(predicted - rates[:, judged], axis=1) / np.maximum(
+        np.linalg.norm(rates[:, judged], axis=1), 1e-9
     )
     known = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
     return float((off * known).max())
