@@ -22,10 +22,10 @@ class Bias:
     the drawn diameter.
 
     table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond
-    the ends.
+        the ends.
     curve_nm: or coefficients c_k of bias = sum c_k (drawn diameter / 100 nm)^k.
     csv: or a file of two columns, drawn diameter and bias in nm, with or without a
-    head.
+        head.
     isolated_nm: what a pillar without neighbours gains beyond one in a full lattice.
     range_um: distance (Gaussian 1/e radius) over which neighbours count for that.
 

@@ -1,5 +1,5 @@
-"""Pillars by their own shape: central differences of ln t by the pillar-response errors,
-and by their edges.
+"""Pillars by their own shape: central differences of ln t by the pillar-response
+errors, and by their edges.
 """
 
 import dataclasses
@@ -31,13 +31,11 @@ class OwnRates:
     """Logarithmic derivatives of t at some sizes.
 
     rates: (pillar-response errors, n) complex, by the base unit of each (um, rad, 1); 0
-    of
-    what such pillars cannot have.
+        of what such pillars cannot have.
     edges: (n,) by a bias of all edges, less that by the size, which is what a proxy
-    knows: 0 where a shape keeps its
-    form as its edges move (circles, squares), per um.
+    knows: 0 where a shape keeps its form as its edges move (circles, squares), per um.
     error: largest relative change (rms over the sizes) of one of them from a coarser
-    truncation.
+        truncation.
     """
 
     rates: Array

@@ -2,8 +2,7 @@
 symmetry and measurement of each.
 
 Fit, tolerance study, error budget, training spread and mask correction read this table
-and nothing else: a new cause is
-a new row. Three kinds of derivative hold all of them:
+and nothing else: a new cause is a new row. Three kinds of derivative hold all of them:
 
     CDError    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
     ResponseError   t of every pillar alike, by its diameter                          t exp(sum a_c s_c(D))
@@ -32,9 +31,8 @@ class Guide:
     are made of.
 
     k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,)
-    effective index and its derivatives
-    by the diameter. index, around: of pillar and surroundings. height_um, sidewall_rad:
-    of the design.
+        effective index and its derivatives by the diameter. index, around: of pillar
+        and surroundings. height_um, sidewall_rad: of the design.
     """
 
     k: float
@@ -60,13 +58,13 @@ class ResponseError:
     """Derivative of ln t of every pillar alike, by ``unit`` of the row.
 
     quick: from the effective index, (n,) complex for the diameters of a guide. changed:
-    the cell with so much more of
-    the cause; None where a pillar of the same size has no more of it. step: of
-    differences through a solver. exact: the number of the cell that tables of t follow
-    by powers (:class:`metalens.fabrication.Solved`), empty where none does.
+        the cell with so much more of the cause; None where a pillar of the same size
+        has no more of it. step: of differences through a solver. exact: the number of
+        the cell that tables of t follow by powers
+        (:class:`metalens.fabrication.Solved`), empty where none does.
     numbers: rate of each number of a cell, as
-    :func:`metalens.fabrication.own.changed_pillar` names them, by cell and size of the
-    pillar; {} where such a pillar cannot have the cause.
+        :func:`metalens.fabrication.own.changed_pillar` names them, by cell and size of
+        the pillar; {} where such a pillar cannot have the cause.
     """
 
     quick: Callable[[Guide], Array]
@@ -90,8 +88,8 @@ class Drawn:
     """How a process spreads a cause, in PROCESS.toml's table ``spread``.
 
     name, sigma: entry there and its default. share: of the entry's amount that the
-    cause gets; two causes of one entry
-    are the x and y of a direction that every lens draws anew.
+        cause gets; two causes of one entry are the x and y of a direction that every
+        lens draws anew.
     """
 
     name: str
@@ -105,16 +103,15 @@ class Perturbation:
     design.
 
     meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma:
-    prior knowledge without metrology.
+        prior knowledge without metrology.
     low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name.
-    free: fitted unless told
-    otherwise. drawn: how the process spreads it, where it does. plausible: standard
-    deviation that is reckoned with
-    where it is neither fitted nor stated; sigma where 0. effect: as a cause in words,
-    where it is looked for while it is not fitted; probe: so much of it is tried then.
+    free: fitted unless told otherwise. drawn: how the process spreads it, where it
+        does. plausible: standard deviation that is reckoned with where it is neither
+        fitted nor stated; sigma where 0. effect: as a cause in words, where it is
+        looked for while it is not fitted; probe: so much of it is tried then.
     extra: fitted too where the usual ones do not explain the frames. reversible: near
-    focus the images of a lens with the opposite sign look alike. measured_by: what
-    settles it beside the frames.
+        focus the images of a lens with the opposite sign look alike. measured_by: what
+        settles it beside the frames.
     """
 
     name: str
@@ -460,9 +457,8 @@ def coarser(wavelength_um: float) -> float:
     wavelength / 0.85 um, 1 at least.
 
     Pillars, their height and what their tools are asked to hold grow with the
-    wavelength, so that errors of one kind
-    turn the phase alike; lenses of shorter waves come from the same writers and
-    etchers, with their nanometres.
+    wavelength, so that errors of one kind turn the phase alike; lenses of shorter waves
+    come from the same writers and etchers, with their nanometres.
 
     Args:
         wavelength_um: vacuum wavelength, um.
@@ -507,8 +503,7 @@ def named(
 
 def with_missing(rows: Sequence[Array]) -> Array:
     """(pillar-response errors, *shape) of the first rows of the table: those that are
-    not
-    there are 0.
+    not there are 0.
     """
     return np.stack(
         [*rows, *[np.zeros_like(rows[0])] * (len(named(ResponseError)) - len(rows))]
@@ -517,8 +512,7 @@ def with_missing(rows: Sequence[Array]) -> Array:
 
 def lacking(cell: Cell) -> tuple[str, ...]:
     """Names of the causes that pillars of this kind cannot have: a round one has no
-    length and no turn, one
-    without layers no pedestal.
+    length and no turn, one without layers no pedestal.
 
     Args:
         cell: unit cell with its materials, shape and lattice.

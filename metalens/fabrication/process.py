@@ -90,8 +90,7 @@ class State:
 
     def answers(self) -> Array:
         """(pillar-response errors,) amounts in um, rad and 1, as the pillars'
-        derivatives
-        take them.
+        derivatives take them.
         """
         return self._of(ResponseError) * [row.unit for _, row in of_kind(ResponseError)]
 
@@ -110,12 +109,12 @@ class Spread(_Entries):  # type: ignore[misc]
     :data:`DRAWN`.
 
     bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the
-    other, in a random direction.
+        other, in a random direction.
     bow_nm: bias from centre to edge. height_nm, index, sidewall_deg: of the whole lens.
     width_nm, length_nm, turn_deg: of the sides of all rectangles or ellipses and of
-    their turn; none unless stated.
+        their turn; none unless stated.
     pedestal_nm, cap_nm: of the heights of films under and on a layered pillar's own
-    material; none unless stated.
+        material; none unless stated.
     """
 
     def __post_init__(self) -> None:

@@ -1,6 +1,5 @@
 """What the pillar-response errors do to every pillar: derivatives of ln t over the
-diameter,
-and t itself under a change.
+diameter, and t itself under a change.
 """
 
 import math
@@ -43,10 +42,8 @@ class Solved:
 
     wavelength_um: that it was solved at. diameter_um: (n,) rising.
     powers: (causes, orders, n) of t in powers of the amount of each pillar-response
-    error
-    (um, rad, 1), in the table's order;
-        the first is the designed t, the others are 0 for a cause that was not solved.
-        Between the amounts that were
+        error (um, rad, 1), in the table's order; the first is the designed t, the
+        others are 0 for a cause that was not solved. Between the amounts that were
         solved a series misses resonances that move by: up to 0.03 of t beside them.
     """
 
@@ -69,19 +66,16 @@ class Sensitivity:
     diameter.
 
     coefficients: (pillar-response errors, degree + 1) complex power series in (D -
-    center_um)
-    of d ln t by the base unit
-        (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row
-        that is not there.
+        center_um) of d ln t by the base unit (um, rad, 1) of each; a row of zeros
+        switches a cause off, and so does a row that is not there.
     error: of the slopes, relative to their change across the lens; nan where not known.
     low_um, high_um: diameters that the polynomials were made for; beyond them they go
-    on along their tangents.
+        on along their tangents.
     solved: t itself under large changes, where a solver was asked; it stands for the
-    proxy then.
+        proxy then.
     edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size,
-    per um: a proxy knows pillars
-        that keep their form as they grow, which a biased rectangle does not; None for
-        those that do.
+        per um: a proxy knows pillars that keep their form as they grow, which a biased
+        rectangle does not; None for those that do.
     pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
     """
 
@@ -136,13 +130,11 @@ class Sensitivity:
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
     """Pillars of given diameters under the pillar-response errors: t over that of the
-    proxy
-    at the design's wavelength.
+    proxy at the design's wavelength.
 
     slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
-    orders, *shape) of t in powers of
-    the others, the designed t first; None where all are linear. proxy: (*shape) t of
-    the proxy.
+        orders, *shape) of t in powers of the others, the designed t first; None where
+        all are linear. proxy: (*shape) t of the proxy.
     """
 
     slopes: Array
@@ -190,17 +182,15 @@ class Slopes(Protocol):
 
 def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     """Derivatives from the effective index of the pillars that the proxy's phase
-    implies; of pillars that are not
-    round on a square lattice those of their own shape, by exact derivatives of a solver
-    (seconds a lens).
+    implies; of pillars that are not round on a square lattice those of their own shape,
+    by exact derivatives of a solver (seconds a lens).
 
     Args:
         degree: of the polynomials over the diameter.
 
     Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by
-    index; interference between
-    foot and top is left out. The cell solvers say it better, at seconds a lens. Of
-    others: ``error`` of the result.
+        index; interference between foot and top is left out. The cell solvers say it
+        better, at seconds a lens. For other shapes: ``error`` of the result.
 
     Raises:
         CellError, MaterialError, LensError: pillars that are not round and that the
@@ -231,8 +221,7 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
 
 def _of_its_own(lens: Lens) -> Sensitivity:
     """From :func:`metalens.fabrication.own.own_rates` at Chebyshev sizes, as
-    polynomials of
-    degree 5.
+    polynomials of degree 5.
     """
     low, high = lens.proxy.domain_um
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
@@ -276,8 +265,7 @@ def guide(
     """Effective indices of pillars: phase(D) = k n_eff(D) h, smoothed by a polynomial.
 
     Anchored at the thinnest pillar by the effective medium of thin cylinders across the
-    field (Rayleigh 1892, two
-    dimensions).
+    field (Rayleigh 1892, two dimensions).
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -324,9 +312,9 @@ def designed(
     """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at
     an angle of incidence.
 
-    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 1e-3 to 1): by
-    diameter, and by wavelength as far again as the proxy reaches, then held; of one
-    wavelength they hold at all.
+    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T|
+    held within 1e-3 to 1): by diameter, and by wavelength as far again as the proxy
+    reaches, then held; of one wavelength they hold at all.
 
     Args:
         wavelength_um: vacuum wavelength, um.
@@ -411,8 +399,8 @@ def transmission(
 
     Args:
         answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
-            bias_um: what of the diameters is
-            bias, of all edges alike, and no size of the design (:func:`biased`).
+            bias_um: what of the diameters is bias, of all edges alike, and no size of
+            the design (:func:`biased`).
         proxy: phase and |T| over the diameter.
         d_um: (*shape) diameters, um.
         wavelength_um: vacuum wavelength, um.

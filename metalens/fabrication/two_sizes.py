@@ -138,15 +138,12 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
 @dataclass(frozen=True, eq=False, slots=True)
 class PairSensitivities:
     """Logarithmic derivatives of t by the pillar-response errors, of pillars of two
-    sizes and
-    one polarisation.
+    sizes and one polarisation.
 
     width_um, length_um: (n,) pairs that were solved. rates: (pillar-response errors, n)
-    complex, by the base unit of
-        each (um, rad, 1). error: largest relative change of one of them from a coarser
-        truncation, and what the rates
-        of the second half of the pairs differ by from those of the first half, carried
-        there.
+        complex, by the base unit of each (um, rad, 1). error: largest relative change
+        of one of them from a coarser truncation, and what the rates of the second half
+        of the pairs differ by from those of the first half, carried there.
     """
 
     width_um: Array
@@ -180,7 +177,10 @@ def pair_sensitivities(
     found = pair_rates(lens, width, length)
     return {
         light: PairSensitivities(
-            width, length, each.rates, each.error + _held_out_error(width, length, each.rates)
+            width,
+            length,
+            each.rates,
+            each.error + _held_out_error(width, length, each.rates),
         )
         for light, each in found.items()
     }

@@ -4,8 +4,7 @@ read each diameter once.
     φ(D) = φ_0 + x(φ_1 + x(φ_2 + …)),  |T|(D) alike,  x = scale D^power + shift        paper Eq. 2, at one (λ, θ)
 
 Polynomials are taken in float64 over a part of a row that stays in the nearest cache,
-and whole turns come off before
-the cast to the dtype of the result.
+and whole turns come off before the cast to the dtype of the result.
 """
 
 import numba
@@ -27,8 +26,7 @@ def fill_response(
     lens: Lens, at: tuple[float, float], phase: Array, level: Array
 ) -> None:
     """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in
-    their dtype; 0 where there is
-    none.
+    their dtype; 0 where there is none.
 
     Args:
         at: wavelength in um, angle of incidence in rad.
@@ -66,8 +64,7 @@ def fill_response_of(
     turned: Array | None = None,
 ) -> None:
     """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad
-    that is
-    added.
+    that is added.
 
     Args:
         proxy: phase and |T| over the diameter.
@@ -86,8 +83,7 @@ def response_polynomials(
     proxy: Proxy, diameter_um: Array, at: tuple[float, float]
 ) -> Polynomials:
     """What :func:`evaluate_row` takes of these diameters, for a wavelength in um and an
-    angle in rad; raises as
-    :func:`fill_response`.
+    angle in rad; raises as :func:`fill_response`.
 
     Args:
         proxy: phase and |T| over the diameter.

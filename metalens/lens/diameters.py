@@ -28,8 +28,7 @@ class DiameterMap:
     """Pillar sizes on a lattice; the lens axis sits at index ((ny-1)/2, (nx-1)/2).
 
     A hexagonal lattice is every other site of a grid of half a pitch along x and
-    ``row_um`` along y: those with
-    row + column odd hold no pillar.
+    ``row_um`` along y: those with row + column odd hold no pillar.
 
     Attributes:
         diameter_um: (y, x) size of every pillar (its diameter where it is round), 0
@@ -47,8 +46,8 @@ class DiameterMap:
 
     Raises:
         LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and
-            column named); no pillar; a pillar
-            between the sites of the lattice; turns that do not fit the map.
+            column named); no pillar; a pillar between the sites of the lattice; turns
+            that do not fit the map.
     """
 
     diameter_um: Array
@@ -129,8 +128,7 @@ class DiameterMap:
     @property
     def grid(self) -> "SiteSpacing":
         """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on
-        a
-        square lattice.
+        a square lattice.
         """
         square = self.lattice.kind == "square" and not self.row_um
         column, row = self.steps_um

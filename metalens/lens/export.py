@@ -43,18 +43,16 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     """Write a lens in the format that the name's ending says.
 
     ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission,
-    pitch_um, wavelength_um; where
-    pillars are turned angle_rad; where they have two sizes length_um, phase and
-    transmission for light along x.
-    ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture,
-    unwrapped, in mm.
+    pitch_um, wavelength_um; where pillars are turned angle_rad; where they have two
+    sizes length_um, phase and transmission for light along x. ``.dat``: Zemax grid
+    phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
 
     Args:
         path: target; its ending says the format.
 
     Returns:
         largest difference in phase (rad) between the pillars and what a program
-        interpolates; 0 for the arrays.
+            interpolates; 0 for the arrays.
 
     Raises:
         LensError: another ending, or a phase that no smooth map has (see
@@ -112,10 +110,10 @@ class GridPhase:
     """Phase on a square grid, +y down as everywhere here.
 
     phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be
-    interpolated; nan further out.
+        interpolated; nan further out.
     step_um: of the points. error_rad: largest difference between the pillars and the
-    cubic interpolation of the points,
-    a few points inside the rim, where a program has all it needs.
+        cubic interpolation of the points, a few points inside the rim, where a program
+        has all it needs.
     """
 
     phase_rad: Array
@@ -127,8 +125,8 @@ class GridPhase:
         nodata`` a point, largest y first.
 
         Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the
-            program then takes differences. The
-        blanks that end the first line say whose file it is.
+            program then takes differences. The blanks that end the first line say whose
+            file it is.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
         lines = [f"{n} {n} {step} {step} 0 0 0\t \t"]
@@ -222,16 +220,15 @@ def unwrap_phase(lens: Lens) -> Array:
     at the middle.
 
     Along the middle column first, then along every row to both sides: exact where
-    neighbours differ by less than half
-    a turn.
+    neighbours differ by less than half a turn.
 
     Args:
         lens: the lens.
 
     Raises:
         LensError: gaps along the way, or neighbours half a turn apart whichever way
-            they are joined: a vortex, a
-            spiral or zones with steps have no smooth phase.
+            they are joined: a vortex, a spiral or zones with steps have no smooth
+            phase.
     """
     d = lens.diameters.diameter_um
     there = np.asarray(d) > 0

@@ -4,18 +4,14 @@ turned by.
     C(s, α) = 1 + a s + b s²        on amplitudes whose squares are power; s: sine by which light is turned
 
 The first term is that of the zone borders, whose number grows with s; the second that
-of the slope between them. a and
-b go through solved rows (:mod:`metalens.design.neighbours`), apart for fields along the
-slope and across it, and for
-slopes along the lattice and along its diagonal; between these they go as sin² 2α, the
-least that a square lattice has.
-Beyond the steepest row along the lattice C stays as it is; beyond that along the
-diagonal, what sets it apart does.
-Rows are solved at one wavelength and at normal incidence. Light of another wavelength
-or from the side is given the
-same factor where the zones are as wide: s is that of the rows' wavelength. What that
-leaves out is for who uses it to
-count (:mod:`metalens.psf.budget`).
+of the slope between them. a and b go through solved rows
+(:mod:`metalens.design.neighbours`), apart for fields along the slope and across it, and
+for slopes along the lattice and along its diagonal; between these they go as sin² 2α,
+the least that a square lattice has. Beyond the steepest row along the lattice C stays
+as it is; beyond that along the diagonal, what sets it apart does. Rows are solved at
+one wavelength and at normal incidence. Light of another wavelength or from the side is
+given the same factor where the zones are as wide: s is that of the rows' wavelength.
+What that leaves out is for who uses it to count (:mod:`metalens.psf.budget`).
 """
 
 import math
@@ -38,13 +34,12 @@ class NeighbourRows:
     """Rows of a lens's own unlike pillars, each solved as one cell.
 
     sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
-    diagonal of the lattice.
+        diagonal of the lattice.
     factor: (2, n) complex tangential amplitude where the light should go, over that of
-    pillars one by one; of light
-        whose field lies along the row, and across it. coarse: (2, n) the same at a
-        coarser truncation.
+        pillars one by one; of light whose field lies along the row, and across it.
+        coarse: (2, n) the same at a coarser truncation.
     scatter: (n,) share of the transmitted power that goes elsewhere, beyond what
-    pillars one by one would send there.
+        pillars one by one would send there.
     wavelength_um: of the rows. cover: index of the medium behind the pillars.
 
     Raises:
@@ -172,8 +167,9 @@ class NeighbourRows:
 
     def doubted(self, sine: Array) -> list["NeighbourRows"]:
         """What it may be as well: at the coarser truncation, without the row that
-        changes most at these sines, and with
-        what zones that get shorter from one to the next change."""
+        changes most at these sines, and with what zones that get shorter from one to
+        the next change.
+        """
         mine = self.mean(sine)
         apart = [float(np.abs(other.mean(sine) - mine).max()) for other in self.others]
         less = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))

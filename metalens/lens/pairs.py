@@ -18,13 +18,11 @@ class TwoSizeTable:
     polarised along x and along y.
 
     wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2)
-    power-normalised amplitudes that
-        keep the polarisation, exp(-iwt).
+        power-normalised amplitudes that keep the polarisation, exp(-iwt).
     focus_y_um: (sensor, source) distance of the light polarised along y; that of the
-    lens is of light along x.
+        lens is of light along x.
     entry_error: root mean square of the error bars of the pillars that stand in the
-    lens, relative to |t|; nan where
-        it is not known (older files).
+        lens, relative to |t|; nan where it is not known (older files).
     """
 
     wavelength_um: Array

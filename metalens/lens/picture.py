@@ -17,12 +17,10 @@ _ZOOM = 28  # pillars along the side of the zoom
 
 
 def lens_picture(lens: Lens) -> bytes:
-    """PNG: wrapped phase at the design wavelength, and single pillars halfway to the
-    rim.
+    """PNG: wrapped phase at the design wavelength, and single pillars halfway to the rim.
 
     A pixel has the phase of the mean of exp(iφ) over its sites and fades where the
-    phase turns within it, so that no
-    lenses appear that are none.
+    phase turns within it, so that no lenses appear that are none.
 
     Args:
         lens: the lens.

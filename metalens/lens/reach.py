@@ -146,8 +146,8 @@ def depth_range_um(
     (2 wavelength).
 
     Where no depth is that far out of focus, far is ten times near; near is at least the
-    lens's diameter, or the
-    depth of focus itself. Rounded to ``digits`` digits, and beyond the films in front.
+    lens's diameter, or the depth of focus itself. Rounded to ``digits`` digits, and
+    beyond the films in front.
 
     A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
     """

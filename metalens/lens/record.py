@@ -45,25 +45,22 @@ class Lens:
     sensor_distance_um: lens to sensor, in the cover medium.
     source_distance_um: object distance of best focus (inf for a collimated beam).
     profile: name of the design (hyperbolic, double-helix, cubic, fisher, map,
-    as-built).
+        as-built).
     provenance: config and inputs that made it.
     layers: films in front and behind; their cover is that of the cell.
     hand: circular light that the lens is made for: "right" (field x + iy, the phase
-    grows by twice the turn of a
-        pillar) or "left"; the proxy is then that of the light that leaves with the
-        other hand. Empty: any light.
+        grows by twice the turn of a pillar) or "left"; the proxy is then that of the
+        light that leaves with the other hand. Empty: any light.
     pairs: table of pillars of two sizes in place of the proxy; None where they have
-    one. light: polarisation, "x" or
-        "y", that phase, transmission and distances are for where they have two
-        (:meth:`seen`).
+        one. light: polarisation, "x" or "y", that phase, transmission and distances are
+        for where they have two (:meth:`seen`).
     neighbours: rows of its own unlike pillars (:func:`metalens.design.neighbours`),
-    whose factor PSFs and images then
-        hold; None where none was solved.
+        whose factor PSFs and images then hold; None where none was solved.
 
     Raises:
         LensError: layers with another cover than the cell's; turned pillars without a
-            hand, or the other way round;
-            PropagationError: films thicker than their gap.
+            hand, or the other way round; PropagationError: films thicker than their
+            gap.
     """
 
     diameters: DiameterMap = field(metadata={"flat": True})

@@ -2,8 +2,7 @@
 Newton's method runs a few times.
 
 What media make of a ray is analytic in its squared reach u, away from -(Σ t / n)²:
-Chebyshev coefficients fall as a
-power.
+Chebyshev coefficients fall as a power.
 """
 
 from collections.abc import Callable

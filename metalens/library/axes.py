@@ -70,9 +70,8 @@ class AxesLibrary:
     normal incidence.
 
     Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the
-    pillar's foot to that of its top,
-    as :class:`metalens.cell.response.Response` has it. The sizes are those before the
-    turn of the shape.
+    pillar's foot to that of its top, as :class:`metalens.cell.response.Response` has
+    it. The sizes are those before the turn of the shape.
 
     cell, sweep: what was computed.
     wavelength_um: (w,). x_um: (m,), y_um: (n,) sizes, evenly spaced with one step.
@@ -159,8 +158,8 @@ def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
 
     Raises:
         ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
-            with a ratio of its own, pillars
-            that touch; and as :func:`metalens.library.check_sweep`.
+            with a ratio of its own, pillars that touch; and as
+            :func:`metalens.library.check_sweep`.
     """
     spans = size_ranges(sweep)
     if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
@@ -401,19 +400,17 @@ def sweep_two_sizes(
 
     Args:
         settings: ``diameters_um`` and ``lengths_um`` are the ranges along x and y,
-            ``samples`` the entries along the
-            longer of them. console, checkpoint: as for :func:`metalens.library.sweep`.
+            ``samples`` the entries along the longer of them. console, checkpoint: as
+            for :func:`metalens.library.sweep`.
         cell: unit cell with its materials, shape and lattice.
 
     Accuracy: the bar of an entry adds the truncation error of the solver, carried as a
-    small shift of the sizes, and
-        the disagreement of interpolations, scaled by what twelve pairs held out show;
-        ``held_out`` tells how far off
-        they and twelve more are.
+        small shift of the sizes, and the disagreement of interpolations, scaled by what
+        twelve pairs held out show; ``held_out`` tells how far off they and twelve more
+        are.
 
     Raises:
-        ConfigError, CellError, MaterialError: see
-            :func:`check_axes_sweep`.
+        ConfigError, CellError, MaterialError: see :func:`check_axes_sweep`.
     """
     check_axes_sweep(cell, settings)
     settings = settings.settled(cell)

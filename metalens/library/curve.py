@@ -2,10 +2,9 @@
 dozen exact solves.
 
 The response of a pillar is a meromorphic function of its diameter, so a rational
-function that shares its poles
-between t and r converges geometrically through every resonance. Nodes are added where
-two rational fits of the
-same data disagree; the disagreement that is left is the error estimate.
+function that shares its poles between t and r converges geometrically through every
+resonance. Nodes are added where two rational fits of the same data disagree; the
+disagreement that is left is the error estimate.
 """
 
 from collections.abc import Callable
@@ -37,9 +36,9 @@ class SolvedNodes:
     """Exact solves of one curve, in the order they were made.
 
     diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver. energy:
-    (n,).
+        (n,).
     converged: whether the last nodes were predicted within the tolerance; reason: why
-    the search stopped.
+        the search stopped.
     """
 
     diameter_um: Array
@@ -68,12 +67,10 @@ class ResponseCurve:
         """(..., 2) t and r, and (...) error estimate of t, not below the true error.
 
         The estimate adds the largest disagreement with a rival fit, the residual of the
-        fit, a tenth of the
-        tolerance, and the solver's error: mostly a small shift of the diameter, it is
-        carried from the neighbouring
-        nodes in proportion to the slope of t, no farther than any passive pillar can
-        be. At a node the estimate is the
-        solver's own.
+        fit, a tenth of the tolerance, and the solver's error: mostly a small shift of
+        the diameter, it is carried from the neighbouring nodes in proportion to the
+        slope of t, no farther than any passive pillar can be. At a node the estimate is
+        the solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -260,8 +257,8 @@ def _suspect(
     fit: RationalFunction, rivals: list[RationalFunction], x: Array, cheaper: Array
 ) -> tuple[float, float]:
     """Where the fits disagree most, or nearly so at a cheaper place, and by how much at
-    most; narrow resonances are
-    looked at on their own scale."""
+    most; narrow resonances are looked at on their own scale.
+    """
     low, high = x.min(), x.max()
     poles = fit.poles()
     poles = poles[

@@ -67,8 +67,7 @@ def solver_at_fixed_discretization(
     engine: str,
 ) -> Callable[[float], Response]:
     """As :func:`solve_to_tolerance`, on one discretisation for all diameters of
-    ``span_um``, so
-    far as it goes.
+    ``span_um``, so far as it goes.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -93,14 +92,12 @@ def solvers_at_common_discretization(
     that all of them need.
 
     It is the least that meets the tolerance at three probes, which a curve over the
-    span solves anyhow: answers are
-    remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is
-    reported), but it has no jumps that
-    a rational fit would take for resonances. Meshes of the modal method need meet it at
-    two of the probes: beside a
-    resonance, where the error is many times that elsewhere, the next mesh takes over.
-    The jump there is the true error
-    of the coarser mesh, some tenth of its bar.
+    span solves anyhow: answers are remembered. Elsewhere the error of coupled waves may
+    exceed the tolerance (it is reported), but it has no jumps that a rational fit would
+    take for resonances. Meshes of the modal method need meet it at two of the probes:
+    beside a resonance, where the error is many times that elsewhere, the next mesh
+    takes over. The jump there is the true error of the coarser mesh, some tenth of its
+    bar.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -143,10 +140,8 @@ def has_upright_walls(cell: Cell, engine: str) -> bool:
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
     """Whether :func:`solver_at_fixed_discretization` took the finest discretisation
-    there is, by the errors of
-    the nodes that came of it (the
-    first ones as a curve begins with): a pillar solved by itself has no less error
-    then.
+    there is, by the errors of the nodes that came of it (the first ones as a curve
+    begins with): a pillar solved by itself has no less error then.
 
     Args:
         cell: unit cell with its materials, shape and lattice.

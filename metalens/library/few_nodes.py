@@ -26,8 +26,8 @@ def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
     """The values to solve first: all of a few, else five Leja points.
 
     Each is where the product of the distances to those before it is largest, which
-    keeps that product, the factor of
-    the error of the polynomial through them, small everywhere.
+    keeps that product, the factor of the error of the polynomial through them, small
+    everywhere.
     """
     if len(values) <= ALL_UP_TO:
         return values
@@ -105,8 +105,8 @@ def complete_sweep(
     angles.
 
     poles: (k, 2) diameter and half-width of the resonances of every solved curve. Where
-    a narrow one moves from one
-    node to the next, the diameters it passes have an error of 1: they must be solved.
+        a narrow one moves from one node to the next, the diameters it passes have an
+        error of 1: they must be solved.
 
     Args:
         normal: polarisation at normal incidence that stands for s and for p.
@@ -185,13 +185,11 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     """(3, diameter) row at ``x`` by the polynomial through all nodes.
 
     The error is extrapolated. Leaving out one node changes the row by the error of the
-    next lower degree, leaving out
-    two by that of the degree below; where the second is less than the first by some
-    factor, the polynomial through
-    all nodes is better by that factor again. Changes are taken as the largest of
-    neighbouring diameters, as any one
-    may vanish by chance; the result is trebled, and the errors of the nodes are added
-    as they enter.
+    next lower degree, leaving out two by that of the degree below; where the second is
+    less than the first by some factor, the polynomial through all nodes is better by
+    that factor again. Changes are taken as the largest of neighbouring diameters, as
+    any one may vanish by chance; the result is trebled, and the errors of the nodes are
+    added as they enter.
 
     nodes: (m,). table: (m, 3, diameter).
     """

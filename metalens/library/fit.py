@@ -43,14 +43,13 @@ class ProxyTolerances:
     """What a proxy must meet.
 
     phase_tolerance_rad, transmission_tolerance: largest deviation from the library
-    entries; left out, 1e-3, or half
-        of what the entries' own error bars say on the domain where that is more.
+        entries; left out, 1e-3, or half of what the entries' own error bars say on the
+        domain where that is more.
     coefficients: real ones, of phase and |T| together at one wavelength and angle; more
-    are taken only where
-        fewer would leave less than a full turn.
+        are taken only where fewer would leave less than a full turn.
     least_transmission: a domain ends where |t| falls below.
     least_half_width_um: a domain ends at resonances narrower than this: a pillar so
-    little off would jump.
+        little off would jump.
     within_um: (least, largest) diameter to consider; all entries without it.
     """
 
@@ -98,14 +97,14 @@ class ProxyFit:
     """A proxy and why it is as it is.
 
     notes: where its domain was cut, and why. table: error against the number of
-    coefficients on that domain.
+        coefficients on that domain.
     turns: covered by the domain, the least over wavelengths and angles.
     polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their
-    mean.
+        mean.
     shortfall: by how much the proxy misses the tolerances that were wanted, for a
-    person; empty where it meets them.
+        person; empty where it meets them.
     smooth_turns: covered by the diameters without resonance, as far as the proxy or
-    not.
+        not.
     """
 
     proxy: Proxy
@@ -141,12 +140,10 @@ def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyF
     """The proxy of a library.
 
     Every other diameter is fitted (least largest deviation, by Lawson's weights), all
-    are judged: half of them
-    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have
-    their own polynomials in
-    diameter^power; |T| is scaled until its certified bound lies below 1. Where so few
-    entries allow only a
-    domain that misses the tolerances, ``shortfall`` says so.
+    are judged: half of them the fit never saw. The phase is monotone, as the library's
+    is. Phase and |T| have their own polynomials in diameter^power; |T| is scaled until
+    its certified bound lies below 1. Where so few entries allow only a domain that
+    misses the tolerances, ``shortfall`` says so.
 
     Args:
         wanted: tolerances and limits of the fit.
@@ -232,8 +229,9 @@ def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
 
 def _followed(data: FitData, wanted: ProxyTolerances) -> tuple[FitData, Proxy, int]:
     """The domain that a proxy follows, and its number of coefficients: those wanted;
-    more where a full turn takes them;
-    fewer where so few entries let those wanted swing between them."""
+    more where a full turn takes them; fewer where so few entries let those wanted swing
+    between them.
+    """
     terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
     kept, proxy = _longest(data, wanted, terms)
     while more < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
@@ -256,8 +254,9 @@ def _shorter(
     data: FitData, wanted: ProxyTolerances, terms: int
 ) -> tuple[FitData, Proxy, int] | None:
     """Without the last diameters, beside what bounds the domain, where the tolerances
-    are met so; they are excluded as
-    the resonance is, up to a tenth of the phase. None where that is not enough."""
+    are met so; they are excluded as the resonance is, up to a tenth of the phase. None
+    where that is not enough.
+    """
     for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
         some = data.part(slice(count))
         if _turns(some) < (1 - EXCLUDED) * _turns(data):
@@ -343,8 +342,8 @@ def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
 
 def _best(data: FitData, wanted: ProxyTolerances, terms: int) -> Proxy | None:
     """Of the powers of the diameter, the one with the least error in units of the
-    tolerances; None where each takes
-    |T| below 0 between the entries."""
+    tolerances; None where each takes |T| below 0 between the entries.
+    """
     found = []
     for power in POWERS:
         with contextlib.suppress(DomainError):
@@ -437,8 +436,8 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
 
 def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson
-    1961: weights times
-    deviation)."""
+    1961: weights times deviation).
+    """
     weight = np.ones(values.shape)
     best, least = (
         np.zeros((*values.shape[:-1], basis.shape[1])),

@@ -2,12 +2,10 @@
 the lattice adds to it.
 
 A pillar with mirrors along its own axes passes diag(t_x, t_y). Turned by θ in the
-plane, and alone, it passes
-R(θ) diag(t_x, t_y) R(-θ): of the circular wave x ± iy the share (t_x + t_y)/2 keeps its
-hand, and (t_x - t_y)/2 leaves
-with the other hand and the phase ±2θ (Pancharatnam and Berry). On a lattice the
-neighbours see the turn; how much is
-solved, not guessed.
+plane, and alone, it passes R(θ) diag(t_x, t_y) R(-θ): of the circular wave x ± iy the
+share (t_x + t_y)/2 keeps its hand, and (t_x - t_y)/2 leaves with the other hand and the
+phase ±2θ (Pancharatnam and Berry). On a lattice the neighbours see the turn; how much
+is solved, not guessed.
 """
 
 import dataclasses
@@ -31,11 +29,11 @@ class GeometricPhase:
     """Solved cells of one pillar, turned in its lattice.
 
     size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one
-    period of the lattice.
+        period of the lattice.
     t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver.
     earlier: (n, k, 2, 2) t of coarser
     truncations: shares of the light have ``rcwa.SAFETY`` times their farthest change
-    over them as error bar.
+        over them as error bar.
     """
 
     size_um: float
@@ -171,8 +169,7 @@ def solve_rotations(
 
     Raises:
         CellError: a shape that cannot be turned (see :func:`check_geometric_phase`), or
-            that meets its
-            neighbours when turned.
+            that meets its neighbours when turned.
     """
     check_geometric_phase(cell, size_um)
     period = period_rad(cell)

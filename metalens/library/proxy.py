@@ -40,22 +40,21 @@ class Proxy:
     seen on held-out entries.
 
     phase_coefficients: ([angle degree + 1,] wavelength degree + 1, diameter degree + 1)
-    Chebyshev coefficients
-        of the phase in rad.
+        Chebyshev coefficients of the phase in rad.
     transmission_coefficients: as above, of |T|; certified to stay within [0, 1] on the
-    domain.
+        domain.
     domain_um: (least, largest) diameter.
     wavelengths_um: (least, largest) wavelength; equal where the proxy holds at one
-    wavelength.
+        wavelength.
     max_phase_error_rad, max_transmission_error: largest deviation from held-out library
-    entries.
+        entries.
     power: the polynomials run in diameter^power.
     max_angle_rad: largest angle of incidence in air; the polynomials run in the square
-    of its sine.
+        of its sine.
     entry_error: what the entries may be wrong by themselves, relative to |t|: their
-    error bars' root mean square.
+        error bars' root mean square.
     gaps_um: (least, largest) diameters around narrow resonances inside the domain,
-    which :meth:`diameter_um` never returns.
+        which :meth:`diameter_um` never returns.
 
     Raises:
         DomainError: |T| leaves [0, 1] inside the domain, or an empty domain.
@@ -139,15 +138,14 @@ class Proxy:
 
         Args:
             within_um: (least, largest) diameter to use; the whole domain without it.
-                Where it covers more
-                than a turn the end with the lesser phase is used: move ``within_um`` to
-                choose the branch.
+                Where it covers more than a turn the end with the lesser phase is used:
+                move ``within_um`` to choose the branch.
             gap: what to do with a phase that no pillar has (less than a turn covered).
 
         Accuracy:
             phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
-            gradients are exact. A diameter in one of ``gaps_um`` moves to its nearer
-            end.
+                gradients are exact. A diameter in one of ``gaps_um`` moves to its
+                nearer end.
 
         Raises:
             DomainError: the phase is not monotone within ``within_um``, or no pillar

@@ -69,10 +69,8 @@ def fit_rational_aaa(
     """The rational function of least degree that meets the data within ``tolerance``.
 
     Nakatsukasa, Sète and Trefethen, "The AAA algorithm for rational approximation",
-    SIAM J. Sci. Comput. 40,
-    A1494 (2018): support points are taken where the fit is worst, weights from the last
-    right singular vector
-    of the Loewner matrix.
+    SIAM J. Sci. Comput. 40, A1494 (2018): support points are taken where the fit is
+    worst, weights from the last right singular vector of the Loewner matrix.
 
     Args:
         x: (n,) distinct real points.

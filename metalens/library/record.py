@@ -42,21 +42,18 @@ class Sweep:
 
     wavelengths_um: vacuum wavelengths.
     angles_deg: of incidence in air, in the plane of a lattice axis; both polarisations
-    where one is not 0.
+        where one is not 0.
     diameters_um: (least, largest); without it from 0.06 (or a fifth of a smaller pitch)
-    to the pitch less 0.05.
+        to the pitch less 0.05.
     samples: evenly spaced diameters; more are added around resonances.
     tolerance: error bar that is asked of every entry's t; left out, what the solver of
-    such cells reaches but beside
-        resonances (:data:`USUAL`).
+        such cells reaches but beside resonances (:data:`USUAL`).
     engine: auto, rcwa or modal.
     lengths_um: (least, largest) size along y of a rectangle or an ellipse; diameters_um
-    is then that along x, and the
-        library one over both sizes (``samples`` entries along the longer range) with
-        Jones matrices.
+        is then that along x, and the library one over both sizes (``samples`` entries
+        along the longer range) with Jones matrices.
     light: linear, or circular: x and y at normal incidence, for pillars that are turned
-    one by one; the proxy is then
-        that of the light converted to the other hand.
+        one by one; the proxy is then that of the light converted to the other hand.
     """
 
     wavelengths_um: tuple[float, ...] = (0.85,)
@@ -172,18 +169,17 @@ class PillarLibrary:
 
     cell, sweep: what was computed.
     polarization: names along the first axis; angle_rad, wavelength_um, diameter_um: the
-    other axes.
+        other axes.
     t, r: (polarization, angle, wavelength, diameter) complex amplitudes of the zero
-    order.
+        order.
     t_error: as t; estimate of |t - exact|, not below the true error.
     energy: as t; |t|² + |r|² of the zero orders, 1 where nothing absorbs and no other
         order propagates.
     resonances: (k, 5) polarization index, angle_rad, wavelength_um, diameter_um,
-    half-width in um of the poles of
-        t(D) near the real axis.
+        half-width in um of the poles of t(D) near the real axis.
     engine: modal or rcwa. solves: exact solves behind the entries.
     proxy: polynomial of Eq. 2 fitted to the entries; notes: what was cut from its
-    domain, and why.
+        domain, and why.
     turned: for circular light, the pillar of most conversion solved at several turns.
     """
 
@@ -253,7 +249,7 @@ class PillarLibrary:
         """Mean of :attr:`lost` over pillars, at the least angle of the library.
 
         diameter_um: of the pillars, 0 where there is none. wavelength_um: the nearest
-        of the library is taken; polarisations are averaged.
+            of the library is taken; polarisations are averaged.
         """
         wave = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
         pillars = np.ravel(diameter_um)[np.ravel(diameter_um) > 0]

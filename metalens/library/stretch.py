@@ -22,9 +22,9 @@ class MonotonicBranch:
     diameter_um: (d,). phase: (angle, wavelength, d) rad, unwrapped along every axis.
     level: |t|, as phase.
     notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
-    their mean.
+        their mean.
     gaps_um: (least, largest) diameters inside the stretch around narrow resonances,
-    which no pillar of a lens should have.
+        which no pillar of a lens should have.
     """
 
     diameter_um: Array
@@ -44,12 +44,11 @@ def longest_monotonic_branch(
     across_resonances: bool = False,
 ) -> MonotonicBranch:
     """The stretch of most phase over which, at all wavelengths, angles and
-    polarisations, |t| stays above
-    ``least_transmission``, the phase rises (of openings, which leave less film the
-    wider they are, falls), and no
-    resonance is narrower than ``least_half_width_um`` and no error bar above half of
-    |t|. With ``across_resonances`` it goes on behind narrow resonances, without the
-    entries nearer to one than ``least_half_width_um`` or two half-widths.
+    polarisations, |t| stays above ``least_transmission``, the phase rises (of openings,
+    which leave less film the wider they are, falls), and no resonance is narrower than
+    ``least_half_width_um`` and no error bar above half of |t|. With
+    ``across_resonances`` it goes on behind narrow resonances, without the entries
+    nearer to one than ``least_half_width_um`` or two half-widths.
 
     Args:
         library: the swept cell.

@@ -30,20 +30,18 @@ class CellStudy:
 
     pitches_um, heights_um, wavelengths_um: every combination.
     pillar: material of the pillars, on the substrate and under the cover of
-    :class:`metalens.cell.Cell`.
+        :class:`metalens.cell.Cell`.
     cell: any cell in its place: substrate, cover, shape, lattice, films, wall and
-    material of every pillar; its pitch
-        and height are those compared, and "diameter" is the size of its shape. Light is
-        along x, at normal incidence.
+        material of every pillar; its pitch and height are those compared, and
+        "diameter" is the size of its shape. Light is along x, at normal incidence.
     min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and
-    between two.
+        between two.
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end
-    a stretch.
+        a stretch.
     others: materials that the chosen cell is tried with as well, where their sources
-    hold all the wavelengths; [] for
-        none.
+        hold all the wavelengths; [] for none.
     """
 
     pitches_um: tuple[float, ...] = (
@@ -108,8 +106,9 @@ class CellVerdict:
     """One cell at one wavelength.
 
     turns: of phase that the longest smooth stretch covers; from_um, to_um: its
-    diameters.
-    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
+        diameters.
+    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in
+        phase.
     ends: what bounds it above.
     max_angle_deg: of incidence in air up to which no diffraction order propagates, in
         substrate or cover.
@@ -445,8 +444,7 @@ def best_cell(
     study: CellStudy, verdicts: list[CellVerdict]
 ) -> tuple[float, float] | None:
     """(pitch, height) in um that covers a full turn at every wavelength with most turns
-    at the worst of them, at the
-    least height; None where no cell does.
+    at the worst of them, at the least height; None where no cell does.
 
     Args:
         study: what is compared.

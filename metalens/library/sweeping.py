@@ -69,8 +69,8 @@ def _run(
     """The library of a sweep that was checked.
 
     Curves are solved at a few wavelengths and angles first; those that polynomials
-    between them do not give within
-    the tolerance are solved too, and single entries that are still above it one by one.
+    between them do not give within the tolerance are solved too, and single entries
+    that are still above it one by one.
     """
     console = console or Console(quiet=True)
     engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]

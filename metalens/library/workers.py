@@ -41,8 +41,7 @@ def curves_task(
     (:func:`metalens.library.curve.sample_adaptively`).
 
     Lights of one wavelength and direction share the mesh, and the homogeneous modes at
-    the diameters that every curve
-    begins with.
+    the diameters that every curve begins with.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -247,8 +246,8 @@ class SweepJournal:
     where it stopped.
 
     The first line names the work: its settings and what the files of its materials
-    hold. The journal of other work is
-    begun afresh, a line that is damaged or cut short is dropped.
+    hold. The journal of other work is begun afresh, a line that is damaged or cut short
+    is dropped.
 
     Args:
         path: None keeps nothing. about: records of settings that the tasks follow from.
