@@ -3,6 +3,7 @@ every other valley as good.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -261,9 +262,8 @@ def scan_parameter(
             image=best.image[few],
             slopes=best.slopes[:, few],
         )
-        sides = threads.run_each(
-            lambda sign, p=problem, h=here: _scan_side(p, h, i, sign), (-1, 1)
-        )
+        scan = functools.partial(_scan_side, problem, here, i)
+        sides = threads.run_each(scan, (-1, 1))
         stops = [*sides[0][::-1], here, *sides[1]]
         wall = np.array([math.inf, *(one.merit for one in stops), math.inf])
         low = np.flatnonzero((wall[1:-1] <= wall[:-2]) & (wall[1:-1] <= wall[2:]))

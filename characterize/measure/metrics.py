@@ -139,15 +139,14 @@ def strehl_ratio(psf: Array, ideal: Array) -> float:
     """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled
     alike.
 
-    Peaks come from parabolas through the highest samples, so that their place under the
+    Peaks come from a quintic spline through the samples, so that their place under the
     grid does not matter.
 
     Args:
         psf: (y, x) light, background taken off.
     """
-    return _peak(np.asarray(psf, float) / np.sum(psf)) / _peak(
-        np.asarray(ideal, float) / np.sum(ideal)
-    )
+    peaks = (find_peak(light)[2] / np.sum(light) for light in (psf, ideal))
+    return float(next(peaks) / next(peaks))
 
 
 def measure_spot(psf: Array, *, step_um: float) -> SpotMetrics:
@@ -285,33 +284,6 @@ def _within(light: Array, x: Array, y: Array, radius: float) -> float:
         np.minimum(x[column, None] + 0.5, chord),
     )
     return whole + float((light[row, column] * np.maximum(high - low, 0).mean(1)).sum())
-
-
-def _peak(light: Array) -> float:
-    row, column = np.unravel_index(int(light.argmax()), light.shape)
-    return _parabola(light, int(row), int(column))[0]
-
-
-def _parabola(light: Array, row: int, column: int) -> tuple[float, tuple[float, float]]:
-    """Height and place (dy, dx) of the top of parabolas along y and x through the
-    highest sample.
-    """
-    top, place = float(light[row, column]), []
-    height = top
-    for axis, (i, n) in enumerate(((row, light.shape[0]), (column, light.shape[1]))):
-        if not 0 < i < n - 1:
-            place.append(0.0)
-            continue
-        before, after = (
-            (light[i - 1, column], light[i + 1, column])
-            if axis == 0
-            else (light[row, i - 1], light[row, i + 1])
-        )
-        bend = before - 2 * top + after
-        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-        height += -0.125 * (before - after) ** 2 / bend if bend < 0 else 0.0
-        place.append(float(shift))
-    return float(height), (place[0], place[1])
 
 
 def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:

@@ -38,24 +38,19 @@ class AxisOperators:
     """Along one axis: nodes to coarse samples, ``to`` (coarse, nodes); coarse to fine
     samples, ``fine`` (fine, coarse).
 
-    Fields on coarse samples are less their carrier, so that ``fine`` is real;
-    ``carrier`` (fine,) puts it back.
-    moved: derivative of ``to`` by ``wave`` or ``distance``, per um, the carrier held.
+    Fields on coarse samples are less their carrier, which no intensity sees, so that
+    ``fine`` is real. moved: derivative of ``to`` by ``wave`` or ``distance``, per um, the carrier held.
     """
 
     to: Array
     fine: Array
-    carrier: Array
     moved: Callable[[str], Array]
 
     def of_kind(self, kind: Any) -> "AxisOperators":
         """In complex numbers of a kind."""
         moved = functools.cache(lambda name: self.moved(name).astype(kind))
         return AxisOperators(
-            self.to.astype(kind),
-            self.fine.astype(real_of(kind)),
-            self.carrier.astype(kind),
-            moved,
+            self.to.astype(kind), self.fine.astype(real_of(kind)), moved
         )
 
 
@@ -97,25 +92,15 @@ class WindowOperators:
     rest: CouplingTerms
     moved: Callable[[str], CouplingTerms]
 
-    def field(self, light: Array, tolerance: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or
-        with some left out.
-        """
-        return self.finer(self.coarse(light, tolerance))
-
     def coarse(self, light: Array, tolerance: float = 0.0) -> Array:
-        """As :meth:`field`, on the coarse samples."""
+        """(..., q, p) -> (..., Y, X) on the coarse samples, by all terms or with some
+        left out.
+        """
         return self._sum(light, ((self.y.to, self.x.to, self.rest, tolerance),))
 
-    def finer(self, coarse: Array) -> Array:
-        """(..., Y, X) on the window's samples of a field on the coarse ones."""
-        return np.asarray(
-            self.envelope(coarse) * (self.y.carrier[:, None] * self.x.carrier)
-        )
-
     def envelope(self, coarse: Array) -> Array:
-        """As :meth:`finer`, less the turns of the middle direction, which no intensity
-        sees.
+        """(..., Y, X) on the window's samples of a field on the coarse ones, less the
+        turns of the middle direction, which no intensity sees.
         """
         flat = coarse.reshape(-1, *coarse.shape[-2:])
         out = np.empty((len(flat), len(self.y.fine), len(self.x.fine)), coarse.dtype)
@@ -133,7 +118,7 @@ class WindowOperators:
     def rates(
         self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0
     ) -> Array:
-        """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or
+        """(..., q, p) -> (..., Y, X) derivative of the field by ``wave`` or
         ``distance`` per um, as an envelope.
 
         Less what turns places of the window by themselves, which no intensity sees.
@@ -256,9 +241,7 @@ def axis_operators(
         ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
         return np.asarray(1j * k * (ends[0] - ends[1]) / (2 * step_um) * value)
 
-    return coarse, AxisOperators(
-        value, weights, np.exp(1j * k * by(middle, at_um)), moved
-    )
+    return coarse, AxisOperators(value, weights, moved)
 
 
 def _nearby(
