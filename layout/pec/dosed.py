@@ -67,12 +67,17 @@ def correct(mask: MaskPlan, exposure: ExposureSettings) -> MaskPlan:
         exposure: point exposure, tolerance and number of doses.
 
     Raises:
-        ProcessError: as :func:`correct_plans`.
+        ProcessError: no plan; as :func:`correct_plans`.
 
     Accuracy:
         Edges of all shapes are at dose to size within the tolerance, as
         :func:`layout.verify.exposure.verify_exposure` finds.
     """
+    if not isinstance(mask, MaskPlan):
+        raise ProcessError(
+            f"{type(mask).__name__} is no plan: doses are found for plans of lenses; "
+            "lay a doses.csv beside a file made elsewhere"
+        )
     return correct_plans([mask], exposure)[0][0]
 
 
