@@ -75,5 +75,5 @@ def test_calls_name_arguments_that_exist(path):
 
 
 def test_a_call_with_an_unknown_argument_is_seen():
-    text = "from layout.mask import build\nmade = build.prepare_mask(lens, rules, dosed=False)\n"
-    assert _wrong_calls(text) == (1, [(2, "build.prepare_mask", ["dosed"])])
+    text = "from layout.mask import build\nmade = build.draw_mask(lens, rules, dosed=False)\n"
+    assert _wrong_calls(text) == (1, [(2, "build.draw_mask", ["dosed"])])

@@ -418,16 +418,6 @@ def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(
     )  # walls of 160 to 240 nm
 
 
-def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypatch):
-    table = build.plan(lens(), PROCESS, furnished=False)
-    monkeypatch.setattr(shaped, "_TABLED", 0)
-    by_sorting = build.plan(lens(), PROCESS, furnished=False)
-    assert [c.name for c in table.classes] == [c.name for c in by_sorting.classes]
-    np.testing.assert_array_equal(
-        table.lattices[0].whole(), by_sorting.lattices[0].whole()
-    )
-
-
 def test_all_edges_of_a_shape_move_by_the_bias_of_its_size():
     """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of
     both; no ratio of 240.
