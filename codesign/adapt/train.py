@@ -29,14 +29,12 @@ from codesign.adapt.source import (
     rows_of,
 )
 from codesign.batches import TEST
-from codesign.network import recalibrate_batch_norm
 from codesign.optics import MadeLens, PixelPsfStack, built
 from codesign.train import (
     FrameBatch,
     InnerConfig,
     LearningRateSchedule,
     LogRecord,
-    SceneSource,
     SensorFrames,
     Trainer,
     assess,
@@ -243,44 +241,6 @@ def run_job(
             checkpoint.save(path, {"trainer": going.state()}, settings=settings)
 
 
-def recalibrate_on_lenses(
-    going: Trainer, source: FinishedRun, *, batches: int = 8
-) -> None:
-    """Measure the batch statistics on training frames through the lenses that the
-    network was trained for.
-
-    Never on frames that judge: a network that nobody warned of the made lens knows none
-    of its images.
-
-    Args:
-        going: training with its network.
-        source: finished run: its network, lens and sensor. batches: how many batches.
-    """
-    frames = []
-    for number in range(batches):
-        made = going.light.stacks[number % len(going.light.stacks)]
-        step = _Step(going.scenes, number)
-        frames.append(assess.sensor_frames(going, step, 1, stack=made).frames)
-    recalibrate_batch_norm(going.model.net, source.architecture, frames)
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """One batch of scenes."""
-
-    scenes: SceneSource
-    number: int
-
-    @property
-    def margin(self) -> int:
-        """Samples around the frames."""
-        return self.scenes.margin
-
-    def batch(self, step: int, size: int) -> FrameBatch:
-        """The batch, whatever ``step``."""
-        return self.scenes.batch(self.number, size)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class TestFrames:
     """Frames that judge, rendered once for every case."""
@@ -328,7 +288,7 @@ def judge_network(
         source: finished run: its network, lens and sensor. config: of the retraining.
         stacks: PSFs of made lenses.
     """
-    recalibrate_on_lenses(going, source)
+    assess.recalibrate_network(going, source.architecture)
     frames = frames or render_test_frames(source, config)
     own, fine = [], []
     for made in stacks[: config.judge]:

@@ -18,7 +18,14 @@ from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior_parameters, psf_error
-from codesign.train import LogRecord, Trainer, checkpoint, device_of, place_on_device
+from codesign.train import (
+    LogRecord,
+    Trainer,
+    assess,
+    checkpoint,
+    device_of,
+    place_on_device,
+)
 from metalens import __version__, lens
 from metalens.core import config, reading, store
 from metalens.core.errors import TrainingError
@@ -255,7 +262,7 @@ def _keep(
     story: retrain_report.RetrainingResults,
 ) -> None:
     source, going = trained
-    retraining.recalibrate_on_lenses(going, source)
+    assess.recalibrate_network(going, source.architecture)
     cut = Subnet(going.model.net, source.architecture)
     checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
     retrain_report.write_retraining_page(folder / "report.html", story)

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 
 from codesign.adapt import FinishedRun
-from codesign.adapt import train as retraining
 from codesign.batches import EXPERIMENT, EyeScenes, as_batch, sensor_irradiance
 from codesign.evaluate.shown import AXIAL as AXIAL
 from codesign.evaluate.shown import LATERAL as LATERAL
@@ -44,7 +43,7 @@ from codesign.gaze import (
     face_angles,
     shared,
 )
-from codesign.network import losses, recalibrate_batch_norm
+from codesign.network import losses
 from codesign.optics import formed
 from codesign.train import Predictions, SensorFrames, assess, frame_wide, read_out
 from metalens.core.arrays import Array
@@ -380,11 +379,7 @@ def prepare_run(
             ``optics.image_tolerance``.
     """
     trainer = source.run.trainer
-    if source.made is None:
-        measured = assess.training_frames(trainer)
-        recalibrate_batch_norm(trainer.model.net, source.architecture, measured)
-    else:
-        retraining.recalibrate_on_lenses(trainer, source)
+    assess.recalibrate_network(trainer, source.architecture)
     settings, scenes = trainer.optics, source.settings.scenes
     seen = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin

@@ -2,6 +2,7 @@
 and shards of frames on disk.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,8 +45,7 @@ class SeparabilityTriplets:
     """Anchor, gaze+ and slip+ renderings of the same subjects (paper Sec. 3.6), and the
     steps between them.
 
-    gaze_step_rad, slip_step_um: the steps taken, along the motions that ``directions``
-    names.
+    gaze_step_rad, slip_step_um: the steps taken, across and along the camera's axis.
     """
 
     anchor: RenderedFrames
@@ -53,13 +53,11 @@ class SeparabilityTriplets:
     slip: RenderedFrames
     gaze_step_rad: float
     slip_step_um: float
-    directions: tuple[str, str]
 
 
 def render_triplets(
     states: EyeStates,
     *,
-    directions: tuple[str, str] = ("gaze_x", "slip_z"),
     gaze_step_rad: float = 3.5e-5,
     slip_step_um: float = 1.0,
     rig: CameraRig | None = None,
@@ -68,7 +66,7 @@ def render_triplets(
     """Finite-difference triplets in the linear regime, at one exposure.
 
     Args:
-        states: subjects with gaze and slippage. directions: a gaze and a slip motion.
+        states: subjects with gaze and slippage.
         gaze_step_rad: step of the gaze. slip_step_um: step of the slippage.
         rig: pose of camera and lamps; the default one without it.
         camera: pixel grid; the default one without it.
@@ -80,38 +78,29 @@ def render_triplets(
         um wide. At half a degree,
         where edges move by pixels, they are wrong by 40 % and more.
     """
-    kinds = {
-        "gaze_x": (0, 0),
-        "gaze_y": (0, 1),
-        "slip_x": (1, 0),
-        "slip_y": (1, 1),
-        "slip_z": (1, 2),
-    }
-    if directions[0] not in ("gaze_x", "gaze_y") or directions[1] not in (
-        "slip_x",
-        "slip_y",
-        "slip_z",
-    ):
-        raise SceneError(
-            f"directions {directions}: need a gaze and a slip, of {', '.join(kinds)}"
-        )
-    turn, move = (
-        torch.zeros(2, dtype=torch.float64),
-        torch.zeros(3, dtype=torch.float64),
+    motions = ("gaze_rad", 0, gaze_step_rad), ("slip_um", 2, slip_step_um)
+    anchor, gaze, slip = (
+        render(one, rig=rig, camera=camera, exposed=states)
+        for one in moved_states(states, motions)
     )
-    turn[kinds[directions[0]][1]] = gaze_step_rad
-    move[kinds[directions[1]][1]] = slip_step_um
-    turned, moved = (
-        replace(states, gaze_rad=states.gaze_rad + turn),
-        replace(states, slip_um=states.slip_um + move),
-    )
-    views = [
-        render(s, rig=rig, camera=camera, exposed=states)
-        for s in (states, turned, moved)
-    ]
-    return SeparabilityTriplets(
-        views[0], views[1], views[2], gaze_step_rad, slip_step_um, directions
-    )
+    return SeparabilityTriplets(anchor, gaze, slip, gaze_step_rad, slip_step_um)
+
+
+def moved_states(
+    states: EyeStates, motions: Sequence[tuple[str, int, float]]
+) -> list[EyeStates]:
+    """The states, then the same moved along every motion.
+
+    Args:
+        states: subjects with gaze and slippage.
+        motions: (field of the state, axis, step in rad or um) each.
+    """
+    out = [states]
+    for name, axis, step in motions:
+        values = getattr(states, name).clone()
+        values[:, axis] += step
+        out.append(replace(states, **{name: values}))
+    return out
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,5 +1,6 @@
 """How well a network reads frames that it never saw: slippage and pupil mask."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -108,12 +109,14 @@ def sensor_frames(
     *,
     stack: PixelPsfStack | None = None,
     optics: OpticsConfig | None = None,
+    first: int = 0,
 ) -> SensorFrames:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
     with fixed noise.
 
     Args:
-        optics: how the image is formed; as in training without it.
+        optics: how the image is formed; as in training without it. first: number of
+            the first batch.
         trainer: with lens, sensor and network as they are. scenes: frames by number.
         batches: how many batches.
     """
@@ -121,7 +124,7 @@ def sensor_frames(
     prepared: UniformImager | Imager | None = None
     pitch, wide, above = trainer.model.pitch_um, 1.0, ""
     pixels, masks, slips, depths = [], [], [], []
-    for number in range(batches):
+    for number in range(first, first + batches):
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
             given = (
@@ -226,13 +229,29 @@ def batched_frames(seen: SensorFrames) -> list[Tensor]:
 
 
 def training_frames(trainer: Trainer, *, batches: int = 8) -> list[Tensor]:
-    """Training frames through the lens as it is: batch statistics are measured on them,
-    never on frames that are scored.
+    """Training frames through the lens as it is, or through the made lenses that
+    training draws: what batch statistics are measured on, never frames that are scored.
 
     Args:
-        trainer: with lens, sensor and network as they are. batches: how many batches.
+        trainer: with lens, sensor and network as they are. batches: how many.
     """
-    return batched_frames(sensor_frames(trainer, trainer.scenes, batches))
+    stacks = trainer.light.stacks
+    if not stacks:
+        return batched_frames(sensor_frames(trainer, trainer.scenes, batches))
+    return [
+        sensor_frames(trainer, trainer.scenes, 1, stack=made, first=number).frames
+        for number, made in zip(range(batches), itertools.cycle(stacks), strict=False)
+    ]
+
+
+def recalibrate_network(trainer: Trainer, architecture: Architecture) -> None:
+    """Measure the batch statistics of one architecture on :func:`training_frames`.
+
+    Args:
+        trainer: with lens, sensor and network. architecture: whose statistics.
+    """
+    frames = training_frames(trainer)
+    recalibrate_batch_norm(trainer.model.net, architecture, frames)
 
 
 @torch.no_grad()

@@ -37,7 +37,7 @@ from codesign.network import Architecture, Prediction, blur, cost, losses, runni
 from codesign.optics import LensError, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.train import moving
-from codesign.train.ahead import Prefetcher, renderer_threads
+from codesign.train.ahead import prefetch, renderer_threads
 from codesign.train.evolution import Count, sample_sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
 from codesign.train.light import StepImaging
@@ -45,7 +45,7 @@ from codesign.train.moving import LearningRateSchedule, TrainedModel, make_model
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
-    render_triplets,
+    triplet_frames,
 )
 from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
@@ -279,14 +279,9 @@ class Trainer:
         threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        with Prefetcher(
-            self._batch, end=end, workers=renderer_threads(self.light.device)
-        ) as ahead:
-            while self.step < end:
-                batch = ahead.take(self.step)
-                with ahead.beside():
-                    record = self._advance(batch)
-                yield record
+        workers = renderer_threads(self.light.device)
+        for batch in prefetch(self._batch, range(self.step, end), workers=workers):
+            yield self._advance(batch)
 
     def state(self) -> dict[str, object]:
         """Everything that the next step depends on."""
@@ -461,7 +456,7 @@ class Trainer:
         if not every or self.triplets is None:
             return optics, depth_loss(made, self.optics, energy=self.inner.energy)
         found = fisher_separability(
-            render_triplets(self.triplets, config, step),
+            triplet_frames(self.triplets, config, step),
             lambda one: sensor_irradiance(one, optics, margin=self.scenes.margin),
             encircled_energy(
                 made.intensity,

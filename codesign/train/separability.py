@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from codesign.batches import EyeScenes
-from codesign.eye import EyeStates, render
+from codesign.eye import moved_states, render
 from metalens.core.errors import ConfigError
 from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
 from metalens.image import sensor as camera
@@ -95,22 +95,7 @@ class FisherSeparability:
         return torch.atan2((gaze * slip - both**2).clamp_min(0).sqrt(), both)
 
 
-def moved_states(states: EyeStates, config: SeparabilityConfig) -> list[EyeStates]:
-    """The anchors, then the same moved along every motion.
-
-    Args:
-        states: subjects with gaze and slippage.
-        config: motions, steps and weights of Eq. 6.
-    """
-    out = [states]
-    for name, axis, step in config.directions:
-        values = getattr(states, name).clone()
-        values[:, axis] += step
-        out.append(replace(states, **{name: values}))
-    return out
-
-
-def render_triplets(
+def triplet_frames(
     scenes: EyeScenes, config: SeparabilityConfig, step: int
 ) -> list[Frames]:
     """Frames of the anchors of a training step and of every motion, at the anchors'
@@ -122,7 +107,7 @@ def render_triplets(
     anchors = replace(scenes, stream=STREAM).states(step, config.triplets)
     return [
         render(one, rig=scenes.rig, camera=scenes.camera, exposed=anchors).frames
-        for one in moved_states(anchors, config)
+        for one in moved_states(anchors, config.directions)
     ]
 
 
@@ -138,7 +123,7 @@ def fisher_separability(
     """Eqs. 4 to 6 of triplets through a lens and its sensor; differentiable in both.
 
     Args:
-        frames: of :func:`render_triplets`. image: gives the irradiance (n, y, x) of
+        frames: of :func:`triplet_frames`. image: gives the irradiance (n, y, x) of
             frames on samples ``sample_um`` apart.
         encircled: share of the light that the lens keeps together, any shape.
         sensor: its pixels; their expected electrons are compared, without noise.

@@ -14,6 +14,7 @@ from codesign.adapt import correction
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
 from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
 from codesign.eye import render
+from codesign.train.ahead import prefetch
 from codesign.train.ambiguity import ambiguous_pairs
 
 ROOT = Path(__file__).parents[3]
@@ -73,3 +74,15 @@ def test_a_lens_is_trained_behind_a_network_and_a_loss_of_ones_own():
     phase_rad, losses = example["train"](network, steps=12)
     assert losses[-1] < 0.9 * losses[0]  # one batch of 16 frames, learned by heart
     assert int((phase_rad.abs() > 1e-3).sum()) == len(phase_rad)
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_frames_rendered_ahead_are_those_of_their_steps(workers):
+    scenes = EyeScenes(SceneConfig(pixels=32, margin=0), 36.0, 2000.0, seed=2)
+    steps = range(3, 8)
+    made = list(prefetch(lambda n: scenes.batch(n, 2), steps, workers=workers))
+    assert len(made) == len(steps)
+    for step, batch in zip(steps, made, strict=True):
+        assert torch.equal(batch.slip_mm, scenes.batch(step, 2).slip_mm)
+        want = scenes.batch(step, 2).frames.radiance
+        assert torch.equal(batch.frames.radiance, want)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from codesign.batches import EyeScenes, SceneConfig, sensor_irradiance
+from codesign.eye import moved_states
 from codesign.optics import stack as lens
 from codesign.optics.stack import OpticsConfig
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
-    moved_states,
-    render_triplets,
+    triplet_frames,
 )
 from metalens.core.errors import ConfigError
 from metalens.image import Sensor, encircled_energy
@@ -39,7 +39,7 @@ def test_the_fisher_matrix_is_the_plain_sum_over_pixels():
     """Pixels of two samples are means of four; images in units of the anchor's mean;
     per degree and mm; float32 differences of 1e-3 of the light: 1e-3 of the entries.
     """
-    frames = render_triplets(SCENES, CONFIG, 3)
+    frames = triplet_frames(SCENES, CONFIG, 3)
     light = [_pinhole(f).double().numpy() for f in frames]
     pixels = [f.reshape(2, 24, 2, 24, 2).mean((2, 4)) for f in light]
     level = pixels[0].mean((1, 2), keepdims=True)
@@ -68,7 +68,7 @@ def test_the_fisher_matrix_is_the_plain_sum_over_pixels():
 
 def test_motions_are_steps_of_one_coordinate_at_the_anchor_s_exposure():
     states = SCENES.states(0, 2)
-    _, gaze, *slips = moved_states(states, CONFIG)
+    _, gaze, *slips = moved_states(states, CONFIG.directions)
     assert torch.allclose(
         gaze.gaze_rad - states.gaze_rad,
         torch.tensor([math.radians(0.2), 0.0], dtype=torch.float64),
@@ -76,14 +76,14 @@ def test_motions_are_steps_of_one_coordinate_at_the_anchor_s_exposure():
     for axis, moved in enumerate(slips):
         step = (moved.slip_um - states.slip_um).numpy()
         assert step == pytest.approx(np.tile(40.0 * np.eye(3)[axis], (2, 1)))
-    axial = moved_states(states, replace(CONFIG, motions="axial"))
+    axial = moved_states(states, replace(CONFIG, motions="axial").directions)
     assert len(axial) == 3
     assert float((axial[2].slip_um - states.slip_um)[0, 2]) == pytest.approx(40.0)
 
 
 def test_the_loss_has_the_gradient_that_differences_say():
     """Central differences of 1e-2 rad; images in single precision: 2 %."""
-    frames = render_triplets(SCENES, CONFIG, 1)
+    frames = triplet_frames(SCENES, CONFIG, 1)
 
     def loss(coefficients):
         made = lens.lens_psf_stack(OPTICS, coefficients)
