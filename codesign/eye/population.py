@@ -258,7 +258,7 @@ class EyeStates:
         """(n,) values of one trait.
 
         Args:
-            name: of the entry.
+            name: of the trait.
         """
         return self.traits[:, list(POPULATION).index(name)]
 

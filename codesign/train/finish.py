@@ -234,7 +234,7 @@ def uncertainty_summary(
     width, depth of windows.
 
     Args:
-        name: of the entry. answers: of the network.
+        name: prefix of the keys. answers: of the network.
         seen: frames of the sensor with their truth.
         reach: conformal quantile, in standard deviations.
     """
