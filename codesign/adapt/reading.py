@@ -89,11 +89,14 @@ def measure_accuracy(answers: Predictions, seen: SensorFrames) -> NetworkAccurac
 def bootstrap_interval(
     values: Array, *, draws: int = 1000, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % percentile interval of the mean of (n,) values by the bootstrap.
+    """95 % percentile interval of the mean of (n,) values by the bootstrap; of a single
+    value the value itself.
 
     Args:
         values: to average. draws: resamples. seed: of them.
     """
+    if len(values) < 2:
+        return float(values[0]), float(values[0])
     ends = stats.bootstrap(
         (values,), np.mean, n_resamples=draws, method="percentile", rng=seed
     ).confidence_interval
@@ -103,7 +106,8 @@ def bootstrap_interval(
 def bootstrap_ratio(
     values: Array, reference: Array, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Ratio of two means and its 95 % percentile interval by the paired bootstrap.
+    """Ratio of two means and its 95 % percentile interval by the paired bootstrap; of a
+    single pair the ratio itself.
 
     Args:
         values, reference: (n,) of the same n subjects or scenes. draws: resamples.
@@ -113,8 +117,11 @@ def bootstrap_ratio(
     def ratio(one: Array, other: Array, axis: int = -1) -> Array:
         return np.asarray(one.mean(axis) / other.mean(axis))
 
+    whole = float(ratio(values, reference))
+    if len(values) < 2:
+        return whole, whole, whole
     ends = stats.bootstrap(
         (values, reference), ratio, n_resamples=draws, paired=True,
         method="percentile", rng=seed,
     ).confidence_interval  # fmt: skip
-    return float(ratio(values, reference)), float(ends.low), float(ends.high)
+    return whole, float(ends.low), float(ends.high)

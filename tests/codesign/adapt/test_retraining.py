@@ -121,6 +121,12 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     )  # 95 %, with the spread of 200 trials and the bootstrap's own bias
 
 
+def test_a_single_subject_has_its_own_value_for_an_interval():
+    one, other = np.array([3.0]), np.array([1.5])
+    assert reading.bootstrap_interval(one) == (3.0, 3.0)
+    assert reading.bootstrap_ratio(one, other) == (2.0, 2.0, 2.0)
+
+
 def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(found):
     assert found.known
     assert len(found.drawn) == 2
