@@ -33,7 +33,7 @@ from metalens.image import (
     imager,
     uniform_imager,
 )
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import Source
 
 torch.set_num_threads(2)

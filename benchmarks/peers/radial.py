@@ -18,7 +18,7 @@ from scipy.special import j0
 from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.core.paths import source_path
+from metalens.optics.paths import source_path
 from metalens.propagate import PropagationCase
 from metalens.propagate.estimate import SAFETY, draw_pixels, sampled_square_error
 

@@ -15,8 +15,9 @@ from metalens.design import Focus, profiles
 from metalens.image import Frames, Grid, Optics, PillarWave, SmoothWave, Window, imager
 from metalens.image.left_out import Judged, neglected, unpolarised
 from metalens.image.plan import spectral
-from metalens.lens import DiameterMap, Layers, Lens
+from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
+from metalens.optics import Layers
 from metalens.psf import Source, SpectralNodes, spectrum
 
 FRAMES = 8

@@ -41,7 +41,8 @@ from metalens.image import (
     psfs,
     uniform_imager,
 )
-from metalens.lens import Layers, Lens
+from metalens.lens import Lens
+from metalens.optics import Layers
 from metalens.psf import PsfStack, Source, View, from_lens, spectrum
 
 PITCH, COUNT, WAVELENGTH = 0.4, 3600, 0.85

@@ -28,7 +28,8 @@ from characterize.model import (
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import CDError, ResponseError, WavefrontError, maps, named
-from metalens.lens import Lens, Stop
+from metalens.lens import Lens
+from metalens.optics import Stop
 
 _STITCH_UM = 0.05
 _STOP_UM = 3.0

@@ -9,7 +9,8 @@ import numpy as np
 
 from metalens.core import legendre
 from metalens.core.arrays import Array
-from metalens.lens import DiameterMap, Stop
+from metalens.lens import DiameterMap
+from metalens.optics import Stop
 
 
 def even_nodes(count: int, pull: float, low: float, high: float) -> Array:

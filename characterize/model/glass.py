@@ -13,8 +13,8 @@ from numpy.polynomial import chebyshev
 from characterize.model.parameters import PLACE
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.core.paths import sensor_path
-from metalens.lens import Layers, media
+from metalens.optics import Layers, media
+from metalens.optics.paths import sensor_path
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache

@@ -22,7 +22,7 @@ from scipy.special import spherical_jn
 from characterize.model.glass import AIR, FilmStack
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.core.paths import hypot_minus_length
+from metalens.optics.paths import hypot_minus_length
 
 # least tolerance of a field that single precision holds: :func:`least_tolerance` of
 # 4000 columns is 4e-5
@@ -39,7 +39,7 @@ class CompressedKernel:
     """d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) of one wavelength and distance.
 
     Through films r is the path of the ray, and d / r² is √(passed / spread) of
-    :mod:`metalens.lens.media`.
+    :mod:`metalens.optics.media`.
 
     p, q: spans of direction cosines of the lens seen from the window's centre, at the
     nominal distance.

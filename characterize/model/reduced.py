@@ -43,7 +43,8 @@ from characterize.model.window import (
 from metalens.core import legendre, threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.lens import Lens, media
+from metalens.lens import Lens
+from metalens.optics import media
 
 Axes = tuple[Array, Array]
 _KEPT = 12  # operators: of a place that each of some threads is at

@@ -21,7 +21,6 @@ from characterize.inference import AsBuilt
 from characterize.model import PLACE, parameter_vector, process_state_of
 from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from metalens.core.arrays import Array
-from metalens.core.paths import path_difference, sensor_path, source_path
 from metalens.design import Focus, profiles
 from metalens.fabrication import (
     PERTURBATIONS,
@@ -42,6 +41,7 @@ from metalens.image import (
     view,
 )
 from metalens.lens import Lens
+from metalens.optics.paths import path_difference, sensor_path, source_path
 
 OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")
 TABLE_STEP_UM = 1e-5  # of the table of t over the diameter

@@ -36,7 +36,7 @@ from metalens.image import (
     with_psfs,
 )
 from metalens.image import imager as field_imager
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import Source
 
 There = tuple[

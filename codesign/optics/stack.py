@@ -31,7 +31,6 @@ from codesign.optics.lens_errors import (
 from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.core.paths import source_path
 from metalens.design import Focus, PhaseOf, profiles
 from metalens.image import (
     Field,
@@ -47,8 +46,9 @@ from metalens.image import (
     uniform_imager,
     view,
 )
-from metalens.lens import Layers
 from metalens.library import DEFAULT_CELL, Proxy
+from metalens.optics import Layers
+from metalens.optics.paths import source_path
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,8 @@ from metalens.aberrations.waves import (
 )
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import Lens, media, reach
+from metalens.lens import Lens, reach
+from metalens.optics import media
 from metalens.psf import passed_um2
 
 SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are given
@@ -236,7 +237,7 @@ def vignetted_share(
     without a stop.
 
     Shares of patches of the pillars' plane that the hole lights
-    (:meth:`metalens.lens.Layers.lit`); the light is taken
+    (:meth:`metalens.optics.Layers.lit`); the light is taken
     as even there, as PSFs take it.
 
     Accuracy: 1e-4, and that of sites at the rim of the lens.

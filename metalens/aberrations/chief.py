@@ -3,7 +3,7 @@ it.
 
 Behind the pillars light goes on along p = p_in + grad φ / k (n sin θ as a vector) and
 meets the sensor at
-X = x + b(p) p, b = Σ t / √(n² - p²) over the media behind (:mod:`metalens.lens.media`).
+X = x + b(p) p, b = Σ t / √(n² - p²) over the media behind (:mod:`metalens.optics.media`).
 Close rays, with Q = ∂p/∂x on
 the pillars and B = ∂(b p)/∂p:
 
@@ -27,8 +27,9 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import Lens, media
-from metalens.lens.media import Media
+from metalens.lens import Lens
+from metalens.optics import media
+from metalens.optics.media import Media
 from metalens.psf import library_incidence
 
 ZONES = 2.0  # radius of the pillars that are looked at, in √(wavelength focal length)

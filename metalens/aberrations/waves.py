@@ -25,8 +25,9 @@ import torch
 
 from metalens import propagate
 from metalens.core.arrays import Array
-from metalens.lens import Lens, media
-from metalens.lens.media import Media
+from metalens.lens import Lens
+from metalens.optics import media
+from metalens.optics.media import Media
 from metalens.propagate import paths
 from metalens.psf import SpectralNodes, all_maps
 

@@ -35,9 +35,10 @@ from metalens.design import (
     check_focus,
 )
 from metalens.design.free_form import FisherSettings, ResolvedFisherSettings
-from metalens.lens import Layers, Lens, check_gaps
+from metalens.lens import Lens
 from metalens.lens import picture as lens_plot
 from metalens.library import PillarLibrary, axes
+from metalens.optics import Layers, check_gaps
 from metalens.psf import FocusMetrics
 
 if TYPE_CHECKING:

@@ -16,8 +16,9 @@ from metalens.design import (
     PhaseOf,
     Quality,
 )
-from metalens.lens import Layers, Lens
+from metalens.lens import Lens
 from metalens.library import Proxy
+from metalens.optics import Layers
 from metalens.psf import FocusMetrics
 
 

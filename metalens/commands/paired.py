@@ -19,8 +19,9 @@ from metalens.design import (
     PhaseOf,
     PolarizationMetrics,
 )
-from metalens.lens import Layers, Lens, check_gaps
+from metalens.lens import Lens
 from metalens.library import axes
+from metalens.optics import Layers, check_gaps
 from metalens.psf import FocusMetrics
 
 BOTH: tuple[Literal["x", "y"], ...] = ("x", "y")

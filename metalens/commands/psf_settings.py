@@ -13,7 +13,8 @@ from metalens import design, lens, propagate, psf
 from metalens.core import config
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.lens import Layers, reach
+from metalens.lens import reach
+from metalens.optics import Layers
 from metalens.psf import spectrum as spectra
 
 MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000

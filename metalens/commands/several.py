@@ -10,8 +10,9 @@ from metalens import design
 from metalens.commands import design_words as words
 from metalens.core.errors import ConfigError
 from metalens.design import FocusCheck, Quality, WavelengthTarget
-from metalens.lens import Layers, Lens
+from metalens.lens import Lens
 from metalens.library import PillarLibrary
+from metalens.optics import Layers
 from metalens.psf import FocusMetrics
 
 

@@ -5,7 +5,6 @@ from . import executor as executor
 from . import legendre as legendre
 from . import lock as lock
 from . import manifest as manifest
-from . import paths as paths
 from . import reading as reading
 from . import records as records
 from . import report as report

@@ -10,7 +10,8 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.design.profiles import Focus, hyperbolic_phase
 from metalens.design.sites import PhaseOf
-from metalens.lens import Lens, media
+from metalens.lens import Lens
+from metalens.optics import media
 
 RAYS = 25  # along an axis
 _APART = (

@@ -15,8 +15,8 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, LensError
-from metalens.core.paths import path_difference, source_path
-from metalens.lens import Layers, check_gaps, media
+from metalens.optics import Layers, check_gaps, media
+from metalens.optics.paths import path_difference, source_path
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,7 @@
 """Compiled loops: light on the nodes of a pupil, and pillars averaged over cells."""
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -8,10 +10,9 @@ from metalens.core.threads import run_split
 from metalens.lens import answers
 from metalens.propagate import sincos_turns32
 
-PART, put = (
-    answers.PART,
-    answers.evaluate_row,
-)  # compiled loops know names of their own module
+# compiled loops know names of their own module
+PART: int = answers.PART
+put: Any = answers.evaluate_row
 
 
 def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:

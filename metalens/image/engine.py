@@ -22,7 +22,8 @@ from metalens.image.stray import stray_of
 from metalens.image.texture import CONTRAST, scene_error
 from metalens.image.through import through
 from metalens.image.waves import PillarWave, SmoothWave, Wave, wave_of
-from metalens.lens import Layers, Lens
+from metalens.lens import Lens
+from metalens.optics import Layers
 from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
 from metalens.psf import spectrum as spectra
 

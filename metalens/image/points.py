@@ -30,7 +30,7 @@ from metalens.image import compiled, polarised
 from metalens.image.rays import Paths, Rays, landing, rays, source_paths, through_stop
 from metalens.image.scene import plain
 from metalens.image.waves import Wave
-from metalens.lens import Layers, media
+from metalens.optics import Layers, media
 from metalens.psf import VectorPupil, dominant_components
 
 SPARE = 1.06  # period of the nodes per width of the window

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import PropagationError
-from metalens.core.paths import path_difference, sensor_path, source_path
+from metalens.optics.paths import path_difference, sensor_path, source_path
 
 
 @dataclass(frozen=True, slots=True)

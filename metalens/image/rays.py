@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.lens import Layers, Media, media, smooth
+from metalens.optics import Layers, Media, interpolant, media
 
 VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 FEW = 24  # rays along an axis that tell where the light behind a stop lands
@@ -298,12 +298,14 @@ def _each(
             away2 = (x - sx) ** 2 + (y - sy) ** 2
             away2 = away2.clamp(max=float((away2 * (seen.whole > 0)).max()))
             out.append(
-                smooth.chebyshev_interpolant(functools.partial(_chord, before), away2)
+                interpolant.chebyshev_interpolant(
+                    functools.partial(_chord, before), away2
+                )
                 - chief
             )
     return torch.stack(out)
 
 
 def _chord(before: Media, away2: Any) -> Any:
-    """:func:`metalens.lens.media.chord` of the squared reach; NumPy or torch."""
+    """:func:`metalens.optics.media.chord` of the squared reach; NumPy or torch."""
     return media.chord(before, away2**0.5)

@@ -21,7 +21,8 @@ from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.image import compiled
 from metalens.image.scene import values
-from metalens.lens import Layers, Lens, Media, answers, media, smooth
+from metalens.lens import Lens, answers
+from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import among
 
 # over which pillars are averaged at most: below a zone of the lens, far above the pitch
@@ -355,7 +356,7 @@ def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
 def _longer(between: Media, r2: Tensor) -> Tensor:
     """Optical path of the ray of squared reach r² less that along the normal, um."""
     if len(between.layers) > 1:
-        extra: Tensor = smooth.chebyshev_interpolant(
+        extra: Tensor = interpolant.chebyshev_interpolant(
             lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2
         )
         return extra

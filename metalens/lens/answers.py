@@ -19,7 +19,7 @@ Polynomials = tuple[
     float, float, int, float, Array, Array
 ]  # scale, shift, power, ceiling, monomials of φ and |T|
 PART = 512  # pillars of a row at a time
-FASTMATH = {"contract", "nsz", "reassoc"}
+FASTMATH: set[str] = {"contract", "nsz", "reassoc"}
 
 
 def fill_response(

@@ -5,8 +5,8 @@ it does, from its own focus.
 import math
 from dataclasses import dataclass, field
 
-from metalens.lens.layers import Layers
 from metalens.lens.record import Lens
+from metalens.optics.layers import Layers
 
 # at the rim, at both ends of the range: the blur is then 3.5 wavelength / NA in radius
 DEFOCUS_WAVES = 1.75

@@ -17,10 +17,12 @@ from metalens.core.errors import LensError
 from metalens.core.reading import read_hdf5, typed_reader
 from metalens.core.store import Provenance
 from metalens.lens.diameters import DiameterMap as DiameterMap
-from metalens.lens.layers import Layers, check_gaps
 from metalens.lens.neighbours import NeighbourRows
 from metalens.lens.pairs import TwoSizeTable
 from metalens.library import Proxy
+from metalens.optics.aperture_stop import Stop as Stop
+from metalens.optics.layers import Layers as Layers
+from metalens.optics.layers import check_gaps
 
 _NAME = "diameter_um"
 Hand = Literal["", "left", "right"]

@@ -14,7 +14,7 @@ from numpy.polynomial import chebyshev
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.threads import run_split
-from metalens.lens import Media, media
+from metalens.optics import Media, media
 from metalens.propagate.geometry import PropagationCase, check_aperture
 from metalens.propagate.paths import from_source, ray_amplitude
 from metalens.propagate.sincos import sincos_turns64

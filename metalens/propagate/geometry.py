@@ -16,7 +16,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import Media
+from metalens.optics import Media
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.core.arrays import Array
-from metalens.lens import media
+from metalens.optics import media
 from metalens.propagate.geometry import PropagationCase
 from metalens.propagate.paths import from_source, ray_cosines, reference_depth
 

@@ -7,7 +7,7 @@ The field of a point behind films is the sum of its plane waves about the ray,
 
 L the optical path of the ray, spread the area on the sensor per area of p = n sin θ,
 passed the power that the faces
-let through, C what all waves add to the stationary phase (:mod:`metalens.lens.waves`).
+let through, C what all waves add to the stationary phase (:mod:`metalens.optics.media`).
 In one medium C = 1 and that is
 d/(2πr²)(1/r - ik) exp(ikr) itself.
 
@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from metalens.core.arrays import Array
-from metalens.core.paths import hypot_minus_length, sensor_path
-from metalens.lens import Media, media, saddle_correction
+from metalens.optics import Media, media, saddle_correction
+from metalens.optics.paths import hypot_minus_length, sensor_path
 from metalens.propagate.geometry import PropagationCase
 
 SOME = 32  # pillars along an axis whose rays tell what films leave out

@@ -17,7 +17,7 @@ import numpy as np
 
 from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers, Media, media
+from metalens.optics import Layers, Media, media
 from metalens.propagate.choice import MethodChoice, choose_method
 from metalens.propagate.direct import angular_spectrum as _angular_spectrum
 from metalens.propagate.direct import field_at, field_exact

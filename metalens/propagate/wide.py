@@ -30,7 +30,7 @@ import torch
 from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import media
+from metalens.optics import media
 from metalens.propagate.geometry import PropagationCase
 from metalens.propagate.grids import WideAxis, grid_um, spread_weights, wide_axes
 from metalens.propagate.operators import depth_basis

@@ -17,7 +17,8 @@ import numpy as np
 from scipy.special import jv
 
 from metalens.core.arrays import Array
-from metalens.lens import CURVED, Lens, NeighbourRows, media
+from metalens.lens import CURVED, Lens, NeighbourRows
+from metalens.optics import media
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:

@@ -10,7 +10,7 @@ import torch
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers, media
+from metalens.optics import Layers, media
 from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import extended
 from metalens.psf.among import NeighbourJonesFactors

@@ -18,8 +18,8 @@ from scipy import fft, sparse, special
 
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.core.paths import source_path
 from metalens.lens import Lens
+from metalens.optics.paths import source_path
 from metalens.psf.of_lens import library_incidence
 
 MOST_SITES = 25_000_000  # 5000 x 5000: 1.5 GB

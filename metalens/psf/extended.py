@@ -25,7 +25,7 @@ from scipy.special import j1, jv
 from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
-from metalens.lens import media
+from metalens.optics import media
 from metalens.propagate import PropagationCase
 from metalens.psf.cells import MOST, nyquist_um
 from metalens.psf.record import SourceShape

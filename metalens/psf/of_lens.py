@@ -13,7 +13,8 @@ from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.store import Provenance
-from metalens.lens import Lens, answers, media
+from metalens.lens import Lens, answers
+from metalens.optics import media
 from metalens.propagate import paths
 from metalens.psf import among
 from metalens.psf import spectrum as spectra

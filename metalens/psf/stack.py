@@ -11,7 +11,8 @@ import torch
 from metalens import propagate
 from metalens.core.arrays import Array, to_tensor
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers, NeighbourRows
+from metalens.lens import NeighbourRows
+from metalens.optics import Layers
 from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import among
 from metalens.psf.among import NeighbourJonesFactors

@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from metalens.core.arrays import Array
-from metalens.lens import media
+from metalens.optics import media
 from metalens.propagate import (
     PropagationCase,
     Pupils,

@@ -21,9 +21,9 @@ from characterize.model.setting import FrameSetting
 from metalens import design, profiles
 from metalens.cell.record import Cell, Film, Index
 from metalens.fabrication import Sensitivity
-from metalens.lens import Layers
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers
 
 DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)
 VALUES = {

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell.record import Film, Index
-from metalens.lens import Layers
+from metalens.optics import Layers
 
 
 @dataclass(frozen=True)

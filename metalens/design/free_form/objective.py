@@ -9,7 +9,6 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from metalens.core.paths import path_difference
 from metalens.design.free_form.settings import ProcessVariation, ResolvedFisherSettings
 from metalens.image import (
     Field,
@@ -19,6 +18,7 @@ from metalens.image import (
     pixel_information,
 )
 from metalens.image import pupil as pupils
+from metalens.optics.paths import path_difference
 
 CLIMB_IMAGES = (
     4  # of a step, at least two an angle: more noise, but more steps in the same time

@@ -24,7 +24,7 @@ from characterize.model.glass import AIR, FilmStack
 from characterize.model.parameters import NAMES, KnownValue, parameter_vector
 from metalens import design, profiles
 from metalens.cell import Cell, Film, Index
-from metalens.lens import Layers
+from metalens.optics import Layers
 
 DISTANCE, WAVELENGTH = 117.0, 0.85
 FRONT, BEHIND = ((1.45, 63.0),), ((1.52, 31.0), (1.38, 18.0))

@@ -22,8 +22,8 @@ from metalens.cli import main
 from metalens.core.errors import LensError
 from metalens.design import Focus
 from metalens.fabrication import Spread, State, draws
-from metalens.lens import Layers
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers
 from tests.codesign import made_lens as m
 
 SLOPE = 55.0  # rad / um: phase over diameter, a straight line

@@ -21,8 +21,8 @@ from metalens.design.profiles import DoubleHelix, Focus
 from metalens.image import pupil as pupils
 from metalens.image.information import axial_information
 from metalens.image.pupil import Pupil
-from metalens.lens import Layers, Stop
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers, Stop
 
 RADIUS_UM = 150.0
 # pillars that give the phase of their diameter exactly: 3 turns over the domain, no

@@ -17,7 +17,7 @@ from metalens.cell import Film, Index
 from metalens.core.errors import SceneError
 from metalens.core.store import Provenance
 from metalens.design import Focus
-from metalens.lens import Layers
+from metalens.optics import Layers
 from tests.codesign import made_lens as m
 
 CAMERA = PinholeCamera(24, 3.0)

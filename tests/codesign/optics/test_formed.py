@@ -19,7 +19,7 @@ from metalens.image import Frames, Imager, UniformImager, normalised, textured_f
 from metalens.image.forming import with_psfs
 from metalens.image.plan import spectral
 from metalens.image.slopes import drawn, term
-from metalens.lens import Layers, Stop
+from metalens.optics import Layers, Stop
 
 SMALL = OpticsConfig(
     aperture_mm=0.3, sensor_distance_mm=2.0, focus_mm=30.0, polynomials=9, depths_mm=(16.0, 30.0), depth_count=6,

@@ -22,9 +22,9 @@ from layout.study import page as study_page
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.core.errors import MaskFileError, ProcessError
-from metalens.lens import Layers, Stop
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers, Stop
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,9 @@ from layout.study import focus
 from layout.study.focus import FocusWindow
 from metalens.cell import Cell, Film, Index
 from metalens.core.errors import PropagationError
-from metalens.lens import DiameterMap, Layers, Lens, Stop
+from metalens.lens import DiameterMap, Lens
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers, Stop
 from tests.referees import films, plain_sum
 
 RNG = np.random.default_rng(4)

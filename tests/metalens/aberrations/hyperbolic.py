@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from metalens.cell import Cell, Film, Index
-from metalens.lens import DiameterMap, Layers, Lens, Stop
+from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
+from metalens.optics import Layers, Stop
 from tests.referees import ray_trace
 
 WAVE, PITCH, RADIUS = 0.85, 0.42, 62.0

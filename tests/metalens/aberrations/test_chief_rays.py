@@ -9,7 +9,7 @@ import pytest
 
 from metalens.aberrations import chief_ray
 from metalens.core.errors import PropagationError
-from metalens.lens import Stop
+from metalens.optics import Stop
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, WAVE, made
 
 ANGLES = (0.0, 7.0, -16.0)

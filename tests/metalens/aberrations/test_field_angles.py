@@ -10,7 +10,7 @@ import pytest
 from metalens.aberrations import frequencies_per_mm, over_field
 from metalens.aberrations.angles import vignetted_share
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers, Stop
+from metalens.optics import Layers, Stop
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, RADIUS, WAVE, made
 
 ANGLES = (-14.0, 0.0, 9.0)

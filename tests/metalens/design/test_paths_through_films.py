@@ -8,7 +8,7 @@ import pytest
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.lens import Layers
+from metalens.optics import Layers
 
 
 def longer(layers, radius):

@@ -22,7 +22,7 @@ from metalens.image import (
     imager,
     psfs,
 )
-from metalens.lens import Layers, Stop
+from metalens.optics import Layers, Stop
 from metalens.psf import SpectralNodes
 
 DISTANCE, RADIUS, STEP, SAMPLES, MARGIN = 600.0, 90.0, 10.0, 14, 4

@@ -12,7 +12,7 @@ import torch
 from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.image import Frames, Grid, Optics, SmoothWave, imager, plan
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import Source, spectrum
 from tests.referees.true_image import Referee
 

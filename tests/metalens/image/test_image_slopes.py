@@ -21,7 +21,7 @@ from metalens.image import (
     with_psfs,
 )
 from metalens.image.slopes import term
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import SpectralNodes
 
 RADIUS = 40.0

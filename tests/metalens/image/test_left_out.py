@@ -12,7 +12,7 @@ from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window, psfs
 from metalens.image.left_out import Judged, folded, polarised, unpolarised
 from metalens.image.texture import texture_error
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import SpectralNodes
 
 WAVE, DISTANCE = 0.85, 33.0

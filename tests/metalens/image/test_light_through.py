@@ -17,8 +17,8 @@ from metalens.image.engine import normalised
 from metalens.image.plan import Plan
 from metalens.image.points import psfs
 from metalens.image.through import through
-from metalens.lens import Layers, Stop
 from metalens.library import Proxy
+from metalens.optics import Layers, Stop
 from metalens.psf import SpectralNodes, View, from_lens
 
 GLASS = Layers(behind=(Film(Index(1.7), 110.0),))

@@ -21,7 +21,7 @@ from metalens.image import (
     uniform_imager,
 )
 from metalens.image.points import Optics
-from metalens.lens import Layers
+from metalens.optics import Layers
 from tests.elsewhere import AWAY, elsewhere
 
 FOCUS = Focus(0.94, 900.0, 7e3)

@@ -16,8 +16,9 @@ from metalens.core.errors import SceneError
 from metalens.design import Focus, profiles
 from metalens.image import Grid, Optics, PillarWave, Window, imager, left_out, psfs
 from metalens.image.texture import texture_error
-from metalens.lens import DiameterMap, Layers, Lens, NeighbourRows
+from metalens.lens import DiameterMap, Lens, NeighbourRows
 from metalens.library import Proxy
+from metalens.optics import Layers
 from metalens.psf import View, from_lens, integrate_pixels
 
 PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15

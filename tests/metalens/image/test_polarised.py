@@ -18,7 +18,7 @@ from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psf
 from metalens.image.polarised import factors
 from metalens.image.rays import Rays
 from metalens.image.texture import texture_error
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import (
     VectorPupil,
     dominant_components,

@@ -11,7 +11,7 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.image import Grid, stray
-from metalens.lens import Layers, Stop
+from metalens.optics import Layers, Stop
 
 GRID = Grid((76, 106), 7.0, (20e3, 90e3), margin=4, window=15)  # a frame of 90 x 120
 D, FOCUS, DEPTH, RADIUS = 2000.0, 21e3, 30e3, 60.0

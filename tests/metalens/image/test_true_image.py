@@ -25,7 +25,7 @@ from metalens.image import (
     with_psfs,
 )
 from metalens.image.texture import texture_error
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import SpectralNodes
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

@@ -12,7 +12,7 @@ import torch
 
 from metalens.design import Focus
 from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
-from metalens.lens import Layers, Stop
+from metalens.optics import Layers, Stop
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee

@@ -11,8 +11,8 @@ from metalens import design, lens, psf
 from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import LensError, PropagationError
 from metalens.design import Focus, check_focus
-from metalens.lens import Layers, Stop
 from metalens.library.proxy import Proxy
+from metalens.optics import Layers, Stop
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45), cover=Index(1.21))
 GLASS = Film(Index(1.52), 60.0)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Film, Index
-from metalens.lens import DiameterMap, Layers, Lens, Stop, reach
+from metalens.lens import DiameterMap, Lens, reach
 from metalens.library import Proxy
+from metalens.optics import Layers, Stop
 
 PROXY = Proxy(
     np.array([[3.0, 2.8, 0.3]]),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.lens import smooth
+from metalens.optics import interpolant
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> Non
         return (height**2 + u) ** 0.5
 
     u = torch.linspace(0.2, 600.0, 3000, dtype=torch.float64) ** 2
-    found = smooth.chebyshev_interpolant(root, u.reshape(3, 1, -1))
+    found = interpolant.chebyshev_interpolant(root, u.reshape(3, 1, -1))
     assert sum(asked) == most
     assert found.shape == (3, 1, 1000)
     want = np.sqrt(np.longdouble(height) ** 2 + u.numpy().astype(np.longdouble))
@@ -36,13 +36,13 @@ def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> Non
 def test_what_no_polynomial_reaches_is_taken_as_it_is() -> None:
     u = np.linspace(0.0, 600.0, 2000) ** 2
     np.testing.assert_array_equal(
-        smooth.chebyshev_interpolant(np.sqrt, u), np.sqrt(u)
+        interpolant.chebyshev_interpolant(np.sqrt, u), np.sqrt(u)
     )  # singular at its end
     few = np.array([0.3, 7.1, 2.2])
     np.testing.assert_array_equal(
-        smooth.chebyshev_interpolant(np.cbrt, few), np.cbrt(few)
+        interpolant.chebyshev_interpolant(np.cbrt, few), np.cbrt(few)
     )
     alike = np.full(2000, 2.7)
     np.testing.assert_array_equal(
-        smooth.chebyshev_interpolant(np.cbrt, alike), np.cbrt(alike)
+        interpolant.chebyshev_interpolant(np.cbrt, alike), np.cbrt(alike)
     )

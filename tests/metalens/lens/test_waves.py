@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from metalens.lens import Media, media, saddle_correction
-from metalens.lens.waves import WAVES, SaddleCorrection, plane_wave_correction
+from metalens.optics import Media, media, saddle_correction
+from metalens.optics.media import WAVES, SaddleCorrection, plane_wave_correction
 from tests.referees import films
 
 # media from pillars to sensor, wavelength, n sin θ of the ray in units of the rarest

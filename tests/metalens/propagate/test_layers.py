@@ -17,7 +17,7 @@ import torch
 from metalens import propagate, psf
 from metalens.cell import Film, Index
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers, Media, media
+from metalens.optics import Layers, Media, media
 from metalens.propagate import PropagationCase
 from metalens.propagate.paths import (
     chief_path,

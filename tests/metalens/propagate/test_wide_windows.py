@@ -10,7 +10,7 @@ import torch
 
 from metalens import propagate, psf
 from metalens.core.errors import PropagationError
-from metalens.lens import Media
+from metalens.optics import Media
 from metalens.propagate import grids, wide
 
 PITCH, WAVELENGTH, DISTANCE = 0.43, 0.87, 430.0

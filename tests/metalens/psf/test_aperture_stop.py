@@ -17,7 +17,8 @@ from metalens.core.errors import ConfigError, PropagationError
 from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window
 from metalens.image.points import psfs
-from metalens.lens import DiameterMap, Layers, Lens, Stop, TwoSizeTable, media
+from metalens.lens import DiameterMap, Lens, TwoSizeTable
+from metalens.optics import Layers, Stop, media
 from metalens.psf import Extent, View, blur_um, from_lens, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0

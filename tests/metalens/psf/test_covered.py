@@ -11,7 +11,7 @@ import pytest
 from scipy import optimize
 
 from metalens.cell import Film, Index
-from metalens.lens import Layers, Media
+from metalens.optics import Layers, Media
 from metalens.propagate import PropagationCase
 from metalens.psf import of_lens, vector
 

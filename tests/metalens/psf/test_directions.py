@@ -12,8 +12,9 @@ from scipy import special
 from metalens import lens as lenses
 from metalens.cell import Cell, Film, Index, Lattice
 from metalens.core.errors import PropagationError
-from metalens.lens import DiameterMap, Layers, Lens, Stop
+from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
+from metalens.optics import Layers, Stop
 from metalens.psf import directions, far_field
 from tests.referees import plain_sum
 

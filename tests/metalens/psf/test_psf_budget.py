@@ -14,7 +14,7 @@ import torch
 from metalens import propagate, psf
 from metalens.core import store
 from metalens.core.errors import PropagationError
-from metalens.lens import Layers
+from metalens.optics import Layers
 from metalens.psf import of_lens, spectrum
 from metalens.psf.cells import nyquist_um
 from tests.referees import vectorial

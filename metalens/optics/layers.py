@@ -12,9 +12,8 @@ import numpy as np
 from metalens.cell import Film, Index, Material, index
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, PropagationError
-from metalens.lens import media
-from metalens.lens.media import Media
-from metalens.lens.stop import (
+from metalens.optics import media
+from metalens.optics.aperture_stop import (
     Stop,
     illuminated_radius_um,
     stop_crossing,
@@ -22,6 +21,7 @@ from metalens.lens.stop import (
     stop_shadow,
     stop_transmission,
 )
+from metalens.optics.media import Media
 
 MOST_ABSORBED = 0.02
 
@@ -168,7 +168,7 @@ class Layers:
     ) -> Array:
         """Complex amplitude of a source's light behind the stop over that without it,
         at places of the pillars: as
-        :meth:`lit` with the ripples of the edge (:mod:`metalens.lens.stop`); numpy
+        :meth:`lit` with the ripples of the edge (:mod:`metalens.optics.aperture_stop`); numpy
         arrays.
         """
         if self.stop is None:

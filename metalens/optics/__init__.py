@@ -1,0 +1,5 @@
+"""Plane-parallel media: optical paths, rays, Fresnel, and the aperture stop."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
