@@ -12,7 +12,7 @@ from metalens.propagate import sincos_turns32
 
 # compiled loops know names of their own module
 PART: int = answers.PART
-put: Any = answers.evaluate_row
+put: Any = answers.evaluate_row  # type: ignore[has-type]
 
 
 def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:

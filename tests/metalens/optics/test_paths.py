@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.core import paths
+from metalens.optics import paths
 
 getcontext().prec = 60
 X, Y = (
