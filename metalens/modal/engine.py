@@ -5,9 +5,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
+from metalens import rcwa
 from metalens.cell import Cell, Incidence, Polarization, Response, check_tolerance
 from metalens.core.errors import CellError
 from metalens.core.threads import one_blas_thread
@@ -30,6 +32,7 @@ from metalens.modal.match import (
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, is_lossless, magnetic_pencil
 from metalens.modal.spaces import build_symmetry_class, class_topology
+from metalens.modal.tilted import solve_tilted
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
@@ -377,7 +380,7 @@ def solve(
     """Zero-order transmission and reflection of a round pillar by the modal method: exact
     along z, curved finite elements across.
 
-    Pillars with tilted walls are solved by :func:`metalens.rcwa.solve`.
+    Pillars with tilted walls: see :mod:`metalens.modal.tilted`.
 
     Args:
         cell: round pillar on a square lattice, films allowed.
@@ -401,16 +404,21 @@ def solve(
     light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
-    if cell.round and (cell.sidewall_rad or cell.height_um == 0):
-        from metalens import rcwa
-
-        return rcwa.solve(
+    direction: dict[str, Any] = {
+        "angle_rad": angle_rad,
+        "azimuth_rad": azimuth_rad,
+        "polarization": polarization,
+    }
+    if cell.round and cell.height_um == 0:
+        return rcwa.solve(cell, diameter_um, wavelength_um, **direction)
+    if cell.round and cell.sidewall_rad:
+        return solve_tilted(
             cell,
-            diameter_um,
-            wavelength_um,
-            angle_rad=angle_rad,
-            azimuth_rad=azimuth_rad,
-            polarization=polarization,
+            float(diameter_um),
+            light,
+            lambda plain, d, tol: solve(
+                plain, d, wavelength_um, tolerance=tol, **direction
+            ),
             tolerance=tolerance,
         )
     case = case_of(cell, diameter_um, light)

@@ -48,6 +48,7 @@ def wall_sections(
     size_um: float,
     wavelength_um: float,
     operators: Callable[[PillarSection, int], tuple[Array, Array]],
+    shift: Callable[[float], float] | None = None,
 ) -> list[WallSection]:
     """Sections of a pillar, foot first; of tilted ones P and Q are polynomials through
     Chebyshev points of the height.
@@ -55,11 +56,14 @@ def wall_sections(
     Args:
         cell, size_um: the pillar. wavelength_um: in vacuum.
         operators: P and Q of a cross-section, and the number of its section.
+        shift: additional width of a cross-section, by its diameter.
     """
 
     def section(i: int, layer: Layer, grow_um: float) -> WallSection:
         def sample(share: float) -> tuple[Array, Array]:
             width = grow_um + (share - 0.5) * width_slope(cell) * layer.height_um
+            if shift:
+                width += float(shift(size_um + width))
             here = pillar_section(cell, layer, size_um, wavelength_um, grow_um=width)
             return operators(here, i)
 

@@ -8,6 +8,7 @@ face of the films under it) to its top; time factor exp(-iwt).
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,6 +103,7 @@ class CellProblem:
 
     columns: polarisations that are wanted, 0: x or s, 1: y or p.
     normals: for each section the outlines of its normal field; none: its own.
+    shift: change of width of a cross-section, um, by its diameter; None: none.
     """
 
     cell: Cell
@@ -111,6 +113,7 @@ class CellProblem:
     classes: tuple[tuple[Operation, ...], ...]
     columns: tuple[int, ...] = (0, 1)
     normals: tuple[tuple[Outline, ...], ...] = ()
+    shift: Callable[[float], float] | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -257,6 +260,23 @@ def polarization_column(light: Incidence) -> int:
     return int(along_x == (light.polarization == "x"))
 
 
+def problem_of_light(cell: Cell, size_um: float, light: Incidence) -> CellProblem:
+    """The problem of one polarisation.
+
+    Args:
+        cell: the pillar. size_um: of the shape. light: plane wave.
+
+    Raises:
+        CellError, MaterialError: as :func:`cell_problem`; an ambiguous polarisation.
+    """
+    problem = cell_problem(
+        cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad
+    )
+    column = polarization_column(light)
+    columns = (0,) if _is_square(problem) else (column,)
+    return dataclasses.replace(problem, columns=columns)
+
+
 def solve(
     cell: Cell,
     diameter_um: float,
@@ -299,17 +319,8 @@ def solve(
     light = Incidence(
         float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
     )
-    problem = cell_problem(
-        cell,
-        float(diameter_um),
-        light.wavelength_um,
-        light.angle_rad,
-        light.azimuth_rad,
-    )
-    column = polarization_column(light)
-    if _is_square(problem):
-        column = 0
-    problem = dataclasses.replace(problem, columns=(column,))
+    problem = problem_of_light(cell, float(diameter_um), light)
+    column = problem.columns[0]
     found = _refine(problem, tolerance, harmonics)
     return Response(
         complex(found.t[column, column]),
@@ -588,7 +599,9 @@ def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
             normals = problem.normals[i] if problem.normals else None
             return section_operators(space, waves, section, cell, normals=normals)
 
-        walls = wall_sections(cell, size_um, light.wavelength_um, operators)
+        walls = wall_sections(
+            cell, size_um, light.wavelength_um, operators, problem.shift
+        )
         media, layers, match = problem.media, [], None
         if stages:
             match = functools.partial(match_walls, walls, stages=stages)
