@@ -19,8 +19,12 @@ import numpy as np
 
 from metalens.cell import Cell, Incidence, Response
 from metalens.core.arrays import Array
-from metalens.rcwa.sidewall import choose_stage_count
-from metalens.rcwa.solver import CellProblem, problem_of_light, solve_problem
+from metalens.rcwa import (
+    CellProblem,
+    choose_stage_count,
+    problem_of_light,
+    solve_problem,
+)
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4

@@ -4,12 +4,16 @@ from .fields import near_field as near_field
 from .fields import near_fields as near_fields
 from .reference import OrderResponse as OrderResponse
 from .reference import solve_textbook_rcwa as solve_textbook_rcwa
+from .sidewall import choose_stage_count as choose_stage_count
 from .sidewall import staircase_layers as staircase_layers
 from .solver import SAFETY as SAFETY
+from .solver import CellProblem as CellProblem
 from .solver import JonesResponse as JonesResponse
 from .solver import jones as jones
 from .solver import most_harmonics as most_harmonics
+from .solver import problem_of_light as problem_of_light
 from .solver import solve as solve
+from .solver import solve_problem as solve_problem
 from .solver import solve_truncation as solve_truncation
 from .supercell import RowResponse as RowResponse
 from .supercell import block_of as block_of
