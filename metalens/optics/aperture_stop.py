@@ -136,7 +136,11 @@ def _share(before: Media, between: Media, away2: Any) -> Any:
 def stop_transmission(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
     """Share of light that passes where rays cross the stop at (x, y): 1 inside, 0
     outside, over the edge as much of a
-    patch of ``width_um`` as lies inside; numpy or torch."""
+    patch of ``width_um`` as lies inside; numpy or torch.
+
+    Args:
+        at_um: (x, y) where rays cross the stop.
+    """
     x, y = (at - middle for at, middle in zip(at_um, stop.centre_um, strict=True))
     radius = (x * x + y * y) ** 0.5
     share = (stop.radius_um - radius) / width_um + 0.5
@@ -155,6 +159,7 @@ def stop_shadow(
     a place; numpy arrays.
 
     Args:
+        wavelength_um: in vacuum.
         media_um: before and between, tangents: as in :func:`stop_crossing`. at_um: (x,
             y) of
             the pillars, broadcast.
@@ -180,6 +185,11 @@ def fresnel_um(
 ) -> tuple[float, float]:
     """Fresnel lengths in the plane of the ray and across it: of 1/L = 1/(stop to
     pillars) + 1/(source to stop).
+
+    Args:
+        before: media from source to pillars; None for collimated light.
+        between: media from stop to pillars.
+        tangents: (x, y) of the field angle, in air.
     """
     slope2 = tangents[0] ** 2 + tangents[1] ** 2
     w = slope2 / (1 + slope2)
@@ -209,6 +219,12 @@ def stop_model_error(
     point of it has the amplitude of the
     light), which a lens out of focus shows: zones, of a blur of radius b on the sensor,
     are R b / (λ d).
+
+    Args:
+        stop: the aperture stop.
+        media_um: media before and after the stop.
+        tangents: (x, y) of the field angle, in air.
+        wavelength_um: in vacuum.
     """
     if media_um[1] is None:
         return 0.0
@@ -221,7 +237,13 @@ def stop_model_error(
 def illuminated_radius_um(
     stop: Stop, before: Media | None, between: Media | None
 ) -> float:
-    """Radius of what a source on the axis lights on the pillars (paraxial)."""
+    """Radius of what a source on the axis lights on the pillars (paraxial).
+
+    Args:
+        stop: the aperture stop.
+        before: media from source to pillars; None for collimated light.
+        between: media from stop to pillars.
+    """
     if before is None or between is None:
         return stop.radius_um
     return stop.radius_um / (1 - between.reduced_um / before.reduced_um)
@@ -298,6 +320,9 @@ def edge_diffraction_factor(
     y), mean over a width.
 
     Args:
+        width_um: width over which the mean is taken.
+        radius_um: of the stop.
+        wavelength_um: in vacuum.
         at_um: of one shape. ray: unit vector of the plane of incidence. lengths_um:
             Fresnel lengths in it, across it.
     """

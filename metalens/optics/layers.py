@@ -250,6 +250,11 @@ def check_gaps(
 ) -> None:
     """Refuse films that do not fit between source, pillars and sensor.
 
+    Args:
+        layers: films to check.
+        sensor_distance_um: from lens to sensor.
+        source_distance_um: from source to lens.
+
     Raises:
         PropagationError: naming the gap.
     """

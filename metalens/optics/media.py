@@ -101,13 +101,21 @@ class Media:
 
 
 def reach(media: Media, p: Any) -> Any:
-    """Lateral distance of a ray with n sin θ = p, um."""
+    """Lateral distance of a ray with n sin θ = p, um.
+
+    Args:
+        media: plane-parallel media.
+    """
     return p * bend(media.layers, p * p)
 
 
 def path(media: Media, p: Any) -> Any:
     """Optical path of that ray less the path along the normal, um, without
     cancellation.
+
+    Args:
+        media: plane-parallel media.
+        p: n sin θ of the ray.
     """
     return sum(
         (
@@ -140,31 +148,52 @@ def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> An
 
 
 def spread(media: Media, p: Any) -> Any:
-    """Area on the plane per area of p: (reach / p) (d reach / d p), um²."""
+    """Area on the plane per area of p: (reach / p) (d reach / d p), um².
+
+    Args:
+        media: plane-parallel media.
+    """
     return widening(media.layers, p * p)
 
 
 def direction(media: Media, reach_um: Any) -> Any:
-    """p of the ray that reaches so far: the inverse of :func:`reach`, to rounding."""
+    """p of the ray that reaches so far: the inverse of :func:`reach`, to rounding.
+
+    Args:
+        media: plane-parallel media.
+        reach_um: lateral distance, um.
+    """
     layers = media.layers
     w = square(layers, reach_um * reach_um)
     return reach_um / bend(layers, w)
 
 
 def chord(media: Media, reach_um: Any) -> Any:
-    """Optical path of the ray that reaches so far, less the path along the normal, um."""
+    """Optical path of the ray that reaches so far, less the path along the normal, um.
+
+    Args:
+        media: plane-parallel media.
+        reach_um: lateral distance, um.
+    """
     return path(media, direction(media, reach_um))
 
 
 def passed(order: Sequence[float], p: Any) -> Any:
     """Share of unpolarised power that passes the faces between media of indices
     ``order``, in a single pass.
+
+    Args:
+        p: n sin θ of the ray.
     """
     return passed_at(order, p * p)
 
 
 def passed_at(order: Sequence[float], w: Any) -> Any:
-    """As :func:`passed`, of w = p²."""
+    """As :func:`passed`, of w = p².
+
+    Args:
+        order: indices that the faces lie between.
+    """
     s_power, p_power = passed_apart(order, w)
     return (s_power + p_power) / 2
 
@@ -172,6 +201,9 @@ def passed_at(order: Sequence[float], w: Any) -> Any:
 def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
     """Shares of the power of s and of p light that pass the faces, of w = p² (Fresnel);
     0 beyond a critical angle.
+
+    Args:
+        order: indices that the faces lie between.
     """
     return _fresnel(order, w, lambda rest: (rest * (rest.real > 0)) ** 0.5)
 
@@ -179,6 +211,9 @@ def passed_apart(order: Sequence[float], w: Any) -> tuple[Any, Any]:
 def passed_on(order: Sequence[float], w: Any) -> tuple[Any, Any]:
     """As :func:`passed_apart` of complex w, without a cut: the analytic function that
     sums over plane waves need.
+
+    Args:
+        order: indices that the faces lie between.
     """
     return _fresnel(order, w, lambda rest: rest**0.5)
 
@@ -207,12 +242,20 @@ def _sum(parts: Sequence[Any]) -> Any:
 
 
 def bend(layers: Pairs, w: Any) -> Any:
-    """reach / p = Σ t / √(n² - w), w = p²."""
+    """reach / p = Σ t / √(n² - w), w = p².
+
+    Args:
+        layers: (index, thickness) of each medium.
+    """
     return _sum([t / rest for _, t, rest in _with_normals(layers, w)])
 
 
 def widening(layers: Pairs, w: Any) -> Any:
-    """Area on the plane per area of p, as :func:`spread`, of w = p²."""
+    """Area on the plane per area of p, as :func:`spread`, of w = p².
+
+    Args:
+        layers: (index, thickness) of each medium.
+    """
     along = _sum(
         [t * n * n / (rest * rest * rest) for n, t, rest in _with_normals(layers, w)]
     )
@@ -220,7 +263,11 @@ def widening(layers: Pairs, w: Any) -> Any:
 
 
 def whole_path(layers: Pairs, w: Any) -> Any:
-    """Optical path Σ n² t / √(n² - w)."""
+    """Optical path Σ n² t / √(n² - w).
+
+    Args:
+        layers: (index, thickness) of each medium.
+    """
     return _sum([n * n * t / rest for n, t, rest in _with_normals(layers, w)])
 
 
@@ -232,6 +279,9 @@ def square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
 
     Newton's method in S = tan² inside the rarest medium, where a single medium is
     linear.
+
+    Args:
+        layers: (index, thickness) of each medium.
     """
     low2 = min(n for n, _ in layers) ** 2
     reach2 = reach2 + along2 * 0
@@ -268,6 +318,9 @@ def longer(
     (w - w0)/v = more / (g² + w0 (g + g0) Σ t/(s s0 (s + s0))),  path = (w - w0)/v Σ t
     n²/(s s0 (s + s0)),
     g = Σ t/s, s = √(n² - w): difference of reach² = w g² over that of w.
+
+    Args:
+        layers: (index, thickness) of each medium.
     """
     w = square(layers, reach2 + scale * more)
     pairs = [(n, t, (n * n - w) ** 0.5, (n * n - w0) ** 0.5) for n, t in layers]
@@ -335,7 +388,12 @@ def saddle_correction(
 ) -> SaddleCorrection:
     """C of all rays up to this reach; ``wavenumber`` in vacuum, rad/um. light: whose
     power passes the faces, of s, of p
-    or the mean of both."""
+    or the mean of both.
+
+    Args:
+        behind: media from lens to sensor.
+        reach_um: lateral distance, um.
+    """
     layers = behind.layers
     rarest = layers[0][0]
     w = float(square(layers, reach_um * reach_um))
@@ -420,6 +478,11 @@ def plane_wave_correction(
 ) -> Array:
     """(n,) 1 + iC/(kL) of rays of w (n,) = p²: the mean of the heading over ``count`` x
     ``count`` plane waves.
+
+    Args:
+        behind: media from lens to sensor.
+        wavenumber: in vacuum, rad/um.
+        light: s, p or their mean.
     """
     layers, k = behind.layers, wavenumber
     w = np.asarray(w, float)[:, None, None]

@@ -44,6 +44,10 @@ def source_path(x: Any, y: Any, tangents: Any, inverse_depth: Any) -> Any:
     r - r0 = (ρ²/z + 2(x·tx + y·ty)) / (√(ρ²/z² + 2(x·tx + y·ty)/z + s²) + s) with s² =
     1 + tx² + ty², the source at
     (-z·tx, -z·ty, -z). Operands broadcast; no division by the depth.
+
+    Args:
+        tangents: (x, y) of the field angle, in air.
+        inverse_depth: 1 / depth, 1/um.
     """
     tx, ty = tangents
     s = (1 + tx * tx + ty * ty) ** 0.5
@@ -55,6 +59,9 @@ def source_path(x: Any, y: Any, tangents: Any, inverse_depth: Any) -> Any:
 def sensor_path(x: Any, y: Any, centre: Any, distance: Any) -> Any:
     """Path from a pillar at (x, y) to a point of the sensor, less the path from the
     lens centre, um.
+
+    Args:
+        distance: from lens to sensor, um.
     """
     cx, cy = centre
     r0 = (cx * cx + cy * cy + distance * distance) ** 0.5

@@ -119,6 +119,9 @@ def choose_blocks(
     """(rows, columns) blocks that cost least.
 
     Args:
+        case: geometry of the propagation.
+        reference: inverse depth whose phase is taken off, 1/um.
+        itemsize: bytes of a number of the maps.
         kernel: (y, x) in um to (line, …) values whose variation over a block must be
             met, broadcasting.
         tolerance: root mean square error of the interpolation, relative.
@@ -169,6 +172,11 @@ def _needed(
 def carrier_turns(case: PropagationCase, reference: float, x: Any, y: Any) -> Any:
     """Source path (of the reference depth) plus sensor path (to the window centre), in
     wavelengths.
+
+    Args:
+        case: geometry of the propagation.
+        x: column positions, um.
+        y: row positions, um.
     """
     return (
         from_source(case, x, y, case.tangents, reference) + to_sensor(case, x, y)

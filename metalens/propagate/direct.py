@@ -183,6 +183,7 @@ def field_exact(phase_rad: Array, transmission: Array, case: PropagationCase) ->
     Through films the kernel is that of :mod:`metalens.propagate.paths`.
 
     Args:
+        case: geometry of the propagation.
         phase_rad, transmission: (y, x).
 
     Returns:
@@ -208,6 +209,12 @@ def field_at(
 ) -> Array:
     """As :func:`field_exact`, at (point, [x, y]) of the sensor plane; (depth, point)
     complex128.
+
+    Args:
+        phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) magnitude |T| of every pillar.
+        case: geometry of the propagation.
+        points_um: (point, [x, y]) on the sensor plane.
     """
     check_aperture(phase_rad, transmission, case)
     y, x = case.pillars_um
@@ -241,6 +248,11 @@ def sum_field(
 ) -> Array:
     """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth:
     (depth, y, x) complex128.
+
+    Args:
+        phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) magnitude |T| of every pillar.
+        case: geometry of the propagation.
     """
     inverse = np.array(case.inverse_depths_per_um)[:, None, None]
     path = from_source(case, x_um[None, :], y_um[:, None], case.tangents, inverse)
@@ -255,6 +267,9 @@ def free_space_transfer(
 
     band_limited: drop frequencies whose phase the padded grid cannot sample (Matsushima
     and Shimobaba 2009).
+
+    Args:
+        case: geometry of the propagation.
     """
     fy, fx = (
         np.fft.fftfreq(n, step) for n, step in zip(count, case.steps_um, strict=True)
@@ -288,6 +303,10 @@ def angular_spectrum(
     the pitch, centre on it).
 
     Args:
+        phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) magnitude |T| of every pillar.
+        case: geometry of the propagation.
+        band_limited: drop frequencies that the padded grid cannot sample.
         pad: the grid is this many times as wide as the lens; below 2 light wraps
             around.
         single: complex64 instead of complex128.

@@ -147,7 +147,11 @@ class PropagationCase:
 
 
 def axis_positions(count: int, step: float) -> Array:
-    """(count,) positions about the centre of the row."""
+    """(count,) positions about the centre of the row.
+
+    Args:
+        step: distance of neighbours.
+    """
     return (np.arange(count) - (count - 1) / 2) * step
 
 
@@ -156,6 +160,9 @@ def split_window(
 ) -> tuple[tuple[PropagationCase, ...], ...]:
     """The window cut into rows of parts, at most ``parts`` along each axis, equal to
     within one sample.
+
+    Args:
+        case: geometry of the propagation.
     """
     rows, columns = (_cut(count, min(parts, count)) for count in case.samples)
     return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
@@ -166,6 +173,9 @@ def window_tiles(
 ) -> tuple[tuple[list[int], list[int]], tuple[tuple[PropagationCase, ...], ...]]:
     """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size:
     neighbours may overlap.
+
+    Args:
+        case: geometry of the propagation.
     """
     firsts, sizes = [], []
     for count in case.samples:

@@ -85,6 +85,10 @@ def wide_axes(
 ) -> tuple[WideAxis, WideAxis] | None:
     """(y, x) grids for a window; None where its rays are too steep, or too unlike a
     quadratic, for the method.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
     """
     fits, extra = _fitted(case, list(case.half_window_um)), [0.0, 0.0]
     for _ in range(2):
@@ -152,6 +156,10 @@ def _beyond(
 def is_wide(case: PropagationCase, tolerance: float) -> bool:
     """Whether the method is the quickest without a look at the others, whose plans take
     long for such windows.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
     """
     found = wide_axes(case, tolerance)
     if found is None:
@@ -288,13 +296,21 @@ def _band(case: PropagationCase, i: int, extra: float) -> float:
 
 
 def grid_um(axis: WideAxis) -> Array:
-    """(count,) places of the even grid over the lens."""
+    """(count,) places of the even grid over the lens.
+
+    Args:
+        axis: grids along one axis.
+    """
     return axis.first_um + axis.step_um * np.arange(axis.count)
 
 
 def spread_weights(axis: WideAxis, places_um: Array) -> Array:
     """(place, grid) sinc under Kaiser's window: f(x) = Σ_m weight f(x_m) for what the
     kernel's band holds.
+
+    Args:
+        axis: grids along one axis.
+        places_um: positions on the lens.
     """
     t = (places_um[:, None] - grid_um(axis)) / axis.step_um
     inside = np.clip(1 - (t / axis.taps) ** 2, 0, None)

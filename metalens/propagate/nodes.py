@@ -72,6 +72,10 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
     """How the window is cut so that it costs least; None where no cut brings the tables
     down to some 100 MB.
 
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+
     Raises:
         PropagationError: more than 400 nodes would be needed; the window is too large
             for this method.
@@ -126,7 +130,12 @@ def _products(case: PropagationCase, found: NodeCounts, depths: int) -> float:
 
 
 def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
-    """(y, x) nodes over the lens that the kernel needs."""
+    """(y, x) nodes over the lens that the kernel needs.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+    """
     high_y, high_x = case.half_size_um
     rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
     return rows, _count(
@@ -136,6 +145,10 @@ def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
 
 def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
     """The counts that a tile needs.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
 
     Raises:
         PropagationError: more than 400 nodes would be needed.

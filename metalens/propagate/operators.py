@@ -55,7 +55,13 @@ class TileOperators:
 def depth_factors(
     case: PropagationCase, e: Any, x: Any, tangents: Any, inverse: Any
 ) -> Any:
-    """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands."""
+    """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands.
+
+    Args:
+        case: geometry of the propagation.
+        tangents: (x, y) of the field angle, in air.
+        inverse: 1 / depth of the source, 1/um.
+    """
     reference = from_source(case, x, e, case.tangents, reference_depth(case))
     return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
 
@@ -72,6 +78,10 @@ def depth_basis(
     With ``moving`` they also span the derivatives in inverse depth and tangents.
     Orthonormal under the quadrature of
     the nodes; truncated at ``tolerance`` root mean square.
+
+    Args:
+        case: geometry of the propagation.
+        nodes_um: (e,) and (x,) positions on the lens.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(
@@ -147,6 +157,9 @@ def _tangents(
 def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
     """(2, n) pairs (correction term, depth field) whose joint strength matters; the
     rest sums below tolerance.
+
+    Args:
+        size: strengths of the depth fields.
     """
     joint = (np.outer(strength, size) ** 2).ravel()
     order = np.argsort(joint)
@@ -164,6 +177,11 @@ def build_operators(
 ) -> TileOperators:
     """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
     window centre x, y instead.
+
+    Args:
+        case: geometry of the propagation.
+        chosen: counts of nodes and directions.
+        tolerance: relative error of the field.
     """
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um

@@ -32,6 +32,9 @@ SOME = 32  # pillars along an axis whose rays tell what films leave out
 def reference_depth(case: PropagationCase) -> float:
     """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the
     range.
+
+    Args:
+        case: geometry of the propagation.
     """
     inverse = case.inverse_depths_per_um
     return (min(inverse) + max(inverse)) / 2
@@ -44,6 +47,10 @@ def from_source(
     or torch operands.
 
     ``tangents`` are those in air.
+
+    Args:
+        case: geometry of the propagation.
+        inverse: 1 / depth of the source, 1/um.
     """
     return media.source_path(case.front, x, y, tangents, inverse)
 
@@ -53,7 +60,11 @@ def to_sensor(
 ) -> Any:
     """Optical path from (x, y) on the lens to a point of the sensor, by default the
     middle of the window, less that
-    from the lens centre, um."""
+    from the lens centre, um.
+
+    Args:
+        case: geometry of the propagation.
+    """
     cx, cy = case.centre_um if centre is None else centre
     if case.behind is None:
         return sensor_path(x, y, (cx, cy), case.sensor_distance_um)
@@ -66,6 +77,9 @@ def to_sensor(
 def chief_path(case: PropagationCase) -> float:
     """Optical path from the lens centre to the window centre, um: the phase that all
     methods share.
+
+    Args:
+        case: geometry of the propagation.
     """
     reach2 = case.centre_um[0] ** 2 + case.centre_um[1] ** 2
     if case.behind is None:
@@ -79,6 +93,9 @@ def ray_to_offset(
 ) -> tuple[Any, Any]:
     """(amplitude, path) from lens (x, y) to the window offset (X, Y); the path less
     that to the window's centre.
+
+    Args:
+        case: geometry of the propagation.
     """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
     more = X * X + Y * Y + 2 * (X * dx + Y * dy)
@@ -113,7 +130,14 @@ def ray_amplitude_parts(
 ) -> tuple[Any, Any, Any]:
     """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the
     ray of w = p²; for complex
-    steps in w and in thicknesses, on which C itself counts as not depending."""
+    steps in w and in thicknesses, on which C itself counts as not depending.
+
+    Args:
+        behind: media from lens to sensor.
+        wavenumber: in vacuum, rad/um.
+        pairs: (index, thickness) of the media.
+        reach_um: lateral distance, um.
+    """
     passed = media.passed_at(behind.order, w) / media.widening(pairs, w)
     level = wavenumber / (2 * np.pi) * passed**0.5
     turn = 1 / (wavenumber * media.whole_path(pairs, w))
@@ -125,6 +149,9 @@ def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]
     """Amplitudes of s and of p light behind films over :func:`ray_amplitude`, of rays
     of w
     = p²; complex.
+
+    Args:
+        case: geometry of the propagation.
     """
     behind, k = case.behind, case.wavenumber
     if behind is None:
@@ -155,6 +182,9 @@ def films_error(case: PropagationCase, level: Array) -> float:
     Root mean square over the light of some pillars (transmission ``level`` (y, x)),
     each seen from where the window is
     farthest; twice that of the amplitude.
+
+    Args:
+        case: geometry of the propagation.
     """
     if case.behind is None:
         return 0.0
@@ -177,6 +207,9 @@ def films_error(case: PropagationCase, level: Array) -> float:
 def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
     """p along x of the rays to the window centre from lens points ``across``, ``far``
     beside it: n sin θ cos φ.
+
+    Args:
+        case: geometry of the propagation.
     """
     if case.behind is None:
         return across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
@@ -185,7 +218,11 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
 
 
 def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
-    """q along y of the ray from lens row e with p along x to the window centre."""
+    """q along y of the ray from lens row e with p along x to the window centre.
+
+    Args:
+        case: geometry of the propagation.
+    """
     far = e - case.centre_um[1]
     if case.behind is None:
         return (
@@ -198,7 +235,13 @@ def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
 def residual_path(
     case: PropagationCase, p: Any, e: Any, X: Any, Y: Any
 ) -> tuple[Any, Any]:
-    """(amplitude, path difference + pX + qY) of the ray (p, e), without cancellation."""
+    """(amplitude, path difference + pX + qY) of the ray (p, e), without cancellation.
+
+    Args:
+        case: geometry of the propagation.
+        X: offset along x from the window centre, um.
+        Y: offset along y from the window centre, um.
+    """
     far = e - case.centre_um[1]
     if case.behind is None:
         k, d = case.wavenumber, case.sensor_distance_um
@@ -229,6 +272,13 @@ def _from_ray(
 def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
     """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x
     and y, at fixed pillar.
+
+    Args:
+        case: geometry of the propagation.
+        p: n sin θ of the ray.
+        e: row of the lens, um.
+        X: offset along x from the window centre, um.
+        Y: offset along y from the window centre, um.
     """
     k, d = case.wavenumber, case.sensor_distance_um
     far = e - case.centre_um[1]
@@ -287,6 +337,10 @@ def rayleigh_sommerfeld_kernel(
 ) -> Array:
     """K of the module's heading, without the pillar's area, at lens (x, y) and window
     offset (X, Y).
+
+    Args:
+        case: geometry of the propagation.
+        inverse: 1 / depth of the source, 1/um.
     """
     level, away = ray_to_offset(case, x, y, X, Y)
     path = away + from_source(case, x, y, case.tangents, inverse)
@@ -297,6 +351,10 @@ def rayleigh_sommerfeld_kernel(
 def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float]:
     """(least, largest) p = n sin θ cos φ over the lens, for the row nodes given; never
     of zero width.
+
+    Args:
+        case: geometry of the propagation.
+        rows_um: (row,) positions of lens rows.
     """
     high_x = case.half_size_um[1]
     edge = np.array([-high_x, high_x]) - case.centre_um[0]
@@ -311,6 +369,13 @@ def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float
 def plane_wave_residual(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
     """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w
     + pX + qY)).
+
+    Args:
+        case: geometry of the propagation.
+        p: n sin θ of the ray.
+        e: row of the lens, um.
+        X: offset along x from the window centre, um.
+        Y: offset along y from the window centre, um.
     """
     level, path = residual_path(case, p, e, X, Y)
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
@@ -319,6 +384,9 @@ def plane_wave_residual(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -
 def over_blocks(case: PropagationCase) -> Callable[[Any, Any], Array]:
     """The kernel at (y, x) of the lens for the corners and the middle of the window and
     the extreme depths.
+
+    Args:
+        case: geometry of the propagation.
     """
     wy, wx = case.half_window_um
     inverse = np.array(

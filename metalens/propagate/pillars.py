@@ -169,6 +169,9 @@ def reduce_to_moments(
     finite give moments or a sum that is
     not; closed pillars are passed over where a whole tile is closed.
 
+    Args:
+        phase_rad: (y, x) phase of every pillar.
+
     Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars,
     incoherent, and the interpolation
     inside blocks that the plan allows.
@@ -184,6 +187,10 @@ def mix_components(
 ) -> list[tuple[float, torch.Tensor]]:
     """Sign and light of every component, from the light of every map (map, e, x) at
     these places (e,), (x,).
+
+    Args:
+        pupils: factors on the light; None for one map.
+        places_um: positions on the lens.
     """
     if pupils is None:
         return [(1.0, light[0])]

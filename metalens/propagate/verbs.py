@@ -54,6 +54,8 @@ def make_case(
     """Geometry of one propagation.
 
     Args:
+        pitch_um: distance of neighbouring columns.
+        sensor_distance_um: from lens to sensor.
         shape: (y, x) pillars.
         depths_um: source depths, any sequence or a number; inf for a collimated beam.
         angle_rad: field angle along x, or the pair (x, y), arctangents of the light's
@@ -154,6 +156,9 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
     """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs
     (x, y).
 
+    Args:
+        window_um: width, or a pair (x, y).
+
     Raises:
         PropagationError: no number and no pair, parts of samples, or cells that are not
             square to 1e-6.
@@ -184,6 +189,11 @@ def film_settings(
 ) -> dict[str, Any]:
     """``front`` and ``behind`` of a :class:`Case` with these films.
 
+    Args:
+        layers: films around the lens.
+        sensor_distance_um: from lens to sensor.
+        wavelength_um: in vacuum.
+
     Raises:
         PropagationError: films thicker than the distance, or of metal.
     """
@@ -203,6 +213,9 @@ def chief_ray_offset(
     or y (1), um.
 
     Operands may be torch tensors: behind films the cover takes what the distance gains.
+
+    Args:
+        sensor_distance_um: from lens to sensor.
     """
     if behind is None:
         return sensor_distance_um * tangents[axis]
@@ -221,6 +234,9 @@ def chief_ray_offset(
 
 def to_angle_pair(angle_rad: Any) -> tuple[float, float]:
     """(x, y) field angle from a number or a pair.
+
+    Args:
+        angle_rad: one angle or a pair (x, y).
 
     Raises:
         PropagationError: not one or two finite numbers within ±90°.
@@ -284,6 +300,8 @@ def angular_spectrum(
     :mod:`metalens.propagate.direct`).
 
     Args:
+        phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) magnitude |T| of every pillar.
         pad, band_limited, single: padding factor, band limit, complex64.
         geometry: as :func:`make_case`; the window must lie on the pillars' lattice.
     """

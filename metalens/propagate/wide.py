@@ -310,7 +310,12 @@ def fields_wide(
 ) -> torch.Tensor:
     """(b, y, x) field of every depth field, or of every mixture (fewer, b) of them, on
     the window from the light on the
-    grid of the lens, up to a phase of each sample that all share."""
+    grid of the lens, up to a phase of each sample that all share.
+
+    Args:
+        gathered: (y, x) light on the grid of the lens.
+        plan: of :func:`plan_wide`.
+    """
     y, x = plan.axes
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))

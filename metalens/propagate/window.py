@@ -209,6 +209,10 @@ def legendre_bases(
 ) -> tuple[Callable[[Array], Array], ...]:
     """Legendre polynomials over the rows and over the columns of the lens, as weights
     of :func:`moments`.
+
+    Args:
+        case: geometry of the propagation.
+        counts: (y, x) numbers of polynomials.
     """
 
     def over(count: int, half_um: float) -> Callable[[Array], Array]:
