@@ -18,12 +18,13 @@ from metalens.core import manifest, store
 from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
+SAVES = ("store.save", "records.save_record")
 PACKAGES = ("metalens", "layout", "characterize", "codesign")
 
 
 @functools.cache
 def _kinds():
-    """Second argument of every ``store.save`` in the packages."""
+    """Second argument of every call that saves an artefact, in the packages."""
     texts = [
         path.read_text(encoding="utf-8")
         for package in PACKAGES
@@ -32,13 +33,13 @@ def _kinds():
     calls = [
         node
         for text in texts
-        if "store.save" in text
+        if any(name in text for name in SAVES)
         for node in ast.walk(ast.parse(text))
     ]
     calls = [
         node
         for node in calls
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "store.save"
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in SAVES
     ]
     return {
         node.args[1].value for node in calls if isinstance(node.args[1], ast.Constant)

@@ -428,7 +428,7 @@ def _copy_out(x: Any, at: Any, out: Any, row: Any, column: Any) -> None:
 def _unpack(row: Any) -> Any:
     """The parameters of a frame by name."""
     v = row
-    return Parameters(
+    return Parameters(  # type: ignore[call-arg]
         _vector(v, 0, 1), _vector(v, 3, 1), _vector(v, 6, 1), _vector(v, 9, 1),
         _vector(v, 12, 1), _vector(v, 15, 1), _vector(v, 18, 1), _vector(v, 21, 1),
         _vector(v, 24, 1), _vector(v, 27, 1), _vector(v, 30, 1),

@@ -83,13 +83,12 @@ def claim_file(
         made = sorted(p.name for p in new.iterdir())
         manifest.sync_files(new)
         _refuse(target, {*names, *made} - {target.name}, terms, is_folder=False)
+        companions = {*names, *made} - {target.name}
+        for name in companions:  # a picture is missing after a kill, never another's
+            target.with_name(name).unlink(missing_ok=True)
         (new / target.name).replace(target)
-        for name in {*names, *made} - {target.name}:
-            place = target.with_name(name)
-            if name in made:
-                (new / name).replace(place)
-            else:
-                place.unlink(missing_ok=True)  # of the file that stood here before
+        for name in companions & set(made):
+            (new / name).replace(target.with_name(name))
         store.sync_folder(target.parent)
 
 

@@ -412,7 +412,7 @@ def _maps(
         raise PropagationError(
             f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each"
         )
-    phase = to_tensor(phase)
+    phase = to_tensor(phase).cpu()  # pillars are summed on the processor
     if phase.dtype not in ROUNDING:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
     level = to_tensor(level).to(phase)
