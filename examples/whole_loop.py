@@ -32,7 +32,7 @@ from codesign.adapt.settings import RetrainConfig
 from codesign.optics import built
 from metalens import lens as lenses
 from metalens.cli import main
-from metalens.fabrication import sensitivity
+from metalens.fabrication import proxy_sensitivity
 
 work = Path(tempfile.mkdtemp())
 
@@ -86,7 +86,7 @@ truth = HiddenLens(
     parameter=tuple(KnownValue(name, value) for name, value in hidden.items()),
     camera=BenchCamera(pixel_um=2.0, pixels=32),
 )
-shots = bench.simulate_frames(design, truth, sensitivity(design))
+shots = bench.simulate_frames(design, truth, proxy_sensitivity(design))
 (work / "captures").mkdir()
 command_capture.write_captures(work / "captures", shots, truth, design)
 

@@ -29,10 +29,10 @@ from metalens.fabrication import (
     ResponseError,
     Spread,
     State,
-    draws,
-    lacking,
-    named,
-    sensitivity,
+    draw_lenses,
+    inapplicable_names,
+    names_of_kind,
+    proxy_sensitivity,
 )
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
@@ -73,7 +73,7 @@ def lens():
 
 @pytest.fixture(scope="module")
 def response(lens):
-    return sensitivity(lens)
+    return proxy_sensitivity(lens)
 
 
 def seen(lens, t):
@@ -140,8 +140,8 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
     oblique = dataclasses.replace(
         lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5))
     )
-    found = sensitivity(oblique)
-    rate = found.at(np.array([0.19]))[named(ResponseError).index("turn_deg"), 0]
+    found = proxy_sensitivity(oblique)
+    rate = found.at(np.array([0.19]))[names_of_kind(ResponseError).index("turn_deg"), 0]
     up, down = (solved(0.19, RATIO * 0.19, 0.5 + step) for step in (0.02, -0.02))
     # derivatives hold the field of normals that a truncation samples, differences move
     # it: what truncations differ by
@@ -174,7 +174,7 @@ def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens):
         scatter_rad(
             ready.pillars(d.state())[lens.diameters.diameter_um > 0].numpy(), base
         )
-        for d in draws(Spread.only(length_nm=5.0), 60, seed=5)
+        for d in draw_lenses(Spread.only(length_nm=5.0), 60, seed=5)
     ]
     there = lens.diameters.diameter_um > 0
     up, down = (anew(lens, length=step)[there] for step in (2e-3, -2e-3))
@@ -250,14 +250,14 @@ def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(
 
 def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     plain = dataclasses.replace(lens, cell=dataclasses.replace(CELL, shape=Circle()))
-    assert lacking(plain.cell) == (
+    assert inapplicable_names(plain.cell) == (
         "width_nm",
         "length_nm",
         "turn_deg",
         "pedestal_nm",
         "cap_nm",
     )
-    assert lacking(CELL) == ("pedestal_nm", "cap_nm")
+    assert inapplicable_names(CELL) == ("pedestal_nm", "cap_nm")
     with pytest.raises(FitError, match="length_nm"):
         pillar_slopes.log_response_slopes(plain, wanted={"length_nm"})
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
@@ -265,5 +265,5 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
         ErrorBudget(plain, BudgetInputs(mask=Printed(spread=Spread.only(width_nm=1.0))))
     assert State.of({"width_nm": 3.0}).answers()[
-        named(ResponseError).index("width_nm")
+        names_of_kind(ResponseError).index("width_nm")
     ] == pytest.approx(3e-3)

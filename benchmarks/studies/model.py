@@ -27,7 +27,7 @@ from metalens import design, library, rcwa
 from metalens.cell import Cell, Film, Index
 from metalens.core.arrays import Array
 from metalens.design import Focus
-from metalens.design.neighbours import neighbours
+from metalens.design.neighbours import estimate_neighbour_coupling
 from metalens.image import (
     Frames,
     Grid,
@@ -366,7 +366,9 @@ def neighbour_rows() -> Iterator[Row]:
     na, distance, counts = rows_of_unlike.LENSES[0]
     lens = rows_of_unlike.lens_at(distance)
     found, seconds = timed(
-        lambda: neighbours(lens, counts=counts, harmonics=rows_of_unlike.HARMONICS)
+        lambda: estimate_neighbour_coupling(
+            lens, counts=counts, harmonics=rows_of_unlike.HARMONICS
+        )
     )
     cut = rows_of_unlike.solved_whole(lens, "x")
     _, after, before = rows_of_unlike.judged(

@@ -26,7 +26,7 @@ from metalens.cell import Cell
 from metalens.commands.library import CellFile
 from metalens.core import config
 from metalens.core.arrays import Array
-from metalens.design.neighbours import neighbours, printed
+from metalens.design.neighbours import drawn_diameter_range, estimate_neighbour_coupling
 from metalens.lens import Lens, NeighbourRows
 from metalens.psf import among
 from metalens.rcwa import solve_row
@@ -46,7 +46,7 @@ def rows() -> Iterator[Row]:
     """
     for na, distance, counts in LENSES:
         lens = lens_at(distance)
-        found = neighbours(lens, counts=counts, harmonics=HARMONICS)
+        found = estimate_neighbour_coupling(lens, counts=counts, harmonics=HARMONICS)
         for place, (polarization, along) in enumerate(
             (("x", "along"), ("y", "across"))
         ):
@@ -165,7 +165,9 @@ def solved_whole(lens: Lens, polarization: str) -> Cut:
     count, width = len(x), len(x) * cell.pitch_um
     phase = _phase(lens)
     sizes = np.asarray(
-        lens.proxy.diameter_um(phase, wave, within_um=printed(lens), gap="nearest")
+        lens.proxy.diameter_um(
+            phase, wave, within_um=drawn_diameter_range(lens), gap="nearest"
+        )
     )
     about = {"polarization": polarization, "harmonics": HARMONICS}
     row = solve_row(cell, sizes, wave, **about)

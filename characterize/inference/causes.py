@@ -27,7 +27,13 @@ from characterize.model import (
 )
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.fabrication import CDError, ResponseError, WavefrontError, maps, named
+from metalens.fabrication import (
+    CDError,
+    ResponseError,
+    WavefrontError,
+    derivative_maps,
+    names_of_kind,
+)
 from metalens.lens import Lens
 from metalens.optics import Stop
 
@@ -47,7 +53,7 @@ _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
-_OF_MASK = {*named(CDError), *named(ResponseError)}
+_OF_MASK = {*names_of_kind(CDError), *names_of_kind(ResponseError)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -288,7 +294,9 @@ def _of_phase(
     )
     sized = bent[:MODES] * prior_rad()[:, None, None, None]
     yield ImageChange("a smooth phase that no parameter describes", sized)
-    known = [slopes.get(name, np.zeros_like(image)) for name in named(WavefrontError)]
+    known = [
+        slopes.get(name, np.zeros_like(image)) for name in names_of_kind(WavefrontError)
+    ]
     every = np.concatenate([bent, np.stack(known)])
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
@@ -365,7 +373,7 @@ def write_fields(lens: Lens) -> Array:
     shapes = np.concatenate(
         [
             smooth_phase_changes(u, v, MODES + 3),
-            maps(WavefrontError, u, v),
+            derivative_maps(WavefrontError, u, v),
             np.ones((1, len(u))),
         ]
     )

@@ -33,7 +33,7 @@ from characterize.model import (
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.fabrication import coarser
+from metalens.fabrication import wavelength_scale
 from metalens.lens import Lens
 
 WAVES_RAD = 0.9
@@ -576,7 +576,7 @@ def window_um(found: FrameArrangement, model: ForwardModel) -> tuple[float, floa
         found: how the frames lie.
         model: the forward model.
     """
-    most = _ASIDE_UM * coarser(model.lens.wavelength_um)
+    most = _ASIDE_UM * wavelength_scale(model.lens.wavelength_um)
     x, y = (
         float(np.clip(-shift * model.setting.pixel_um, -most, most))
         for shift in found.shift_px[::-1]
@@ -613,7 +613,7 @@ def starting_points(
             base,
             {
                 "bias_nm": base[PLACE["bias_nm"]]
-                + bias * coarser(model.lens.wavelength_um)
+                + bias * wavelength_scale(model.lens.wavelength_um)
             },
         )
         light = model.images(with_values(x, {"background_e": 0.0}))[0]
@@ -649,7 +649,7 @@ def _twins(task: SearchTask, best: FitSolution) -> list[Array]:
     out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]
     if "bias_nm" in task.names:
         i = task.names.index("bias_nm")
-        far_nm = _ALONG_NM * coarser(task.model.lens.wavelength_um)
+        far_nm = _ALONG_NM * wavelength_scale(task.model.lens.wavelength_um)
         along = far_nm * best.covariance[:, i] / best.covariance[i, i]
         for sign in (1, -1):
             moved = np.clip(best.value + sign * along, task.prior.low, task.prior.high)

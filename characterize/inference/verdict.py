@@ -24,7 +24,7 @@ from characterize.inference.uncertainty import Posterior
 from characterize.model import FitParameter, ForwardModel, KnownValue
 from metalens.core import threads
 from metalens.core.arrays import Array
-from metalens.fabrication import coarser
+from metalens.fabrication import wavelength_scale
 from metalens.lens import Lens
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
@@ -207,7 +207,7 @@ def spectrum_text(lens: Lens, known: Mapping[str, KnownValue]) -> list[str]:
     bandwidth_nm = known["bandwidth_nm"].value if "bandwidth_nm" in known else 0.0
     low, high = (edge * 1e3 for edge in lens.proxy.wavelengths_um)
     first, last = (lens.wavelength_um * 1e3 + reach * bandwidth_nm for reach in (-2, 2))
-    room = max(high - low, _ONE_COLOUR_NM * coarser(lens.wavelength_um))
+    room = max(high - low, _ONE_COLOUR_NM * wavelength_scale(lens.wavelength_um))
     if low - room <= first and last <= high + room:
         return []
     return [

@@ -37,7 +37,13 @@ from characterize.model.setting import (
 from characterize.model.window import WindowOperators
 from metalens.core import threads
 from metalens.core.arrays import Array
-from metalens.fabrication import CDError, ResponseError, Sensitivity, named, of_kind
+from metalens.fabrication import (
+    CDError,
+    ResponseError,
+    Sensitivity,
+    names_of_kind,
+    of_kind,
+)
 from metalens.lens import Lens
 
 GEOMETRY = (
@@ -45,7 +51,8 @@ GEOMETRY = (
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
 WIDENING, ANSWERING = (
-    {name: n for n, name in enumerate(named(kind))} for kind in (CDError, ResponseError)
+    {name: n for n, name in enumerate(names_of_kind(kind))}
+    for kind in (CDError, ResponseError)
 )
 EVERY = slice(None)
 Light = tuple[Array, dict[str, Array]]  # and its derivatives by name

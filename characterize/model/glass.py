@@ -115,7 +115,9 @@ class FilmStack:
         sine2 = 1 - 1 / steep
         far = distance_um
         if not self.none_behind:
-            far = media.bend(self.pairs(distance_um), sine2) / math.sqrt(steep)
+            far = media.reach_per_direction(self.pairs(distance_um), sine2) / math.sqrt(
+                steep
+            )
         return far * tangents[0], far * tangents[1]
 
     def drift(self, tangents: tuple[float, float]) -> tuple[float, float]:
@@ -196,12 +198,19 @@ def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
     )
     node, to_series = _nodes()
     w, along_um = (
-        media.square(pairs, most_um2 / 2 * (1 + node)),
+        media.solve_direction_square(pairs, most_um2 / 2 * (1 + node)),
         sum(n * t for n, t in pairs),
     )
-    level = np.sqrt(media.passed_at(order, w) / media.widening(pairs, w))
+    level = np.sqrt(
+        media.passed_at(order, w) / media.area_spreading_of_square(pairs, w)
+    )
     found = to_series @ np.stack(
-        [media.whole_path(pairs, w) - along_um, media.bend(pairs, w), level], 1
+        [
+            media.whole_path(pairs, w) - along_um,
+            media.reach_per_direction(pairs, w),
+            level,
+        ],
+        1,
     )
     chord, bend, level = (
         chebyshev.chebtrim(one, _ROUNDING * np.abs(one).max()) for one in found.T

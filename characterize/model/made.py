@@ -19,15 +19,16 @@ from metalens.fabrication import (
     PairTable,
     Sensitivity,
     WavefrontError,
-    biased,
+    bias_ratio,
     perturbations,
-    transmission,
+    perturbed_transmission,
 )
 from metalens.lens import DiameterMap, Lens
 
 _TABLE = 1 << 16
 _NODES = max(
-    perturbations.polynomials(kind).shape[-1] for kind in (CDError, WavefrontError)
+    perturbations.polynomial_coefficients(kind).shape[-1]
+    for kind in (CDError, WavefrontError)
 )
 
 if TYPE_CHECKING:
@@ -97,12 +98,12 @@ def _of_one_size(
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
     place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
     diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
-    t = transmission(
+    t = perturbed_transmission(
         lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad
     )
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]
-    return np.asarray(t * biased(response, np.nan_to_num(grown, nan=low), bias_um))
+    return np.asarray(t * bias_ratio(response, np.nan_to_num(grown, nan=low), bias_um))
 
 
 def _on_pillars(

@@ -22,9 +22,9 @@ from metalens.fabrication import (
     ResponseError,
     State,
     WavefrontError,
-    coarser,
-    larger,
-    named,
+    names_of_kind,
+    prior_scale,
+    wavelength_scale,
 )
 from metalens.lens import Lens
 
@@ -102,7 +102,10 @@ def _light(name: str, meaning: str) -> FitParameter:
 
 _OF_LENS = {row.name: _of(row) for row in PERTURBATIONS}
 PARAMETERS: tuple[FitParameter, ...] = (
-    *(_OF_LENS[name] for name in (*named(CDError), *named(ResponseError))),
+    *(
+        _OF_LENS[name]
+        for name in (*names_of_kind(CDError), *names_of_kind(ResponseError))
+    ),
     FitParameter(
         "wavelength_nm",
         "wavelength minus stated",
@@ -252,7 +255,7 @@ PARAMETERS: tuple[FitParameter, ...] = (
         effect="a tilt of {:g} um of glass about x",
         probe=5.0,
     ),
-    *(_OF_LENS[name] for name in named(WavefrontError)),
+    *(_OF_LENS[name] for name in names_of_kind(WavefrontError)),
     _light(
         "light_x",
         "ln of the irradiance at the +x rim of the lens over that at its axis",
@@ -393,7 +396,8 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
     """
     wave = lens.wavelength_um
     factors = [
-        coarser(wave) if name in _IN_PIXELS else larger(name, wave) for name in names
+        wavelength_scale(wave) if name in _IN_PIXELS else prior_scale(name, wave)
+        for name in names
     ]
     rows = [
         _times(PARAMETERS[PLACE[name]], factor)
@@ -421,7 +425,7 @@ def type_b_sigma(name: str, lens: Lens) -> float:
     if name in PLACE:
         return usual_parameters([name], lens)[0].unstated
     row = next(row for row in UNFITTED if row.name == name)
-    return row.sigma * larger(name, lens.wavelength_um)
+    return row.sigma * prior_scale(name, lens.wavelength_um)
 
 
 def _times(row: FitParameter, factor: float) -> FitParameter:

@@ -25,11 +25,11 @@ from metalens.fabrication import (
     ResponseError,
     Sensitivity,
     Solved,
-    lacking,
+    inapplicable_names,
     of_kind,
     own_rates,
     pair_sensitivities,
-    sensitivity,
+    proxy_sensitivity,
 )
 from metalens.lens import Lens
 
@@ -64,7 +64,7 @@ def log_response_slopes(
     (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` adds what
     the
     truncation leaves. Cells that no solver takes get the effective-index slopes of
-    :func:`metalens.fabrication.sensitivity`, pillars that are not round those of their
+    :func:`metalens.fabrication.proxy_sensitivity`, pillars that are not round those of their
     own
     shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
     lens.
@@ -81,7 +81,7 @@ def log_response_slopes(
         FitError: a cause is wanted that pillars of this shape cannot have. CellError,
             MaterialError: pillars that are not round, and that no solver takes.
     """
-    for name in lacking(lens.cell):
+    for name in inapplicable_names(lens.cell):
         if name in wanted:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
     if lens.pairs is not None:
@@ -94,7 +94,7 @@ def log_response_slopes(
     except (CellError, MaterialError):
         if not lens.cell.round:
             raise
-        return sensitivity(lens)
+        return proxy_sensitivity(lens)
 
 
 def _of_pairs(lens: Lens) -> Sensitivity:
@@ -181,7 +181,7 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
     """:func:`log_response_slopes` by the solvers."""
     if not lens.cell.round:
-        return sensitivity(lens)
+        return proxy_sensitivity(lens)
     table = solving.solved_transmission(lens) if _upright(lens.cell) else None
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())

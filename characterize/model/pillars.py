@@ -26,14 +26,14 @@ from metalens.fabrication import (
     PairTable,
     ResponseError,
     Sensitivity,
-    answer,
-    biased,
-    coarser,
-    designed,
-    lacking,
-    larger,
+    bias_ratio,
+    designed_transmission,
+    inapplicable_names,
     of_kind,
-    transmission,
+    perturbed_transmission,
+    prepare_response,
+    prior_scale,
+    wavelength_scale,
 )
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
@@ -78,15 +78,18 @@ class ChangeRange:
         """Of lenses for a wavelength: lengths are larger where it is longer
         (``made.coarser``).
         """
-        more, rows = coarser(wavelength_um), zip(_ROWS, cls().answers, strict=True)
+        more, rows = (
+            wavelength_scale(wavelength_um),
+            zip(_ROWS, cls().answers, strict=True),
+        )
         answers = tuple(
-            amount * larger(row.name, wavelength_um) for row, amount in rows
+            amount * prior_scale(row.name, wavelength_um) for row, amount in rows
         )
         return cls(more * cls().bias_um, answers, more * cls().wavelength_um)
 
     def within(self, cell: Cell) -> "ChangeRange":
         """Without what pillars of this cell cannot have."""
-        none = lacking(cell)
+        none = inapplicable_names(cell)
         kept = (
             0.0 if row.name in none else amount
             for row, amount in zip(_ROWS, self.answers, strict=True)
@@ -127,7 +130,9 @@ class PillarResponse:
         )
         self.diameter_um = self._kinds()
         b = max(
-            7, 2 * math.ceil(span.bias_um / (0.006 * coarser(lens.wavelength_um))) + 1
+            7,
+            2 * math.ceil(span.bias_um / (0.006 * wavelength_scale(lens.wavelength_um)))
+            + 1,
         )
         for times in self._laid:  # resonances want more
             self._lay(times * (b - 1) + 1, tolerance)
@@ -163,7 +168,7 @@ class PillarResponse:
         edges add to the size.
         """
         d = self.diameter_um + nodes
-        return answer(self.lens.proxy, self.response, d), biased(
+        return prepare_response(self.lens.proxy, self.response, d), bias_ratio(
             self.response, d, nodes
         )
 
@@ -174,7 +179,7 @@ class PillarResponse:
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
         amounts = np.array(change.answers)
-        return transmission(
+        return perturbed_transmission(
             self.lens.proxy,
             self.response,
             d,
@@ -239,7 +244,9 @@ class PillarResponse:
                 )
             )
         d = self.diameter_um + self.nodes_um[:, None]
-        return designed(self.lens.proxy, d, wave_um, angle_rad=self.angle_rad)
+        return designed_transmission(
+            self.lens.proxy, d, wave_um, angle_rad=self.angle_rad
+        )
 
     def _through_colours(self) -> Array:
         """(colours, b, grid) :meth:`_designed_at` over the span of wavelengths; none

@@ -15,7 +15,7 @@ from characterize.model.pillars import PillarResponse
 from characterize.model.reduced import CompressedLens
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
-from metalens.fabrication import CDError, WavefrontError, maps, named
+from metalens.fabrication import CDError, WavefrontError, derivative_maps, names_of_kind
 from metalens.lens import Lens
 
 LEAST_NM = (
@@ -145,7 +145,7 @@ def background_planes(x: Array, setting: FrameSetting) -> Array:
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
-BENDING = {name: n for n, name in enumerate(named(WavefrontError))}
+BENDING = {name: n for n, name in enumerate(names_of_kind(WavefrontError))}
 LIGHT = ("light_x", "light_y", "light_r")
 
 
@@ -189,7 +189,8 @@ class AngleGroup:
     ) -> "AngleGroup":
         """Without a residual phase."""
         bending, widening = (
-            maps(kind, reduced.u, reduced.v) for kind in (WavefrontError, CDError)
+            derivative_maps(kind, reduced.u, reduced.v)
+            for kind in (WavefrontError, CDError)
         )
         return cls(
             index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape))

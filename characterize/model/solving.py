@@ -17,10 +17,10 @@ from metalens.fabrication import (
     Perturbation,
     ResponseError,
     Solved,
-    coarser,
-    designed,
-    larger,
+    designed_transmission,
     of_kind,
+    prior_scale,
+    wavelength_scale,
 )
 from metalens.lens import Lens
 from metalens.library import curve, engines
@@ -67,10 +67,12 @@ def solved_transmission(lens: Lens) -> Solved | None:
         modal.solve(lens.cell, one, lens.wavelength_um, tolerance=TOLERANCE).t
         for one in some.tolist()
     ]
-    ratio = np.array(exact) / designed(lens.proxy, some, lens.wavelength_um)
+    ratio = np.array(exact) / designed_transmission(
+        lens.proxy, some, lens.wavelength_um
+    )
     if np.abs(ratio * np.exp(-1j * np.angle(ratio.mean())) - 1).max() > _SAME:
         return None
-    reach = REACH_UM * coarser(lens.wavelength_um)
+    reach = REACH_UM * wavelength_scale(lens.wavelength_um)
     low, high = max(least - reach, 0.03 * pitch), min(most + reach, 0.985 * pitch)
     return _solved(lens.cell, lens.wavelength_um, round(low, 6), round(high, 6))
 
@@ -80,7 +82,7 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     """One rational curve over the diameter for every amount of every cause, sampled
     finely.
     """
-    fine = _FINE_UM * coarser(wavelength_um)
+    fine = _FINE_UM * wavelength_scale(wavelength_um)
     diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / fine) + 1)
     changes = _changes(wavelength_um)
     cells = [
@@ -127,7 +129,7 @@ def _changes(wavelength_um: float) -> list[tuple[int, Perturbation, tuple[float,
     out = []
     for n, (_, row) in enumerate(of_kind(ResponseError)):
         if isinstance(row.acts, ResponseError) and row.acts.exact:
-            most = _ROOM * row.high * row.unit * larger(row.name, wavelength_um)
+            most = _ROOM * row.high * row.unit * prior_scale(row.name, wavelength_um)
             out.append(
                 (n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact]))
             )

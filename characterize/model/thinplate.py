@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from metalens.core.arrays import Array
-from metalens.fabrication import WavefrontError, maps
+from metalens.fabrication import WavefrontError, derivative_maps
 
 MODES, KNOTS, EXPECTED_RAD = 24, 9, 0.3
 _GRID = 61
@@ -64,7 +64,10 @@ def _known(u: Array, v: Array) -> Array:
     defocus, aberrations.
     """
     return np.concatenate(
-        [np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(WavefrontError, u, v)]
+        [
+            np.stack([np.ones_like(u), u, v, u * u + v * v]),
+            derivative_maps(WavefrontError, u, v),
+        ]
     )
 
 

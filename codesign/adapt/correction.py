@@ -27,7 +27,7 @@ from metalens.fabrication import (
     Sensitivity,
     State,
     of_process,
-    transmission,
+    perturbed_transmission,
 )
 from metalens.lens import DiameterMap, Lens
 
@@ -268,7 +268,11 @@ def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -
     wave = design.wavelength_um
     now, meant = (
         np.unwrap(
-            np.angle(transmission(design.proxy, response, fine, wave, made.answers()))
+            np.angle(
+                perturbed_transmission(
+                    design.proxy, response, fine, wave, made.answers()
+                )
+            )
         )
         for made in (process_state_of(x), State.of())
     )

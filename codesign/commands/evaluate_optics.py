@@ -110,7 +110,9 @@ def _measure(
         for name, lens in pairs
     }
     spread = [
-        name for name, lens in zip(names, made, strict=True) if not design.focused(lens)
+        name
+        for name, lens in zip(names, made, strict=True)
+        if not design.lens_has_focus(lens)
     ]
     told = [f"{name} {SPREAD}" for name in spread]
     try:

@@ -37,7 +37,7 @@ from metalens.cell import Incidence
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, LensError, PropagationError, SceneError
 from metalens.design import neighbours as supercell
-from metalens.fabrication import Printed, State, draws
+from metalens.fabrication import Printed, State, draw_lenses
 from metalens.image import (
     Imager,
     Optics,
@@ -575,7 +575,7 @@ class ErrorBudget:
     def _solver(self) -> Iterator[BudgetEntry]:
         """Solver and proxy, against the solver at thirty times the precision."""
         lens, library = self.lens, self.given.library
-        at = np.linspace(*supercell.printed(lens), SOLVED)
+        at = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
         tolerance = library.sweep.bar if library else self.given.tolerance
         engine = engines.choose_engine(lens.cell)
         solve = engines.solve_to_tolerance(
@@ -616,7 +616,7 @@ class ErrorBudget:
             yield BudgetEntry("neighbours", rms[0], rms[1], rms[2], method)
             return
         try:
-            rows_of = supercell.neighbours(lens)
+            rows_of = supercell.estimate_neighbour_coupling(lens)
         except CellError:
             return  # films or tilted walls: rows of those are not solved
         counts = ", ".join(map(str, row_lengths(rows_of, lens.cell.pitch_um)))
@@ -644,7 +644,7 @@ class ErrorBudget:
         if self.given.mask is None:
             return
         spread, count = self.given.mask.spread, self.given.draws
-        lenses = [(draw.state(), 0.0) for draw in draws(spread, count, seed=5)]
+        lenses = [(draw.state(), 0.0) for draw in draw_lenses(spread, count, seed=5)]
         method = f"{count} draws of the process, lens not measured"
         yield self._rms("process spread", lenses, method)
 

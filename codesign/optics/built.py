@@ -26,8 +26,8 @@ from metalens.fabrication import (
     PERTURBATIONS,
     Sensitivity,
     State,
-    sensitivity,
-    transmission,
+    perturbed_transmission,
+    proxy_sensitivity,
 )
 from metalens.image import (
     Field,
@@ -183,7 +183,7 @@ class MadeLens:
         self.design, self.settings, self.response = (
             design,
             settings,
-            response or sensitivity(design),
+            response or proxy_sensitivity(design),
         )
         d = design.diameters
         self._field = Field(math.radians(settings.angle_deg))
@@ -341,7 +341,7 @@ class MadeLens:
         low = float(self._diameter_um[self._diameter_um > 0].min()) - reach
         count = int((float(self._diameter_um.max()) + reach - low) / TABLE_STEP_UM) + 2
         grid = low + TABLE_STEP_UM * np.arange(count)
-        t = transmission(
+        t = perturbed_transmission(
             self.design.proxy,
             self.response,
             grid,

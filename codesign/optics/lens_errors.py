@@ -21,7 +21,14 @@ from metalens import library
 from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.fabrication import DRAWN, Draw, ResponseError, State, guide, of_kind
+from metalens.fabrication import (
+    DRAWN,
+    Draw,
+    ResponseError,
+    State,
+    effective_indices,
+    of_kind,
+)
 from metalens.library import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
@@ -227,7 +234,7 @@ def phase_rates(cell: Cell, wavelength_um: float) -> PhaseRates:
     start = proxy.phase_rad(np.array([proxy.domain_um[0]]), wavelength_um)[0]
     even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
     diameter = np.asarray(proxy.diameter_um(even, wavelength_um))
-    seen = guide(cell, proxy, wavelength_um, diameter)
+    seen = effective_indices(cell, proxy, wavelength_um, diameter)
     quick = [
         row.acts.quick(seen).imag
         for _, row in of_kind(ResponseError)

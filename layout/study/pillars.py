@@ -14,7 +14,7 @@ from metalens.fabrication import (
     PairSensitivities,
     PairTable,
     State,
-    transmission,
+    perturbed_transmission,
 )
 from metalens.lens import Lens
 from metalens.library import Proxy
@@ -43,7 +43,7 @@ class OneSize:
         """(bias, kinds) complex t for local biases and one made lens."""
         bias = np.reshape(bias_um, (-1, 1))
         d = self.diameter_um + bias
-        return transmission(
+        return perturbed_transmission(
             self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias
         )
 

@@ -24,7 +24,7 @@ from layout.study.pillars import PillarKindsOfLens, classify_pillars
 from layout.study.sensitivity import LogSensitivities
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
-from metalens.fabrication import Draw, PairSensitivities, Spread, State, draws
+from metalens.fabrication import Draw, PairSensitivities, Spread, State, draw_lenses
 from metalens.lens import Lens
 
 _BAND, _PARTS = (
@@ -100,7 +100,7 @@ def reduce_spread(
         seed: of the random draws.
     """
     index, count, pillars = classify_pillars(lens, sens)
-    states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
+    states = [draw.state() for draw in draw_lenses(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
     angle = rng.uniform(0, 2 * np.pi, _SAMPLES)

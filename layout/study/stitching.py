@@ -15,7 +15,7 @@ from layout.mask.fields import FieldPlan
 from layout.process.process import Process
 from layout.study.focus import FocusSums, FocusWindow, focus_window, prepare_focus
 from metalens.core.arrays import Array
-from metalens.fabrication import designed
+from metalens.fabrication import designed_transmission
 from metalens.lens import Lens
 from metalens.psf import find_peak
 
@@ -132,7 +132,7 @@ def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
             :, columns
         ].astype(np.complex64)
     inside = np.where(d > 0, d, lens.proxy.domain_um[0])
-    t = designed(lens.proxy, inside, lens.wavelength_um) * np.exp(
+    t = designed_transmission(lens.proxy, inside, lens.wavelength_um) * np.exp(
         1j * lens.geometric_rad(rows)
     )
     return np.where(d > 0, t, 0)[:, columns].astype(np.complex64)

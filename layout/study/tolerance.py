@@ -13,8 +13,13 @@ from layout.study.spread_model import SpreadModel, reduce_spread, reduction_erro
 from metalens.core import executor, threads
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
-from metalens.fabrication import Draw, PairSensitivities, State, pair_sensitivities
-from metalens.fabrication import draws as draw_lenses
+from metalens.fabrication import (
+    Draw,
+    PairSensitivities,
+    State,
+    draw_lenses,
+    pair_sensitivities,
+)
 from metalens.lens import Lens, reach
 from metalens.psf import encircled_power, find_peak, fwhm
 

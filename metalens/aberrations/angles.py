@@ -225,7 +225,7 @@ def _brightness(
         falls = (1 - p * p) ** 2
     else:
         falls = 1 / float(
-            media.spread(lens.layers.before(depth_um, lens.wavelength_um), p)
+            media.area_spreading(lens.layers.before(depth_um, lens.wavelength_um), p)
         )
     return falls / abs(float(np.linalg.det(chief.moves)))
 

@@ -126,7 +126,7 @@ def chief_ray(
     return ChiefRay(
         at,
         p,
-        at + media.bend(after.layers, w) * p,
+        at + media.reach_per_direction(after.layers, w) * p,
         focus,
         np.asarray(error),
         source,
@@ -150,7 +150,7 @@ def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Ar
         return tangents
     p = slope / math.hypot(1, slope)
     return np.asarray(
-        -media.reach(lens.layers.before(depth_um, lens.wavelength_um), p)
+        -media.lateral_reach(lens.layers.before(depth_um, lens.wavelength_um), p)
         / slope
         * tangents
     )
@@ -161,7 +161,12 @@ def _arriving(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
     if math.isinf(depth_um):
         return np.asarray(source / math.sqrt(1 + float(source @ source)))
     layers, away = lens.layers.before(depth_um, lens.wavelength_um).layers, x - source
-    return np.asarray(away / media.bend(layers, media.square(layers, away @ away)))
+    return np.asarray(
+        away
+        / media.reach_per_direction(
+            layers, media.solve_direction_square(layers, away @ away)
+        )
+    )
 
 
 def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
@@ -181,7 +186,9 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
         p / math.sqrt(1 - float(p @ p)), depth_um, lens.wavelength_um
     )
     p = slopes / math.sqrt(1 + float(slopes @ slopes))
-    return np.asarray(stop.centre_um + media.bend(between.layers, float(p @ p)) * p)
+    return np.asarray(
+        stop.centre_um + media.reach_per_direction(between.layers, float(p @ p)) * p
+    )
 
 
 def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:

@@ -26,7 +26,7 @@ def focus_problem(
     phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console
 ) -> bool:
     """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
-    if design.focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
+    if design.has_focus(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
         return True
     elsewhere = design.meeting_um(
         phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um

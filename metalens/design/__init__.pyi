@@ -15,8 +15,8 @@ from .focus_check import FocusCheck as FocusCheck
 from .focus_check import check_focus as check_focus
 from .focus_check import focus_figures as focus_figures
 from .focusing import field_angle as field_angle
-from .focusing import focused as focused
-from .focusing import focuses as focuses
+from .focusing import has_focus as has_focus
+from .focusing import lens_has_focus as lens_has_focus
 from .focusing import lens_meeting_um as lens_meeting_um
 from .focusing import meeting_um as meeting_um
 from .own_cell import NeighbourCouplingLoss as NeighbourCouplingLoss

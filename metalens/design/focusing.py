@@ -26,7 +26,9 @@ PLACES, SEARCHED = 61, 121  # points across the lit part of a lens, and to look 
 HALF_LIGHT = 0.5  # of the light at angle 0, below which the field behind a stop ends
 
 
-def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> bool:
+def has_focus(
+    phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float
+) -> bool:
     """Whether rays from the design source meet in one bright spot of the sensor.
 
     An axicon, a hologram and a plain vortex scatter their rays, a vortex in a focus
@@ -42,7 +44,7 @@ def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) 
     if (w[inside] >= after.layers[0][0] ** 2).mean() > SPREAD:
         return False
     inside &= w < 0.999 * after.layers[0][0] ** 2
-    bend = media.bend(after.layers, np.where(inside, w, 0.0))
+    bend = media.reach_per_direction(after.layers, np.where(inside, w, 0.0))
     meets = [(a + bend * p)[inside] for a, p in ((x, px), (y, py))]
     if np.hypot(*(m.std() for m in meets)) > SPREAD * np.hypot(
         x[inside].std(), y[inside].std()
@@ -58,13 +60,13 @@ def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) 
     return bool(not centred or abs(lit.mean()) ** 2 > DARK)
 
 
-def focused(lens: Lens) -> bool:
-    """As :func:`focuses`, of the pillars of a lens: every place has the phase of the
+def lens_has_focus(lens: Lens) -> bool:
+    """As :func:`has_focus`, of the pillars of a lens: every place has the phase of the
     pillar next to it.
     """
     phase, focus, radius_um = _nearest(lens)
     pitch_um = lens.diameters.pitch_um
-    return focuses(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
+    return has_focus(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
 
 
 def lens_meeting_um(lens: Lens) -> tuple[float, float, float] | None:
@@ -118,7 +120,7 @@ def meeting_um(
     if inside.sum() < RAYS:
         return None
     # sideways way to the sensor over p; through air that of the slope u times z
-    bend = media.bend(after.layers, np.where(inside, w, 0.0))[inside]
+    bend = media.reach_per_direction(after.layers, np.where(inside, w, 0.0))[inside]
     z_um = focus.sensor_distance_um
     places = np.stack([x[inside], y[inside]])
     slopes = np.stack([px[inside], py[inside]]) * bend / z_um

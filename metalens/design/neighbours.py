@@ -23,7 +23,7 @@ LONG = 6  # pillars: of shorter rows several are solved
 STEEPEST = 0.95
 
 
-def neighbours(
+def estimate_neighbour_coupling(
     lens: Lens,
     *,
     counts: tuple[int, ...] = (6, 5),
@@ -91,7 +91,10 @@ def _mean(
     for begin in range(begins):
         wanted = 2 * np.pi * (np.arange(count) + 0.25 + begin / begins) / count
         diameters = lens.proxy.diameter_um(
-            wanted, lens.wavelength_um, within_um=printed(lens), gap="nearest"
+            wanted,
+            lens.wavelength_um,
+            within_um=drawn_diameter_range(lens),
+            gap="nearest",
         )
         found.append(_blazed(lens, np.asarray(diameters), harmonics, diagonal))
     return np.mean([ratio for ratio, _ in found], axis=0), float(
@@ -142,7 +145,7 @@ def _blazed(
     return np.array(ratios), float(np.mean(lost))
 
 
-def printed(lens: Lens) -> tuple[float, float]:
+def drawn_diameter_range(lens: Lens) -> tuple[float, float]:
     """(least, largest) diameter of the lens's pillars, within its proxy's domain."""
     built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = lens.proxy.domain_um

@@ -16,7 +16,7 @@ import numpy as np
 from metalens import rcwa
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError
-from metalens.design.neighbours import neighbours, printed
+from metalens.design.neighbours import drawn_diameter_range, estimate_neighbour_coupling
 from metalens.design.profiles import Focus
 from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.psf import NEIGHBOURS, LeftOut
@@ -48,7 +48,9 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
         raise CellError(
             "own_cell: rows of pillars of two sizes are not solved here; leave own_cell out"
         )
-    found = lens.neighbours or neighbours(lens, counts=_counts(lens, aperture))
+    found = lens.neighbours or estimate_neighbour_coupling(
+        lens, counts=_counts(lens, aperture)
+    )
     angle = (
         angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2
         if incidence_rad
@@ -89,7 +91,7 @@ def solve_coupling_rows(lens: Lens, *, radius_um: float) -> NeighbourRows:
         CellError: the cell has films or tilted walls, or no round pillars on a square
             lattice.
     """
-    return neighbours(
+    return estimate_neighbour_coupling(
         lens, counts=_counts(lens, float(_rings(lens, radius_um)[0].max()))
     )
 
@@ -177,7 +179,7 @@ def angle_change(lens: Lens, incidence_rad: float) -> float:
 
     A factor that all pillars share is taken out: it changes no PSF of sum 1.
     """
-    low, high = printed(lens)
+    low, high = drawn_diameter_range(lens)
     diameters = np.linspace(low, high, DIAMETERS)
     changes = []
     both: tuple[Literal["s", "p"], ...] = ("s", "p")

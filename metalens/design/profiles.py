@@ -53,12 +53,12 @@ class Focus:
                 path_difference(radius2_um2, near) + path_difference(radius2_um2, far)
             )
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um).layers
-        total = media.longer(after, 0.0, 0.0, radius2_um2)[1]
+        total = media.path_difference(after, 0.0, 0.0, radius2_um2)[1]
         if math.isfinite(self.source_distance_um):
             before = self.layers.before(
                 self.source_distance_um, self.wavelength_um
             ).layers
-            total = total + media.longer(before, 0.0, 0.0, radius2_um2)[1]
+            total = total + media.path_difference(before, 0.0, 0.0, radius2_um2)[1]
         return np.asarray(total)
 
     def aperture(self, radius_um: float) -> float:
@@ -66,7 +66,7 @@ class Focus:
         towards the sensor.
         """
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um)
-        return float(media.direction(after, radius_um))
+        return float(media.ray_direction(after, radius_um))
 
     def paths_from(
         self, x_um: Array, y_um: Array, tangent: float
@@ -87,10 +87,10 @@ class Focus:
                 found.append(np.asarray(x_um * sine))
                 continue
             pairs = (gap or self.layers.before(far, self.wavelength_um)).layers
-            reach = side * sine * media.bend(pairs, sine**2)
+            reach = side * sine * media.reach_per_direction(pairs, sine**2)
             found.append(
                 np.asarray(
-                    media.longer(
+                    media.path_difference(
                         pairs, sine**2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um
                     )[1]
                 )

@@ -452,7 +452,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
 )
 
 
-def coarser(wavelength_um: float) -> float:
+def wavelength_scale(wavelength_um: float) -> float:
     """How much larger what the table gives in nm is for a lens of this wavelength:
     wavelength / 0.85 um, 1 at least.
 
@@ -466,15 +466,15 @@ def coarser(wavelength_um: float) -> float:
     return max(1.0, wavelength_um / USUAL_UM)
 
 
-def larger(name: str, wavelength_um: float) -> float:
+def prior_scale(name: str, wavelength_um: float) -> float:
     """By which prior and bounds of a row are multiplied for a wavelength:
-    :func:`coarser` of what is given in nm.
+    :func:`wavelength_scale` of what is given in nm.
 
     Args:
         name: of a row of the table.
         wavelength_um: vacuum wavelength, um.
     """
-    return coarser(wavelength_um) if name.endswith("_nm") else 1.0
+    return wavelength_scale(wavelength_um) if name.endswith("_nm") else 1.0
 
 
 def of_kind(
@@ -490,7 +490,7 @@ def of_kind(
     )
 
 
-def named(
+def names_of_kind(
     kind: type[CDError] | type[ResponseError] | type[WavefrontError],
 ) -> tuple[str, ...]:
     """Names of the causes that act in one way, in order.
@@ -506,11 +506,14 @@ def with_missing(rows: Sequence[Array]) -> Array:
     not there are 0.
     """
     return np.stack(
-        [*rows, *[np.zeros_like(rows[0])] * (len(named(ResponseError)) - len(rows))]
+        [
+            *rows,
+            *[np.zeros_like(rows[0])] * (len(names_of_kind(ResponseError)) - len(rows)),
+        ]
     )
 
 
-def lacking(cell: Cell) -> tuple[str, ...]:
+def inapplicable_names(cell: Cell) -> tuple[str, ...]:
     """Names of the causes that pillars of this kind cannot have: a round one has no
     length and no turn, one without layers no pedestal.
 
@@ -526,7 +529,7 @@ def lacking(cell: Cell) -> tuple[str, ...]:
     return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]
 
 
-def polynomials(kind: type[CDError] | type[WavefrontError]) -> Array:
+def polynomial_coefficients(kind: type[CDError] | type[WavefrontError]) -> Array:
     """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each cause."""
     return _polynomials(kind.__name__)
 
@@ -546,8 +549,13 @@ def _polynomials(kind: str) -> Array:
     return out
 
 
-def maps(kind: type[CDError] | type[WavefrontError], u: Array, v: Array) -> Array:
+def derivative_maps(
+    kind: type[CDError] | type[WavefrontError], u: Array, v: Array
+) -> Array:
     """(rows of the kind, *shape) derivative maps at lens places (u, v) over the radius."""
     return np.stack(
-        [np.polynomial.polynomial.polyval2d(u, v, each) for each in polynomials(kind)]
+        [
+            np.polynomial.polynomial.polyval2d(u, v, each)
+            for each in polynomial_coefficients(kind)
+        ]
     )

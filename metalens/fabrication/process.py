@@ -22,9 +22,9 @@ from metalens.fabrication.perturbations import (
     Drawn,
     ResponseError,
     WavefrontError,
-    lacking,
+    inapplicable_names,
     of_kind,
-    polynomials,
+    polynomial_coefficients,
 )
 
 DIAMETER_STEP_NM = 2  # one class of pillars each
@@ -100,7 +100,9 @@ class State:
         return self.amounts[[n for n, _ in of_kind(kind)]]
 
     def _polynomial(self, kind: type[CDError] | type[WavefrontError]) -> Array:
-        return np.asarray(np.tensordot(self._of(kind), polynomials(kind), 1))
+        return np.asarray(
+            np.tensordot(self._of(kind), polynomial_coefficients(kind), 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Spread(_Entries):  # type: ignore[misc]
         """
         apart = {row.drawn.name: row.name for row in PERTURBATIONS if row.drawn}
         for name, value in self.stated.items():
-            if value and apart[name] in lacking(cell):
+            if value and apart[name] in inapplicable_names(cell):
                 raise ProcessError(
                     f"spread.{name} = {value:g}: {cell.described} has none; need 0"
                 )
@@ -192,7 +194,7 @@ class Draw:
         )
 
 
-def draws(spread: Spread, count: int, *, seed: int) -> list[Draw]:
+def draw_lenses(spread: Spread, count: int, *, seed: int) -> list[Draw]:
     """``count`` lenses of a process: normal amounts, gradients in any direction.
 
     Args:

@@ -180,7 +180,7 @@ class Slopes(Protocol):
         ...
 
 
-def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
+def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     """Derivatives from the effective index of the pillars that the proxy's phase
     implies; of pillars that are not round on a square lattice those of their own shape,
     by exact derivatives of a solver (seconds a lens).
@@ -203,7 +203,7 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
         max(float(d.min()), lens.proxy.domain_um[0]),
         min(float(d.max()), lens.proxy.domain_um[1]),
     )
-    seen = guide(
+    seen = effective_indices(
         lens.cell,
         lens.proxy,
         lens.wavelength_um,
@@ -254,7 +254,7 @@ def _of_its_own(lens: Lens) -> Sensitivity:
     )
 
 
-def guide(
+def effective_indices(
     cell: Cell,
     proxy: Proxy,
     wavelength_um: float,
@@ -306,7 +306,7 @@ def guide(
     )
 
 
-def designed(
+def designed_transmission(
     proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0
 ) -> Array:
     """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at
@@ -348,7 +348,7 @@ def _levels(
     return np.asarray(phase), np.asarray(level)
 
 
-def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
+def prepare_response(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
     """What pillars of these diameters (any shape) do under any change of the process,
     made ready once for many.
 
@@ -366,10 +366,12 @@ def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
     inside = np.clip(diameter_um, solved.diameter_um[0], solved.diameter_um[-1])
     series = solved.series(inside)
     slopes[np.flatnonzero(solved.powers[:, 1:].any((1, 2)))] = 0.0
-    return Answer(slopes, series, designed(proxy, inside, solved.wavelength_um))
+    return Answer(
+        slopes, series, designed_transmission(proxy, inside, solved.wavelength_um)
+    )
 
 
-def biased(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
+def bias_ratio(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
     """t of pillars whose edges have moved by a bias to sizes ``d_um``, over that of
     pillars designed so.
 
@@ -384,7 +386,7 @@ def biased(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | flo
     return 1.0 if rate is None else np.exp(bias_um * rate)
 
 
-def transmission(
+def perturbed_transmission(
     proxy: Proxy,
     response: Slopes,
     d_um: Array,
@@ -394,21 +396,21 @@ def transmission(
     bias_um: Array | float = 0.0,
     angle_rad: float = 0.0,
 ) -> Array:
-    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc), or
+    """:func:`designed_transmission` under a change of the process: t exp(sum_c a_c d ln t / dc), or
     as the solver has it.
 
     Args:
         answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
             bias_um: what of the diameters is bias, of all edges alike, and no size of
-            the design (:func:`biased`).
+            the design (:func:`bias_ratio`).
         proxy: phase and |T| over the diameter.
         d_um: (*shape) diameters, um.
         wavelength_um: vacuum wavelength, um.
         angle_rad: angle of incidence in air, rad.
     """
-    changed = answer(proxy, response, d_um).factor(answers) * biased(
+    changed = prepare_response(proxy, response, d_um).factor(answers) * bias_ratio(
         response, d_um, bias_um
     )
     return np.asarray(
-        designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed
+        designed_transmission(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed
     )

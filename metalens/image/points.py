@@ -149,7 +149,9 @@ def sampling(
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     edge = float(
-        media.direction(after, torch.tensor(optics.wave.radius_um, dtype=torch.float64))
+        media.ray_direction(
+            after, torch.tensor(optics.wave.radius_um, dtype=torch.float64)
+        )
     )
     if edge > LARGEST_P * after.layers[0][0]:
         raise PropagationError(

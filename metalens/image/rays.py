@@ -82,25 +82,25 @@ def rays(
     turn = torch.arange(256, dtype=torch.float64, device=device) * (2 * math.pi / 256)
     rim = centre - radius * torch.stack([torch.cos(turn), torch.sin(turn)], -1)
     far = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
-    edge = media.direction(after, far)[:, None] * rim / far[:, None]
+    edge = media.ray_direction(after, far)[:, None] * rim / far[:, None]
     middle = (edge.amin(0) + edge.amax(0)) / 2
     py, px = torch.meshgrid(axis + middle[1], axis + middle[0], indexing="ij")
     p = torch.hypot(px, py).clamp(1e-12, 0.98 * after.layers[0][0])
-    out = media.reach(after, p) / p
+    out = media.lateral_reach(after, p) / p
     x, y = centre[0] - out * px, centre[1] - out * py
     r = torch.hypot(x, y).clamp_min(1e-9)
-    wide = torch.sqrt(media.spread(after, p))
+    wide = torch.sqrt(media.area_spreading(after, p))
     inside = ((radius - r) / (wide * width) + 0.5).clamp(
         0, 1
     )  # of a node across the rim, as wide as r changes with p
-    passed = torch.sqrt(media.passed(after.order, p))
+    passed = torch.sqrt(media.transmitted_power(after.order, p))
     return Rays(
         x,
         y,
         wide * width,
         inside * wide,
         passed,
-        media.path(after, p),
+        media.relative_path(after, p),
         axis,
         middle,
         *bending(after, middle),
@@ -152,7 +152,7 @@ def landing(
     place, after = seen_from
     step = (
         2
-        * float(media.direction(after, torch.tensor(radius, dtype=torch.float64)))
+        * float(media.ray_direction(after, torch.tensor(radius, dtype=torch.float64)))
         / FEW
     )
     found = rays(after, radius, place, (FEW, step), torch.device("cpu"))
@@ -200,10 +200,10 @@ def _turning(after: Media, p: Tensor) -> Tensor:
     window moves.
     """
     size = torch.hypot(p[..., 0], p[..., 1]).clamp_min(1e-9)
-    reach, unit = media.reach(after, size), p / size[..., None]
+    reach, unit = media.lateral_reach(after, size), p / size[..., None]
     along, across = (
         part[..., None, None]
-        for part in (reach / (size * media.spread(after, size)), size / reach)
+        for part in (reach / (size * media.area_spreading(after, size)), size / reach)
     )
     turning: Tensor = (
         across * torch.eye(2).to(p)
@@ -283,7 +283,11 @@ def _each(
             if wavelength_um is None
             else layers.before(depth, wavelength_um)
         )
-        back = float(media.reach(before, p)) / slope if slope > 0 else before.reduced_um
+        back = (
+            float(media.lateral_reach(before, p)) / slope
+            if slope > 0
+            else before.reduced_um
+        )
         sx, sy = -back * tangents[0], -back * tangents[1]
         if (
             len(before.layers) == 1
@@ -294,7 +298,7 @@ def _each(
                 before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief)
             )
         else:
-            chief = float(media.chord(before, np.float64(math.hypot(sx, sy))))
+            chief = float(media.path_of_reach(before, np.float64(math.hypot(sx, sy))))
             away2 = (x - sx) ** 2 + (y - sy) ** 2
             away2 = away2.clamp(max=float((away2 * (seen.whole > 0)).max()))
             out.append(
@@ -307,5 +311,5 @@ def _each(
 
 
 def _chord(before: Media, away2: Any) -> Any:
-    """:func:`metalens.optics.media.chord` of the squared reach; NumPy or torch."""
-    return media.chord(before, away2**0.5)
+    """:func:`metalens.optics.media.path_of_reach` of the squared reach; NumPy or torch."""
+    return media.path_of_reach(before, away2**0.5)

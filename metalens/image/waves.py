@@ -357,7 +357,7 @@ def _longer(between: Media, r2: Tensor) -> Tensor:
     """Optical path of the ray of squared reach r² less that along the normal, um."""
     if len(between.layers) > 1:
         extra: Tensor = interpolant.chebyshev_interpolant(
-            lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2
+            lambda u: media.path_difference(between.layers, 0.0, 0.0, u)[1], r2
         )
         return extra
     n, d = between.layers[0]

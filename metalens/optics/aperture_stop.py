@@ -115,9 +115,11 @@ def stop_crossing(
     slope = math.hypot(*tangents)
     p = slope / math.hypot(1, slope)
     if before is None:
-        way = float(media.bend(between.layers, p * p)) / math.hypot(1, slope)
+        way = float(media.reach_per_direction(between.layers, p * p)) / math.hypot(
+            1, slope
+        )
         return x - way * tangents[0], y - way * tangents[1]
-    back = float(media.bend(before.layers, p * p)) / math.hypot(1, slope)
+    back = float(media.reach_per_direction(before.layers, p * p)) / math.hypot(1, slope)
     dx, dy = x + back * tangents[0], y + back * tangents[1]
     share = _share(before, between, dx * dx + dy * dy)
     return x - share * dx, y - share * dy
@@ -127,8 +129,10 @@ def _share(before: Media, between: Media, away2: Any) -> Any:
     """f of the heading, of the squared lateral way from source to pillars."""
 
     def exact(u: Any) -> Any:
-        w = media.square(before.layers, u)
-        return media.bend(between.layers, w) / media.bend(before.layers, w)
+        w = media.solve_direction_square(before.layers, u)
+        return media.reach_per_direction(between.layers, w) / media.reach_per_direction(
+            before.layers, w
+        )
 
     return interpolant.chebyshev_interpolant(exact, away2)
 
@@ -193,13 +197,13 @@ def fresnel_um(
     """
     slope2 = tangents[0] ** 2 + tangents[1] ** 2
     w = slope2 / (1 + slope2)
-    across = float(media.bend(between.layers, w))
-    along = float(media.widening(between.layers, w)) / across
+    across = float(media.reach_per_direction(between.layers, w))
+    along = float(media.area_spreading_of_square(between.layers, w)) / across
     if before is None:
         return along, across
-    whole = float(media.bend(before.layers, w))
+    whole = float(media.reach_per_direction(before.layers, w))
     return along * (
-        1 - along * whole / float(media.widening(before.layers, w))
+        1 - along * whole / float(media.area_spreading_of_square(before.layers, w))
     ), across * (1 - across / whole)
 
 

@@ -125,11 +125,11 @@ class Layers:
         outer = [(n, t) for n, t in outer if t > 1e-9 * depth_um]
         sine2 = (tangents**2).sum(-1, keepdims=True)
         come = tangents / np.sqrt(1 + sine2)
-        away = media.bend(before.layers, sine2 / (1 + sine2)) * come + np.array(
-            self.stop.centre_um
-        )
-        w = media.square(outer, (away**2).sum(-1, keepdims=True))
-        return np.asarray(away / media.bend(outer, w) / np.sqrt(1 - w))
+        away = media.reach_per_direction(
+            before.layers, sine2 / (1 + sine2)
+        ) * come + np.array(self.stop.centre_um)
+        w = media.solve_direction_square(outer, (away**2).sum(-1, keepdims=True))
+        return np.asarray(away / media.reach_per_direction(outer, w) / np.sqrt(1 - w))
 
     def lit(
         self,

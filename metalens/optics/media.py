@@ -100,16 +100,16 @@ class Media:
         return sum(t / n for n, t in self.layers)
 
 
-def reach(media: Media, p: Any) -> Any:
+def lateral_reach(media: Media, p: Any) -> Any:
     """Lateral distance of a ray with n sin θ = p, um.
 
     Args:
         media: plane-parallel media.
     """
-    return p * bend(media.layers, p * p)
+    return p * reach_per_direction(media.layers, p * p)
 
 
-def path(media: Media, p: Any) -> Any:
+def relative_path(media: Media, p: Any) -> Any:
     """Optical path of that ray less the path along the normal, um, without
     cancellation.
 
@@ -142,43 +142,43 @@ def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> An
     cosine = (1 - sine2) ** 0.5
     thick = sum(t for _, t in front)
     pairs = [(1.0, 1 - thick * inverse), *((n, t * inverse) for n, t in front)]
-    g = bend(pairs, sine2)
+    g = reach_per_direction(pairs, sine2)
     more = (x * x + y * y) * inverse + 2 * g * cosine * (x * tx + y * ty)
-    return longer(pairs, sine2, sine2 * g * g, more, inverse)[1]
+    return path_difference(pairs, sine2, sine2 * g * g, more, inverse)[1]
 
 
-def spread(media: Media, p: Any) -> Any:
+def area_spreading(media: Media, p: Any) -> Any:
     """Area on the plane per area of p: (reach / p) (d reach / d p), um².
 
     Args:
         media: plane-parallel media.
     """
-    return widening(media.layers, p * p)
+    return area_spreading_of_square(media.layers, p * p)
 
 
-def direction(media: Media, reach_um: Any) -> Any:
-    """p of the ray that reaches so far: the inverse of :func:`reach`, to rounding.
+def ray_direction(media: Media, reach_um: Any) -> Any:
+    """p of the ray that reaches so far: the inverse of :func:`lateral_reach`, to rounding.
 
     Args:
         media: plane-parallel media.
         reach_um: lateral distance, um.
     """
     layers = media.layers
-    w = square(layers, reach_um * reach_um)
-    return reach_um / bend(layers, w)
+    w = solve_direction_square(layers, reach_um * reach_um)
+    return reach_um / reach_per_direction(layers, w)
 
 
-def chord(media: Media, reach_um: Any) -> Any:
+def path_of_reach(media: Media, reach_um: Any) -> Any:
     """Optical path of the ray that reaches so far, less the path along the normal, um.
 
     Args:
         media: plane-parallel media.
         reach_um: lateral distance, um.
     """
-    return path(media, direction(media, reach_um))
+    return relative_path(media, ray_direction(media, reach_um))
 
 
-def passed(order: Sequence[float], p: Any) -> Any:
+def transmitted_power(order: Sequence[float], p: Any) -> Any:
     """Share of unpolarised power that passes the faces between media of indices
     ``order``, in a single pass.
 
@@ -189,7 +189,7 @@ def passed(order: Sequence[float], p: Any) -> Any:
 
 
 def passed_at(order: Sequence[float], w: Any) -> Any:
-    """As :func:`passed`, of w = p².
+    """As :func:`transmitted_power`, of w = p².
 
     Args:
         order: indices that the faces lie between.
@@ -241,7 +241,7 @@ def _sum(parts: Sequence[Any]) -> Any:
     return total
 
 
-def bend(layers: Pairs, w: Any) -> Any:
+def reach_per_direction(layers: Pairs, w: Any) -> Any:
     """reach / p = Σ t / √(n² - w), w = p².
 
     Args:
@@ -250,8 +250,8 @@ def bend(layers: Pairs, w: Any) -> Any:
     return _sum([t / rest for _, t, rest in _with_normals(layers, w)])
 
 
-def widening(layers: Pairs, w: Any) -> Any:
-    """Area on the plane per area of p, as :func:`spread`, of w = p².
+def area_spreading_of_square(layers: Pairs, w: Any) -> Any:
+    """Area on the plane per area of p, as :func:`area_spreading`, of w = p².
 
     Args:
         layers: (index, thickness) of each medium.
@@ -259,7 +259,7 @@ def widening(layers: Pairs, w: Any) -> Any:
     along = _sum(
         [t * n * n / (rest * rest * rest) for n, t, rest in _with_normals(layers, w)]
     )
-    return bend(layers, w) * along
+    return reach_per_direction(layers, w) * along
 
 
 def whole_path(layers: Pairs, w: Any) -> Any:
@@ -271,7 +271,7 @@ def whole_path(layers: Pairs, w: Any) -> Any:
     return _sum([n * n * t / rest for n, t, rest in _with_normals(layers, w)])
 
 
-def square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
+def solve_direction_square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any:
     """w = p² of the ray with (w - along2) (reach / p)² = reach2, to rounding.
 
     Without ``along2`` that is the ray of this reach. With it, p² = along2 + q²: along2
@@ -304,7 +304,7 @@ def _largest(values: Any) -> float:
     return float(size.max()) if hasattr(size, "max") else float(size)
 
 
-def longer(
+def path_difference(
     layers: Pairs, w0: Any, reach2: Any, more: Any, scale: Any = 1.0
 ) -> tuple[Any, Any]:
     """(w, path) of the ray whose reach² is ``reach2 + scale·more``: the path less that
@@ -322,7 +322,7 @@ def longer(
     Args:
         layers: (index, thickness) of each medium.
     """
-    w = square(layers, reach2 + scale * more)
+    w = solve_direction_square(layers, reach2 + scale * more)
     pairs = [(n, t, (n * n - w) ** 0.5, (n * n - w0) ** 0.5) for n, t in layers]
     g, g0 = (
         _sum([t / s for _, t, s, _ in pairs]),
@@ -396,7 +396,7 @@ def saddle_correction(
     """
     layers = behind.layers
     rarest = layers[0][0]
-    w = float(square(layers, reach_um * reach_um))
+    w = float(solve_direction_square(layers, reach_um * reach_um))
     steep = max(w / max(rarest * rarest - w, 1e-300), 2.0**-6)
     steep = 2.0 ** (
         math.ceil(4 * math.log2(steep)) / 4
@@ -487,8 +487,8 @@ def plane_wave_correction(
     layers, k = behind.layers, wavenumber
     w = np.asarray(w, float)[:, None, None]
     node, share = np.polynomial.hermite_e.hermegauss(count)
-    p, g = np.sqrt(w), np.asarray(bend(layers, w))
-    along = np.asarray(widening(layers, w)) / g
+    p, g = np.sqrt(w), np.asarray(reach_per_direction(layers, w))
+    along = np.asarray(area_spreading_of_square(layers, w)) / g
     turned = np.exp(-0.25j * np.pi)
     u, v = turned * node[:, None] / np.sqrt(k * along), turned * node / np.sqrt(k * g)
     more = 2 * p * u + u * u + v * v

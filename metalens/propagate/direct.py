@@ -76,7 +76,7 @@ def _films_wave(behind: Media, wavenumber: float, reach_um: float) -> PointWave:
     for count in DEGREES:
         u = chebyshev.chebpts1(count)
         v = middle + half * u
-        w = media.square(layers, length**2 * (1 / v**2 - 1))
+        w = media.solve_direction_square(layers, length**2 * (1 / v**2 - 1))
         path = np.asarray(media.whole_path(layers, w)) - level / v
         amplitude = ray_amplitude(behind, wavenumber, w, reach_um) / v**2
         values = np.stack([path, amplitude.real, amplitude.imag], -1)

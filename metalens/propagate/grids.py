@@ -145,7 +145,7 @@ def _beyond(
     pairs = (
         [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
     )
-    bend = media.bend(pairs, np.where(seen, w, 0.0))
+    bend = media.reach_per_direction(pairs, np.where(seen, w, 0.0))
     found = []
     for fit, p in zip(fits, (y[:, None], x), strict=True):
         left = p * bend - fit.reach_um - fit.stretch_um * (p - fit.middle)

@@ -71,7 +71,9 @@ def to_sensor(
     reach2 = cx * cx + cy * cy
     pairs = case.behind.layers
     more = x * x + y * y - 2 * (x * cx + y * cy)
-    return media.longer(pairs, media.square(pairs, reach2), reach2, more)[1]
+    return media.path_difference(
+        pairs, media.solve_direction_square(pairs, reach2), reach2, more
+    )[1]
 
 
 def chief_path(case: PropagationCase) -> float:
@@ -85,7 +87,7 @@ def chief_path(case: PropagationCase) -> float:
     if case.behind is None:
         return float(np.sqrt(reach2 + case.sensor_distance_um**2))
     pairs = case.behind.layers
-    return float(media.whole_path(pairs, media.square(pairs, reach2)))
+    return float(media.whole_path(pairs, media.solve_direction_square(pairs, reach2)))
 
 
 def ray_to_offset(
@@ -106,8 +108,8 @@ def ray_to_offset(
         r = r_w + away
         return d / (2 * np.pi * r * r) * (1 / r - 1j * k), away
     reach2 = dx * dx + dy * dy
-    w0 = media.square(case.behind.layers, reach2)
-    w, away = media.longer(case.behind.layers, w0, reach2, more)
+    w0 = media.solve_direction_square(case.behind.layers, reach2)
+    w, away = media.path_difference(case.behind.layers, w0, reach2, more)
     return ray_amplitude(case.behind, case.wavenumber, w, case.reach_um), away
 
 
@@ -138,7 +140,7 @@ def ray_amplitude_parts(
         pairs: (index, thickness) of the media.
         reach_um: lateral distance, um.
     """
-    passed = media.passed_at(behind.order, w) / media.widening(pairs, w)
+    passed = media.passed_at(behind.order, w) / media.area_spreading_of_square(pairs, w)
     level = wavenumber / (2 * np.pi) * passed**0.5
     turn = 1 / (wavenumber * media.whole_path(pairs, w))
     ahead, aside = saddle_correction(behind, wavenumber, reach_um).at(w)
@@ -199,7 +201,7 @@ def films_error(case: PropagationCase, level: Array) -> float:
             case.centre_um[::-1], (y, x), case.half_window_um, strict=True
         )
     )
-    w = media.square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
+    w = media.solve_direction_square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
     error = saddle_correction(case.behind, case.wavenumber, case.reach_um).error(w)
     return 2 * float(np.sqrt((light * error**2).sum() / light.sum()))
 
@@ -214,7 +216,9 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
     if case.behind is None:
         return across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
     pairs = case.behind.layers
-    return across / media.bend(pairs, media.square(pairs, across * across + far * far))
+    return across / media.reach_per_direction(
+        pairs, media.solve_direction_square(pairs, across * across + far * far)
+    )
 
 
 def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
@@ -229,7 +233,9 @@ def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
             far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
         )
     pairs = case.behind.layers
-    return far / media.bend(pairs, media.square(pairs, far * far, p * p))
+    return far / media.reach_per_direction(
+        pairs, media.solve_direction_square(pairs, far * far, p * p)
+    )
 
 
 def residual_path(
@@ -252,7 +258,9 @@ def residual_path(
         path = (X * X + Y * Y + g * q / (r + r_w)) / (r + r_w)
         return d / (2 * np.pi * r * r) * (1 / r - 1j * k), path
     w0, g, more = _from_ray(case, p, far, X, Y)
-    w, away = media.longer(case.behind.layers, w0, (p * g) ** 2 + far * far, more)
+    w, away = media.path_difference(
+        case.behind.layers, w0, (p * g) ** 2 + far * far, more
+    )
     level = ray_amplitude(case.behind, case.wavenumber, w, case.reach_um)
     return level, away + p * X + far / g * Y
 
@@ -264,8 +272,8 @@ def _from_ray(
     from ``far`` rows away.
     """
     pairs: Any = case.behind.layers if case.behind is not None else ()
-    w0 = media.square(pairs, far * far, p * p)
-    g = media.bend(pairs, w0)
+    w0 = media.solve_direction_square(pairs, far * far, p * p)
+    g = media.reach_per_direction(pairs, w0)
     return w0, g, X * X + Y * Y - 2 * (g * p * X + far * Y)
 
 
@@ -316,7 +324,7 @@ def _slopes(case: PropagationCase, p: Any, far: Any, X: Any, Y: Any) -> Array:
                 pairs = [*pairs, (behind.index[0], 1j * h)]
         else:
             moved = moved + 2j * h * (across, down)[step - 1]
-        w = media.square(pairs, moved)
+        w = media.solve_direction_square(pairs, moved)
         level, ahead, aside = ray_amplitude_parts(
             behind, case.wavenumber, pairs, w, case.reach_um
         )

@@ -133,7 +133,7 @@ def _check_rays(case: PropagationCase) -> None:
     )  # the rim of a round lens, the far corner
     y = np.abs(np.abs(case.centre_um[1]) + down + high * np.sin(turn))
     steepest, most = (
-        float(media.direction(case.behind, np.hypot(x, y).max())),
+        float(media.ray_direction(case.behind, np.hypot(x, y).max())),
         min(case.behind.order),
     )
     if steepest >= most:
@@ -229,7 +229,7 @@ def chief_ray_offset(
         (n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0
     ]
     pairs = [*gained, (behind.index[0], sensor_distance_um - value)]
-    return media.bend(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
+    return media.reach_per_direction(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
 
 
 def to_angle_pair(angle_rad: Any) -> tuple[float, float]:

@@ -24,7 +24,7 @@ Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
 # amplitude 0.986, -0.066 rad at sine
 # 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is
-# metalens.design.neighbours.neighbours
+# metalens.design.neighbours.estimate_neighbour_coupling
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst
 # pillar off resonance
@@ -247,11 +247,11 @@ def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
-    centre = float(media.reach(after, sine))
+    centre = float(media.lateral_reach(after, sine))
     edges = centre + np.array([-1.0, 1.0]) * (
         lens.diameters.radius_um + lens.diameters.pitch_um / 2
     )
-    p = np.sign(edges) * media.direction(after, np.abs(edges))
+    p = np.sign(edges) * media.ray_direction(after, np.abs(edges))
     return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
@@ -260,13 +260,15 @@ def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
     chief ray's place on the sensor.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    centre = float(media.reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))))
+    centre = float(
+        media.lateral_reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad)))))
+    )
     node, share = np.polynomial.legendre.leggauss(RINGS)
     radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt(
         (node + 1) / 2
     )[:, None]
     turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
-    p = media.direction(
+    p = media.ray_direction(
         after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn))
     )
     weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)

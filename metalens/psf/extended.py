@@ -145,7 +145,7 @@ def _place(
     steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
     thick = sum(t for _, t in case.front)
     away = float(
-        media.bend([(1.0, depth_um - thick), *case.front], 1 - 1 / steep)
+        media.reach_per_direction([(1.0, depth_um - thick), *case.front], 1 - 1 / steep)
     ) / math.sqrt(steep)
     return [-away * tangents[0], -away * tangents[1]]
 

@@ -19,7 +19,7 @@ from metalens import design, lens
 from metalens.cell.record import Cell, Index
 from metalens.core.store import Provenance
 from metalens.design.profiles import Focus
-from metalens.fabrication import sensitivity
+from metalens.fabrication import proxy_sensitivity
 from metalens.library.proxy import Proxy
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt;
@@ -95,7 +95,7 @@ def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
     covariance = np.eye(len(names)) * sigma**2
     return AsBuilt(
         design=made or small(),
-        response=sensitivity(small()),
+        response=proxy_sensitivity(small()),
         names=names,
         value=np.array([TRUE[n] for n in names]),
         covariance=covariance,

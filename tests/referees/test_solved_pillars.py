@@ -11,7 +11,12 @@ from characterize.model import log_response_slopes
 from characterize.model.pillars import PillarChange, PillarResponse
 from metalens import modal
 from metalens.cell import Index
-from metalens.fabrication import ResponseError, answer, named, transmission
+from metalens.fabrication import (
+    ResponseError,
+    names_of_kind,
+    perturbed_transmission,
+    prepare_response,
+)
 from metalens.library.record import DEFAULT_CELL
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_table
@@ -28,7 +33,10 @@ def amounts(height_um=0.0, index=0.0, sidewall_rad=0.0):
     """Of the causes that pillars answer, in the order of the table; of a round one no
     others.
     """
-    names, found = named(ResponseError), np.zeros(len(named(ResponseError)))
+    names, found = (
+        names_of_kind(ResponseError),
+        np.zeros(len(names_of_kind(ResponseError))),
+    )
     for name, amount in (
         ("height_nm", height_um),
         ("index", index),
@@ -47,7 +55,7 @@ def test_pillars_are_those_of_the_solver_under_a_bias_and_a_height(
     the resonance past 0.21 um.
     """
     want = pillar_table.load().at(D + bias_um, 0.7 + height_um, 0.85)
-    found = transmission(
+    found = perturbed_transmission(
         hidden.lens().proxy, response, D + bias_um, 0.85, amounts(height_um)
     )
     assert np.abs(found - want).max() < 3e-3
@@ -56,28 +64,36 @@ def test_pillars_are_those_of_the_solver_under_a_bias_and_a_height(
 def test_the_wavelength_comes_from_the_proxy_and_goes_on_beyond_it(response):
     """1.1 nm at a height 9 nm off: the mixed derivative is left out, 2e-3 of t."""
     want = pillar_table.load().at(D, 0.709, 0.8511)
-    found = transmission(hidden.lens().proxy, response, D, 0.8511, amounts(0.009))
+    found = perturbed_transmission(
+        hidden.lens().proxy, response, D, 0.8511, amounts(0.009)
+    )
     assert np.abs(found - want).max() < 4e-3
-    still = transmission(hidden.lens().proxy, response, D, 0.85, amounts(0.009))
+    still = perturbed_transmission(
+        hidden.lens().proxy, response, D, 0.85, amounts(0.009)
+    )
     assert np.abs(still - want).max() > 1.5 * np.abs(found - want).max()
 
 
 def test_index_and_height_act_together(response):
     cell = dataclasses.replace(DEFAULT_CELL, pillar=Index(3.56), height_um=0.712)
     want = np.array([modal.solve(cell, d, 0.85, tolerance=1e-3).t for d in D])
-    found = transmission(hidden.lens().proxy, response, D, 0.85, amounts(0.012, -0.04))
+    found = perturbed_transmission(
+        hidden.lens().proxy, response, D, 0.85, amounts(0.012, -0.04)
+    )
     assert (
         np.abs(found - want)[:4].max() < 6e-3
     )  # the mixed derivative and the third by the index are left out
     assert (
         np.abs(found - want)[4] < 0.05
     )  # 0.1994 um: next to a resonance, which the index moves
-    alone = transmission(hidden.lens().proxy, response, D, 0.85, amounts(0.012))
+    alone = perturbed_transmission(
+        hidden.lens().proxy, response, D, 0.85, amounts(0.012)
+    )
     assert np.abs(alone - want).max() > 0.1
 
 
 def test_rates_are_derivatives_of_the_factor(response):
-    ready = answer(hidden.lens().proxy, response, D + 0.0071)
+    ready = prepare_response(hidden.lens().proxy, response, D + 0.0071)
     at, step = amounts(0.0117, -0.021, 0.004), 1e-5
     for n in range(len(at)):
         up, down = at.copy(), at.copy()
@@ -91,7 +107,9 @@ def test_rates_are_derivatives_of_the_factor(response):
 
 def test_few_functions_hold_every_change(response):
     pillars = PillarResponse(hidden.lens(), response)
-    change = PillarChange((0.0163, *[0.0] * (len(named(ResponseError)) - 1)), 0.0007)
+    change = PillarChange(
+        (0.0163, *[0.0] * (len(names_of_kind(ResponseError)) - 1)), 0.0007
+    )
     for bias_um in (-0.0117, 0.0, 0.0193):
         weight = pillars.weights(np.array(bias_um))
         rate = pillars.rates(np.array(bias_um), weight)

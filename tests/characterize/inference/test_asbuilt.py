@@ -34,7 +34,7 @@ from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
 from metalens.core.errors import CaptureError, ConfigError, FitError
-from metalens.fabrication import Solved, sensitivity
+from metalens.fabrication import Solved, proxy_sensitivity
 from metalens.psf.of_lens import View
 
 SETTING = FrameSetting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
@@ -456,7 +456,7 @@ def test_what_is_stated_is_not_reckoned_with():
 
 
 def test_effective_index_slopes_scale_as_a_waveguide():
-    found = sensitivity(b.lens())
+    found = proxy_sensitivity(b.lens())
     d = np.array([0.12, 0.17, 0.22])
     height, index, wall = found.at(d)[:3]
     k = 2 * np.pi / 0.85

@@ -10,7 +10,7 @@ from codesign.adapt import correction
 from codesign.optics import built
 from layout.process import process as processes
 from metalens.core.errors import ConfigError
-from metalens.fabrication import sensitivity, transmission
+from metalens.fabrication import perturbed_transmission, proxy_sensitivity
 from tests.codesign import made_lens as m
 
 OLD = """
@@ -23,7 +23,10 @@ def _plan(old=None, **values):
     lens = m.small()
     none = correction.present_bias(None)
     return correction.propose_correction(
-        lens, parameter_vector(values), response=sensitivity(lens), old=old or none
+        lens,
+        parameter_vector(values),
+        response=proxy_sensitivity(lens),
+        old=old or none,
     )
 
 
@@ -42,15 +45,15 @@ def test_a_constant_bias_adds_to_the_present_table(tmp_path):
 
 def test_what_height_takes_from_the_phase_the_diameters_give_back():
     lens, x = m.small(), parameter_vector({"height_nm": -12.0})
-    response = sensitivity(lens)
+    response = proxy_sensitivity(lens)
     plan = _plan(height_nm=-12.0)
     now = np.angle(
-        transmission(
+        perturbed_transmission(
             lens.proxy, response, plan.wanted_um, 0.85, process_state_of(x).answers()
         )
     )
     meant = np.angle(
-        transmission(
+        perturbed_transmission(
             lens.proxy,
             response,
             plan.designed_um,

@@ -21,7 +21,7 @@ from metalens.cell import Cell, Film, Index
 from metalens.cli import main
 from metalens.core.errors import LensError
 from metalens.design import Focus
-from metalens.fabrication import Spread, State, draws
+from metalens.fabrication import Spread, State, draw_lenses
 from metalens.library.proxy import Proxy
 from metalens.optics import Layers
 from tests.codesign import made_lens as m
@@ -69,7 +69,7 @@ def test_the_phase_of_a_process_is_that_of_the_slope_of_the_pillars():
     made = MadeLens(small(), error_budget.settings_of(small(), 0.0))
     want = SLOPE * 1.7e-3 / 4
     spread = Spread.only(gradient_nm=1.7)
-    got = scatter(made, [d.state() for d in draws(spread, 400, seed=2)])
+    got = scatter(made, [d.state() for d in draw_lenses(spread, 400, seed=2)])
     # 400 draws: 4 sigma are 0.14; pillars at the rim 0.02
     assert got == pytest.approx(want, rel=0.16)
     assert scatter(made, [State.of({"bias_nm": 1.7})]) < 0.05 * want

@@ -14,7 +14,7 @@ from codesign.optics import built
 from codesign.optics import stack as optics
 from codesign.optics.stack import PixelPsfStack
 from metalens import psf
-from metalens.fabrication import sensitivity
+from metalens.fabrication import proxy_sensitivity
 from tests.codesign import made_lens as m
 
 X = parameter_vector(
@@ -27,7 +27,7 @@ def _engine(x, settings):
     low-passed to their grid.
     """
     lens, known = m.small(), built.of_lens(x)
-    t = made.as_built_transmission(lens, sensitivity(lens), known)
+    t = made.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85, depths_um=settings.depths_um.numpy(),
@@ -68,7 +68,7 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     it.
     """
     known = built.of_lens(X)
-    want = made.as_built_transmission(m.small(), sensitivity(m.small()), known)
+    want = made.as_built_transmission(m.small(), proxy_sensitivity(m.small()), known)
     got = (
         built.MadeLens(m.small(), m.OPTICS)
         .stack(X)

@@ -12,7 +12,7 @@ from characterize.model.parameters import PLACE, parameter_vector
 from codesign.optics import built
 from codesign.optics.stack import PixelPsfStack
 from metalens import psf
-from metalens.fabrication import sensitivity
+from metalens.fabrication import proxy_sensitivity
 from tests.codesign import made_lens as m
 
 X = parameter_vector(m.TRUE)
@@ -25,7 +25,7 @@ def test_oblique_psfs_agree_with_the_sum_over_every_pillar(angle_deg):
     """
     settings = dataclasses.replace(m.OPTICS, angle_deg=angle_deg)
     lens, known = m.small(), built.of_lens(X)
-    t = made.as_built_transmission(lens, sensitivity(lens), known)
+    t = made.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
         np.angle(t), np.abs(t), pitch_um=0.4, wavelength_um=0.85,

@@ -19,7 +19,13 @@ from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Cross, Rectangle, Square
 from metalens.core.errors import ProcessError
 from metalens.core.report import Figure, Table
-from metalens.fabrication import ResponseError, Spread, draws, named, transmission
+from metalens.fabrication import (
+    ResponseError,
+    Spread,
+    draw_lenses,
+    names_of_kind,
+    perturbed_transmission,
+)
 from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
 from tests.referees import plain_sum
@@ -110,7 +116,7 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
     model = reduce_spread(
         lens, SENS, focus.prepare_focus(lens, where), Spread(), seed=0
     )
-    lenses = draws(Spread(), 4, seed=9)
+    lenses = draw_lenses(Spread(), 4, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
     x, y = (
         axis / lens.diameters.radius_um
@@ -131,8 +137,8 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
             + index * a["index"]
             + wall * np.deg2rad(a["sidewall_deg"])
         )
-        t = transmission(
-            PROXY, SENS, made, 0.85, np.zeros(len(named(ResponseError)))
+        t = perturbed_transmission(
+            PROXY, SENS, made, 0.85, np.zeros(len(names_of_kind(ResponseError)))
         ) * np.exp(change)
         exact = plain_sum.field(lens, np.where(d > 0, t * swung, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
@@ -209,7 +215,9 @@ def test_beyond_the_domain_the_phase_goes_on_straight():
     d = np.array([0.3, 0.31, 0.32])
     phase = np.unwrap(
         np.angle(
-            transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(ResponseError))))
+            perturbed_transmission(
+                PROXY, SENS, d, 0.85, np.zeros(len(names_of_kind(ResponseError)))
+            )
         )
     )
     assert np.diff(phase) == pytest.approx(

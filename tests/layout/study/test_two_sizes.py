@@ -23,8 +23,8 @@ from metalens.fabrication import (
     ResponseError,
     Spread,
     State,
-    draws,
-    named,
+    draw_lenses,
+    names_of_kind,
     own,
     pair_sensitivities,
 )
@@ -37,7 +37,7 @@ LIGHTS = {
     "x": (19.0, 9.0, 0.93),
     "y": (8.0, 21.0, 0.97),
 }  # rad per um of width and of length, |t| of the thinnest
-CAUSES = named(ResponseError)
+CAUSES = names_of_kind(ResponseError)
 
 
 def formula(width_um, length_um, light):
@@ -114,7 +114,7 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
     model = reduce_spread(
         lens, told(lens), focus.prepare_focus(lens, where), Spread(), seed=0
     )
-    lenses = draws(Spread(), 3, seed=9)
+    lenses = draw_lenses(Spread(), 3, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
     x, y = (
         axis / lens.diameters.radius_um

@@ -145,7 +145,9 @@ def _lens():
 
 
 def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
-    found = supercell.neighbours(_lens(), counts=(6, 5, 4), harmonics=2)
+    found = supercell.estimate_neighbour_coupling(
+        _lens(), counts=(6, 5, 4), harmonics=2
+    )
     assert found.sine[~found.diagonal] == pytest.approx(
         WAVE / 0.3 / np.array([6, 5, 4])
     )
@@ -196,7 +198,7 @@ def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(
                         polarization=side,
                         tolerance=5e-3,
                     ).t
-                    for d in supercell.printed(lens)
+                    for d in supercell.drawn_diameter_range(lens)
                 ]
             )
             for angle in (0.0, tilt)
@@ -269,7 +271,7 @@ def _solved_whole(lens, polarization, *, count=12, aperture=0.8, harmonics=2):
     phase = 0.4 - 2 * np.pi / wave * (np.hypot(x, focal) - focal)
     sizes = np.asarray(
         lens.proxy.diameter_um(
-            phase, wave, within_um=supercell.printed(lens), gap="nearest"
+            phase, wave, within_um=supercell.drawn_diameter_range(lens), gap="nearest"
         )
     )
     settings = {"polarization": polarization, "harmonics": harmonics}
@@ -292,7 +294,7 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     """Sign and size; what is left are the ends of twelve pillars and how fast their
     zones change.
     """
-    found = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
+    found = supercell.estimate_neighbour_coupling(steep, counts=(2, 3, 4), harmonics=2)
     solved = [_solved_whole(steep, polarization) for polarization in ("x", "y")]
     cosine = np.sqrt(1 - solved[0][1] ** 2)
     fields = found.at(solved[0][1]) * np.stack([cosine**0.5, cosine**-0.5])
@@ -310,7 +312,7 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
     steep, monkeypatch
 ):
     def kept(lens, *, counts):
-        return supercell.neighbours(
+        return supercell.estimate_neighbour_coupling(
             lens, counts=counts, harmonics=2
         )  # a third of the time
 
@@ -355,7 +357,7 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     Rows of 2, 3 and 4 pillars (2, 4 and 6 along the diagonal) are known. Apart: rows
     whose phases begin elsewhere.
     """
-    rows = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=3)
+    rows = supercell.estimate_neighbour_coupling(steep, counts=(2, 3, 4), harmonics=3)
     block = supercell.block_of(TITANIA.pitch_um, diagonal)
     solved = supercell._mean(steep, count, diagonal, 3)[0]
     sine = GREEN / (count * block.spacing_um)

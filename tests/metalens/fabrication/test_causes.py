@@ -22,7 +22,7 @@ from metalens.fabrication.response import Answer, Sensitivity, Solved
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
-COUNT = len(perturbations.named(ResponseError))
+COUNT = len(perturbations.names_of_kind(ResponseError))
 
 
 def answering(*first):
@@ -42,8 +42,10 @@ def test_biases_over_the_lens_by_hand():
     assert made["bias_y_nm"] == 7.0
     assert not made.bends()
     assert not made.phase_rad(U, V).any()
-    assert perturbations.maps(CDError, U, V)[1] == pytest.approx(1e-3 * U, rel=1e-12)
-    assert perturbations.named(CDError) == names
+    assert perturbations.derivative_maps(CDError, U, V)[1] == pytest.approx(
+        1e-3 * U, rel=1e-12
+    )
+    assert perturbations.names_of_kind(CDError) == names
 
 
 def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
@@ -60,7 +62,7 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
         math.sqrt(8) * radius**3 * np.sin(3 * angle),
         math.sqrt(5) * (6 * radius**4 - 6 * radius**2 + 1),
     ]
-    assert perturbations.maps(WavefrontError, U, V) == pytest.approx(
+    assert perturbations.derivative_maps(WavefrontError, U, V) == pytest.approx(
         np.array(want), rel=1e-9
     )
     x, w = np.polynomial.legendre.leggauss(8)
@@ -69,7 +71,7 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
     basis = np.concatenate(
         [
             np.stack([np.ones_like(u), 2 * u, 2 * v]),
-            perturbations.maps(WavefrontError, u, v),
+            perturbations.derivative_maps(WavefrontError, u, v),
         ]
     ).reshape(10, -1)
     assert basis * weight @ basis.T == pytest.approx(np.eye(10), abs=1e-9)
@@ -292,14 +294,14 @@ def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
         + 0.1
     )
     level = np.array([0.85, 0.7, 0.54])
-    got = response.designed(Line(), d, 0.85, angle_rad=0.1)
+    got = response.designed_transmission(Line(), d, 0.85, angle_rad=0.1)
     assert got[:3] == pytest.approx(level * np.exp(1j * phase), rel=1e-12)
     assert np.abs(got[3:]) == pytest.approx(
         [1e-3, 1], abs=1e-12
     )  # held within 0.001 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
-    changed = response.transmission(
+    changed = response.perturbed_transmission(
         Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1
     )
     assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
@@ -317,15 +319,15 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     slopes = Sensitivity(
         np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved
     )
-    made = response.answer(Line(), slopes, np.array([0.18, 0.24]))
+    made = response.prepare_response(Line(), slopes, np.array([0.18, 0.24]))
     amounts = answering(0.5, 0.02, -0.3)
     want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
-    proxy = response.designed(Line(), at[1:3], 0.85)
+    proxy = response.designed_transmission(Line(), at[1:3], 0.85)
     assert made.factor(amounts) * proxy == pytest.approx(
         want * np.exp(0.15j - 0.03), rel=1e-9
     )
-    beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
-    ends = response.designed(Line(), at[[0, 3]], 0.85)
+    beyond = response.prepare_response(Line(), slopes, np.array([0.1, 0.3]))
+    ends = response.designed_transmission(Line(), at[[0, 3]], 0.85)
     assert beyond.factor(answering()) == pytest.approx(
         powers[0, 0, [0, 3]] / ends, rel=1e-9
     )
@@ -343,7 +345,7 @@ def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
         np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers)
     )
     amounts = answering(0.02)
-    got = response.transmission(Line(), slopes, at, 0.85, amounts)
+    got = response.perturbed_transmission(Line(), slopes, at, 0.85, amounts)
     assert got == pytest.approx(powers[0, 0] * (1 + 0.014j), rel=1e-9)
 
 
@@ -353,7 +355,7 @@ def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylin
     """
     cell = Cell(0.4, 0.6, Index(3.1), between=Index(1.2))
     d = np.linspace(0.1, 0.3, 21)
-    made = response.guide(cell, Line(), 0.85, d)
+    made = response.effective_indices(cell, Line(), 0.85, d)
     k, fill = 2 * math.pi / 0.85, math.pi * 0.01 / 4 / 0.16
     ratio = (3.1**2 - 1.44) / (3.1**2 + 1.44)
     thin = 1.2 * math.sqrt((1 + fill * ratio) / (1 - fill * ratio))
@@ -375,14 +377,14 @@ def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
         cell=Cell(0.4, 0.6, Index(3.1)),
         wavelength_um=0.85,
     )
-    made = response.sensitivity(lens)
+    made = response.proxy_sensitivity(lens)
     assert (made.low_um, made.high_um, made.error) == (
         0.12,
         0.3,
         0.5,
     )  # of the lens, within the proxy's
     d = np.linspace(0.12, 0.3, 61)
-    guide = response.guide(lens.cell, lens.proxy, 0.85, d)
+    guide = response.effective_indices(lens.cell, lens.proxy, 0.85, d)
     for n, (_, row) in enumerate(perturbations.of_kind(ResponseError)):
         assert made.at(d)[n] == pytest.approx(row.acts.quick(guide), rel=1e-3, abs=1e-6)
 

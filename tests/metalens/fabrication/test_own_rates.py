@@ -10,7 +10,14 @@ import pytest
 
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Rectangle
-from metalens.fabrication import ResponseError, lacking, named, own, own_rates, response
+from metalens.fabrication import (
+    ResponseError,
+    inapplicable_names,
+    names_of_kind,
+    own,
+    own_rates,
+    response,
+)
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.rcwa import jones, solve_truncation
@@ -25,7 +32,7 @@ CELL = Cell(
     Index(1.05),
     shape=Rectangle(RATIO, ANGLE),
 )
-ROWS = named(ResponseError)
+ROWS = names_of_kind(ResponseError)
 
 
 def lens(cell=CELL, *, hand="", tilted_light=False):
@@ -115,7 +122,7 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
         return own.OwnRates(rates, table(edge, size_um), 0.013)
 
     monkeypatch.setattr(response, "own_rates", solved)
-    found = response.sensitivity(lens())
+    found = response.proxy_sensitivity(lens())
     power = [
         sum(abs(c) ** 2 * (1 if n == 0 else 0.5) for n, c in rows[i].items())
         for i in range(3)
@@ -258,13 +265,13 @@ def test_films_under_and_on_a_pillar_have_heights_of_their_own(film, few_orders)
 
 
 def test_a_pillar_has_a_pedestal_and_a_cap_where_films_of_another_material_are():
-    assert lacking(on_films()) == ()
-    assert lacking(in_layers()) == ("pedestal_nm",)
-    assert lacking(CELL) == ("pedestal_nm", "cap_nm")
+    assert inapplicable_names(on_films()) == ()
+    assert inapplicable_names(in_layers()) == ("pedestal_nm",)
+    assert inapplicable_names(CELL) == ("pedestal_nm", "cap_nm")
     bare = dataclasses.replace(
         CELL, height_um=0.3, layers=(Layer(0.3, material=Index(1.9)),)
     )  # nothing is its own
-    assert lacking(bare) == ("pedestal_nm", "cap_nm")
+    assert inapplicable_names(bare) == ("pedestal_nm", "cap_nm")
 
 
 def test_a_pillar_cut_into_two_sections_answers_as_the_whole(few_orders):

@@ -119,8 +119,8 @@ def test_maps_without_a_focus_are_known(medium):
         cubic = (x / 40) ** 3 + (y[:, None] / 40) ** 3
         return hyperbolic(x, y) + 5.0 * cubic + 0.02 * k * x
 
-    assert design.focuses(hyperbolic, focus, **about)
-    assert design.focuses(bent, focus, **about)
+    assert design.has_focus(hyperbolic, focus, **about)
+    assert design.has_focus(bent, focus, **about)
     for other in (
         axicon,
         flat,
@@ -129,7 +129,7 @@ def test_maps_without_a_focus_are_known(medium):
         turned(3, hyperbolic),
         turned(1, hyperbolic),
     ):
-        assert not design.focuses(other, focus, **about)
+        assert not design.has_focus(other, focus, **about)
 
 
 def test_a_stop_is_kept_in_the_file_and_seen_by_design_and_focus_check(proxy, tmp_path):

@@ -42,12 +42,12 @@ def ray(behind, wavelength, p):
     """(field of the ray alone, its reach, kL) by Snell's law and Fresnel's power."""
     k, layers = 2 * math.pi / wavelength, behind.layers
     length = sum(n * n * t / math.sqrt(n * n - p * p) for n, t in layers)
-    out, area = media.reach(behind, p), media.spread(behind, p)
+    out, area = media.lateral_reach(behind, p), media.area_spreading(behind, p)
     alone = (
         -1j
         * k
         / (2 * math.pi)
-        * math.sqrt(media.passed(behind.order, p) / area)
+        * math.sqrt(media.transmitted_power(behind.order, p) / area)
         * np.exp(1j * k * length)
     )
     return alone, out, k * length
@@ -118,7 +118,7 @@ def test_the_error_is_told_where_films_are_too_thin_for_it():
 def test_the_series_is_the_waves_at_any_ray():
     behind, k = Media((1.0, 1.9), (9.0, 13.0)), 2 * math.pi / 0.633
     found = saddle_correction(behind, k, 30.0)
-    w = np.linspace(0, float(media.square(behind.layers, 30.0**2)), 37)
+    w = np.linspace(0, float(media.solve_direction_square(behind.layers, 30.0**2)), 37)
     ahead, aside = found.at(w)
     got = 1 + 1j * (ahead + 1j * aside) / (k * media.whole_path(behind.layers, w))
     assert (
@@ -201,7 +201,7 @@ def test_the_series_ends_at_a_quarter_power_of_two_beyond_the_steepest_ray():
             (low, low), rel=1e-14
         )
         end = (low / (found.middle - found.half)) ** 2 - 1
-        w = float(media.square(behind.layers, reach**2))
+        w = float(media.solve_direction_square(behind.layers, reach**2))
         ends.append(
             (4 * math.log2(end), 4 * math.log2(max(w / (low * low - w), 2**-6)))
         )

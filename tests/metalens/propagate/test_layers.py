@@ -206,7 +206,7 @@ def test_a_source_behind_a_film_has_the_phase_of_its_plane_waves():
     )
     sine = np.hypot(*tangents) / np.sqrt(1 + np.hypot(*tangents) ** 2)
     foot = (
-        media.reach(Media((1.0, 1.45), (depth - 120.0, 120.0)), sine)
+        media.lateral_reach(Media((1.0, 1.45), (depth - 120.0, 120.0)), sine)
         * np.array(tangents)
         / np.hypot(*tangents)
     )
@@ -283,7 +283,7 @@ def test_derivatives_in_distance_and_window_centre(step):
         behind = Media(case.behind.index, tuple(thickness))
         moved = dataclasses.replace(case, behind=behind, centre_um=tuple(centre))
         reach2 = (centre[0] + X - x) ** 2 + (centre[1] + Y - y) ** 2
-        w = media.square(behind.layers, reach2)
+        w = media.solve_direction_square(behind.layers, reach2)
         level = ray_amplitude(behind, moved.wavenumber, w, moved.reach_um)
         return np.log(level) + 1j * case.wavenumber * media.whole_path(behind.layers, w)
 

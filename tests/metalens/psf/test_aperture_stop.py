@@ -405,7 +405,7 @@ def test_rays_cross_the_stop_where_snell_has_them() -> None:
     )
     tangents = (0.2, 0.0)
     sine = 0.2 / math.hypot(1, 0.2)
-    source = -float(media.reach(layers.before(depth, WAVE), sine))
+    source = -float(media.lateral_reach(layers.before(depth, WAVE), sine))
     x, u = source + before, source + before - glass
     hole = replace(
         layers, stop=Stop(float(u[1]), 150.0)
