@@ -4,8 +4,8 @@ of printable pillars.
 
 import importlib
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,17 +13,12 @@ import tyro
 
 from metalens import design, lens, library
 from metalens.cell import Cell, describe_order_loss
-from metalens.commands import design_words as words
-from metalens.commands import paired, several
 from metalens.commands.common import CommonOptions, Output
-from metalens.commands.paired import YPolarizationTarget
-from metalens.commands.several import AdditionalWavelength
 from metalens.core import config, reading, store, transaction
 from metalens.core.errors import ConfigError
 from metalens.core.report import Console
 from metalens.core.store import write_bytes
 from metalens.design import (
-    ConversionMetrics,
     Cubic,
     DoubleHelix,
     Focus,
@@ -32,21 +27,65 @@ from metalens.design import (
     PhaseMap,
     PhaseOf,
     Quality,
-    check_focus,
 )
 from metalens.design.free_form import FisherSettings, ResolvedFisherSettings
 from metalens.lens import Lens
 from metalens.lens import picture as lens_plot
 from metalens.library import PillarLibrary, axes
 from metalens.optics import Layers, check_gaps
-from metalens.psf import FocusMetrics
 
 if TYPE_CHECKING:
     from metalens.image import Pupil
 
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
+# pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
+MOST_SUMMED = 60_000_000
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
+
+
+@dataclass(frozen=True, slots=True)
+class YPolarizationTarget:
+    """What light polarised along y is to see.
+
+    profile: which phase. sensor_distance_mm, source_distance_mm: what is imaged onto
+    what (inf for a collimated beam).
+    double_helix, cubic, map: of the profile of that name.
+    """
+
+    profile: Literal["hyperbolic", "double-helix", "cubic", "map"] = "hyperbolic"
+    sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
+    source_distance_mm: float = field(
+        default=20.0, metadata={"may_be_inf": True, "above": 0}
+    )
+    double_helix: DoubleHelix = field(default_factory=DoubleHelix)
+    cubic: Cubic = field(default_factory=Cubic)
+    map: PhaseMap | None = None
+
+    def __post_init__(self) -> None:
+        if self.profile == "map" and self.map is None:
+            raise ConfigError(
+                "along_y: profile 'map' needs a table [along_y.map] with file and pitch_um"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class AdditionalWavelength:
+    """Light beside the design's own that the same pillars are to serve.
+
+    wavelength_nm: of that light. weight: of its squared errors, against 1 of the
+    design's own wavelength.
+    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a
+    collimated beam); left out, as at the
+        design's own wavelength.
+    """
+
+    wavelength_nm: float = field(metadata={"above": 0})
+    weight: float = field(default=1.0, metadata={"above": 0})
+    sensor_distance_mm: float | None = field(default=None, metadata={"above": 0})
+    source_distance_mm: float | None = field(
+        default=None, metadata={"may_be_inf": True, "above": 0}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +152,11 @@ class DesignSettings:
             raise ConfigError(
                 "library and cell are both given; a library holds its cell: give one of them"
             )
-        several.check_single_wavelength_profile(self.wavelengths, self.profile)
+        if self.wavelengths and self.profile in ("fisher", "map"):
+            raise ConfigError(
+                f"wavelengths: profile '{self.profile}' is of one; "
+                "need hyperbolic, double-helix or cubic"
+            )
         check_gaps(
             self.layers, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3
         )
@@ -128,10 +171,34 @@ class DesignSettings:
 
     def at(self, held_um: Iterable[float]) -> "DesignSettings":
         """The same, its wavelength filled in from those that the library holds."""
-        told, only = self.wavelength_nm, {round(1e3 * wave, 6) for wave in held_um}
+        only = {round(1e3 * wave, 6) for wave in held_um}
+        default = only.pop() if len(only) == 1 else _WAVELENGTH_NM
+        return replace(self, wavelength_nm=self.wavelength_nm or default)
+
+    def phase(self, folder: Path) -> PhaseOf:
+        """Wanted phase of a profile that needs no search; files lie below ``folder``."""
+        shapes: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
+            "double-helix": self.double_helix,
+            "cubic": self.cubic,
+            "map": self.map and replace(self.map, file=folder / self.map.file),
+        }
+        return design.phase_of(
+            shapes.get(self.profile), self.focus, radius_um=self.aperture_mm * 500
+        )
+
+    def along(self, target: "YPolarizationTarget") -> "DesignSettings":
+        """The same lens with the target of light along y."""
+        given = {f.name: getattr(target, f.name) for f in fields(target)}
+        return replace(self, **given, along_y=None)
+
+    def at_wavelength(self, light: "AdditionalWavelength") -> "DesignSettings":
+        """The same lens with the target of another wavelength."""
         return replace(
             self,
-            wavelength_nm=told or (only.pop() if len(only) == 1 else _WAVELENGTH_NM),
+            wavelength_nm=light.wavelength_nm,
+            sensor_distance_mm=light.sensor_distance_mm or self.sensor_distance_mm,
+            source_distance_mm=light.source_distance_mm or self.source_distance_mm,
+            wavelengths=(),
         )
 
 
@@ -161,304 +228,270 @@ class Options(CommonOptions):
 
 def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where light does not focus as
-    it should or pillars are hardly
-    known."""
+    it should or the pillars' own errors are large.
+    """
     wanted = config.load(options.config, DesignSettings, empty=False)
-    target, read = options.output, _read(wanted, options.config)
-    if wanted.library is not None and paired.is_two_size_library(
-        options.config.parent / wanted.library
-    ):
-        return _paired(wanted, options, read)
-    if wanted.along_y is not None:
-        raise ConfigError(
-            "along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it"
-        )
-    with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
-        made = _make(wanted, options, draft.path)
-    focus = made.wanted.focus
-    lost = describe_order_loss(made.lens.cell, focus.wavelength_um, made.loss)
-    head, layers = (
-        _head(made.wanted, target, made.quality)
-        + words.pillar_accuracy_text(made.lens)
-        + lost,
-        made.wanted.layers,
-    )
-    about_focus = made.quality, made.check, made.unlike, made.figures
-    values = words.design_values(*about_focus) | several.wavelength_values(made.beside)
-    values |= words.proxy_error(made.lens.proxy) | {"loss": made.loss}
-    text = words.design_text(head, layers, *about_focus, several=bool(made.beside))
-    text += several.wavelength_text(made.beside, layers)
-    if made.quality.turns < 1 and not made.beside:
-        about = made.lens.proxy, made.lens.cell, made.wanted.limits
-        text += f"\n  for a whole turn: {design.phase_coverage_hint(*about, made.quality.turns)}"
-    if made.conversion is not None:
-        values["circular"] = {"hand": made.wanted.hand, **asdict(made.conversion)}
-        text = f"{text}\n{words.conversion_text(made.conversion, made.quality, made.wanted.hand)}"
-    if made.judged is not None:
-        values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
-    checks = (made.check, *(one.check for one in made.beside))
-    return options.console.judged(
-        values, text, [*words.focus_failures(checks), made.lens.proxy.doubt]
-    )
-
-
-def _head(wanted: DesignSettings, target: Path, quality: Quality) -> str:
-    return (
-        f"{target}: {wanted.profile} lens of {quality.pillars:,} pillars, {wanted.aperture_mm} mm, "
-        f"{1e3 * wanted.focus.wavelength_um:g} nm"
-    )
-
-
-def _paired(wanted: DesignSettings, options: Options, read: list[Path]) -> int:
-    """A lens of pillars of two sizes, for light along x and along y."""
-    if options.own_cell:
+    folder, target = options.config.parent, options.output
+    path = None if wanted.library is None else folder / wanted.library
+    two_sizes = path is not None and _is_two_size_library(path)
+    maps = [one.map for one in (wanted, wanted.along_y) if one and one.map]
+    read = [*([path] if path else []), *(folder / one.file for one in maps)]
+    if two_sizes and (options.own_cell or wanted.wavelengths):
         raise ConfigError(
             "own_cell: rows of pillars of two sizes are not solved; leave --own-cell out"
+            if options.own_cell
+            else "wavelengths: need a library of pillars of one size; this one is over "
+            "two (lengths_um)"
         )
-    if wanted.wavelengths:
+    if wanted.along_y is not None and not two_sizes:
         raise ConfigError(
-            "wavelengths: need a library of pillars of one size; this one is over two (lengths_um)"
+            "along_y: one phase for x and one for y need a library over two sizes "
+            "(lengths_um); give it"
         )
-    with options.claim(options.output, beside=(".png",), inputs=read) as draft:
-        path = options.config.parent / (wanted.library or "")
-        made_of, inputs = (
-            axes.load(path),
-            {file.name: reading.sha256(file) for file in (path, options.config)},
-        )
-        wanted = wanted.at(made_of.wavelength_um.tolist())
-        made_of.at(wanted.focus.wavelength_um)
-        if options.process is not None:
-            wanted = replace(
-                wanted, limits=_printable(options.process, made_of.cell, wanted.limits)
-            )
-            inputs[options.process.name] = reading.sha256(options.process)
-        wanted = replace(wanted, layers=wanted.layers.covered_by(made_of.cell.cover))
-        radius_um = wanted.aperture_mm * 500
-        phase, focus, _ = _phase(wanted, options, radius_um)
-        if wanted.along_y is None:
-            other: tuple[PhaseOf | None, Focus] = None, focus
-        else:
-            other = paired.y_polarization_phase(
-                wanted.along_y, focus, options.config, radius_um=radius_um
-            )
-        about = store.Provenance(config=config.dumps(wanted), inputs=inputs)
-        made, split = design.assign_polarization_multiplexed(
-            (phase, other[0]),
-            (focus, other[1]),
-            aperture_um=2 * radius_um,
-            library=made_of,
-            limits=wanted.limits,
-            profile=wanted.profile,
-            provenance=about,
-        )
-        profiles = wanted.profile, (wanted.along_y or wanted).profile
-        checks = paired.check_both_foci(made, profiles, skip=options.skip_focus_check)
-        figures = paired.figures(made, split)
+    ends = (".png",) if two_sizes else (".png", "_fisher.png")
+    with options.claim(target, beside=ends, inputs=read) as draft:
+        make = _design_two_sizes if two_sizes else _design_one_size
+        made, wanted, values, notes, checks = make(wanted, options, draft.path)
         lens.save(draft.path, made)
         write_bytes(draft.path.with_suffix(".png"), lens_plot.lens_picture(made))
-    head = _head(wanted, options.output, split.x)
-    head += describe_order_loss(made_of.cell, wanted.focus.wavelength_um)
-    values = paired.polarization_values(split, checks, figures)
-    text = paired.polarization_text(head, wanted.layers, split, checks, figures)
-    return options.console.judged(values, text, words.focus_failures(checks))
-
-
-def _read(wanted: DesignSettings, where: Path) -> list[Path]:
-    """The files that the config names."""
-    maps = [
-        one
-        for one in (wanted.map, wanted.along_y.map if wanted.along_y else None)
-        if one is not None
+    title = (
+        f"{target}: {wanted.profile} lens of {values['pillars']:,} pillars, "
+        f"{wanted.aperture_mm} mm, {1e3 * made.wavelength_um:g} nm"
+    )
+    failures = [
+        f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a "
+        f"Strehl ratio of {check.strehl:.3f}, expected {check.expected:.3f}"
+        for check in checks
+        if check is not None and not check.passed
     ]
-    return ([where.parent / wanted.library] if wanted.library else []) + [
-        where.parent / one.file for one in maps
-    ]
+    doubt = "" if two_sizes else made.proxy.doubt
+    return options.console.report(
+        title, values, notes=notes, failures=[*failures, doubt]
+    )
 
 
-def _make(wanted: DesignSettings, options: Options, path: Path) -> "DesignOutcome":
-    """Design, check and write the lens with its pictures."""
-    made_of, inputs = _pillars(wanted, options.config, options.console)
-    cell, proxy = made_of.cell, library.proxy_of(made_of)
-    transaction.check_room(
-        options.output, int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2)
-    )  # 4 each
-    wanted = wanted.at(proxy.wavelengths_um)
-    proxy.at(
-        wanted.focus.wavelength_um
-    )  # outside the library it is refused here, not after the search for a phase
-    if options.process is not None:
-        wanted = replace(
-            wanted, limits=_printable(options.process, cell, wanted.limits)
-        )
-        inputs[options.process.name] = reading.sha256(options.process)
-    inputs[options.config.name] = reading.sha256(options.config)
-    wanted = replace(wanted, layers=wanted.layers.covered_by(cell.cover))
-    own = _located(wanted, options.config)
-    if wanted.profile == "map" and own is not None and own.file.is_file():
-        inputs[own.file.name] = reading.sha256(own.file)
-    radius_um = wanted.aperture_mm * 500
-    phase, focus, judged = _phase(wanted, options, radius_um)
-    about: dict[str, Any] = {
-        "aperture_um": 2 * radius_um,
-        "limits": wanted.limits,
-        "profile": wanted.profile,
+_Outcome = tuple[
+    Lens, DesignSettings, dict[str, Any], list[str], Sequence[FocusCheck | None]
+]  # with the settings as filled in, the values, notes and checks of the foci
+
+
+def _design_two_sizes(
+    wanted: DesignSettings, options: Options, draft: Path
+) -> _Outcome:
+    """A lens of pillars of two sizes, for light along x and along y."""
+    path = options.config.parent / (wanted.library or "")
+    pillars, inputs = axes.load(path), {path.name: reading.sha256(path)}
+    wanted = wanted.at(pillars.wavelength_um.tolist())
+    pillars.at(wanted.focus.wavelength_um)
+    wanted = _fill_limits(wanted, options, pillars.cell, inputs)
+    phase, focus, _ = _find_phase(wanted, options, draft)
+    other: tuple[PhaseOf | None, Focus] = None, focus
+    if wanted.along_y is not None:
+        target = wanted.along(wanted.along_y)
+        other = target.phase(options.config.parent), target.focus
+    made, split = design.assign_polarization_multiplexed(
+        (phase, other[0]), (focus, other[1]), library=pillars, **_common(wanted, inputs)
+    )
+    values: dict[str, Any] = {
+        "pillars": split.x.pillars,
+        "pairs_of_sizes": split.pairs,
+        "multiplexed": split.multiplexed,
+        "covered": split.covered,
     }
-    about["provenance"] = store.Provenance(config=config.dumps(wanted), inputs=inputs)
-    conversion: ConversionMetrics | None = None
+    checks: list[FocusCheck | None] = []
+    lights: tuple[Literal["x", "y"], ...] = ("x", "y")
+    profiles = wanted.profile, (wanted.along_y or wanted).profile
+    for place, light in enumerate(lights):
+        quality, seen = (split.x, split.y)[place], made.seen(light)
+        hyperbolic = profiles[place] == "hyperbolic"
+        check = _check(seen, quality, options, wanted=hyperbolic)
+        checks.append(check)
+        own = _summarize(seen, quality, check)
+        del own["turns"]  # of a single diameter
+        values[f"along_{light}"] = own | {
+            "wavefront_efficiency_error": split.wavefront_efficiency_error[place],
+            "leaked": split.leaked[place],
+        }
+    lost = describe_order_loss(pillars.cell, wanted.focus.wavelength_um)
+    return made, wanted, values, [lost], checks
+
+
+def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _Outcome:
+    """A lens of pillars of one size: at one wavelength or several, or rotated."""
+    pillars, inputs = _pillars(wanted, options.config.parent, options.console)
+    cell, proxy, folder = (
+        pillars.cell,
+        library.proxy_of(pillars),
+        options.config.parent,
+    )
+    sites = int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2)
+    transaction.check_room(options.output, sites)  # 4 bytes each
+    wanted = wanted.at(proxy.wavelengths_um)
+    proxy.at(wanted.focus.wavelength_um)  # refused here, not after the search
+    wanted = _fill_limits(wanted, options, cell, inputs)
+    if wanted.profile == "map" and wanted.map and (folder / wanted.map.file).is_file():
+        inputs[wanted.map.file.name] = reading.sha256(folder / wanted.map.file)
+    phase, focus, values = _find_phase(wanted, options, draft)
+    about = _common(wanted, inputs)
+    rotated = pillars.turned is not None
+    targets: list[DesignSettings] = []
     others: list[Quality] = []
-    lights = [
-        design.WavelengthTarget(*_phase(one, options, radius_um)[:2], w)
-        for one, w in several.designs_by_wavelength(wanted, made_of)
-    ]
-    if lights:
+    if wanted.wavelengths:
+        if rotated:
+            raise ConfigError(
+                "wavelengths: turned pillars make one phase at all of them; need a "
+                "library for any light"
+            )
+        targets = [wanted.at_wavelength(one) for one in wanted.wavelengths]
+        weights = [one.weight for one in wanted.wavelengths]
+        lights = [
+            design.WavelengthTarget(one.phase(folder), one.focus, weight)
+            for one, weight in zip([wanted, *targets], [1.0, *weights], strict=True)
+        ]
         made, (quality, *others) = design.assign_multi_wavelength(
             lights, cell=cell, proxy=proxy, **about
         )
-    elif made_of.turned is not None:
+    elif rotated:
         made, quality, conversion = design.assign_geometric_phase(
-            phase, focus, library=made_of, hand=wanted.hand, **about
+            phase, focus, library=pillars, hand=wanted.hand, **about
         )
+        values["circular"] = {"hand": wanted.hand, **asdict(conversion)}
     else:
         partial = options.accept_partial_turn
         made, quality = design.make(
             phase, focus, cell=cell, proxy=proxy, accept_partial_turn=partial, **about
         )
-    meets = wanted.profile != "map" or words.focus_problem(
-        phase, focus, radius_um, cell, options.console
-    )
-    quality = replace(quality, focuses=meets)
-    made, found = words.solve_coupling(
-        made, quality, conversion, radius_um, solve=options.own_cell
-    )
-    checked = _checkable(wanted, options, quality)
-    check = (
-        check_focus(made, expected=quality.strehl if others else 1.0)
-        if checked
-        else None
-    )
-    beside = several.judge_wavelengths(
-        made, wanted.wavelengths, lights[1:], others, check=checked
-    )
-    figures = words.focus_figures(made, quality)
-    lens.save(path, made)
-    write_bytes(path.with_suffix(".png"), lens_plot.lens_picture(made))
-    if judged is not None:
-        write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    lost = made_of.mean_loss(made.diameters.diameter_um, wanted.focus.wavelength_um)
-    return DesignOutcome(
-        wanted, quality, check, figures, judged, conversion, found, made, beside, lost
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class DesignOutcome:
-    """What a design is worth. wanted: as it was filled in; check: of its focus;
-    figures:
-    of its PSF; judged: of a free form; conversion: of
-    circular light; unlike: what neighbours leave of the efficiency; beside: of the
-    other wavelengths; loss: mean share that is absorbed or in other orders."""
-
-    wanted: DesignSettings
-    quality: Quality
-    check: FocusCheck | None
-    figures: FocusMetrics | None
-    judged: "_Judged | None"
-    conversion: ConversionMetrics | None
-    unlike: design.NeighbourCouplingLoss | None
-    lens: Lens
-    beside: tuple[several.WavelengthMetrics, ...]
-    loss: float
-
-
-def _checkable(wanted: DesignSettings, options: Options, quality: Quality) -> bool:
-    """Whether the exact sum makes sense: a lens with one focus, small enough to hold
-    every pillar's phase at once.
-    """
-    if wanted.profile != "hyperbolic" or options.skip_focus_check:
-        return False
-    if quality.pillars > words.MOST_SUMMED:
-        options.console.say(
-            f"the exact sum around the focus is left out: more than {words.MOST_SUMMED:,} pillars"
+    radius_um = wanted.aperture_mm * 500
+    notes = [describe_order_loss(cell, focus.wavelength_um)]
+    if wanted.profile == "map":
+        meets = design.has_focus(
+            phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um
         )
-    return quality.pillars <= words.MOST_SUMMED
-
-
-@dataclass(frozen=True, slots=True)
-class _Judged:
-    """What a free-form design is worth: numbers, text, PNG."""
-
-    values: dict[str, Any]
-    text: str
-    picture: bytes
-
-
-def _phase(
-    wanted: DesignSettings, options: Options, radius_um: float
-) -> tuple[PhaseOf, Focus, _Judged | None]:
-    """The phase of the profile, what it images onto what, and for a free form how it
-    compares.
-    """
-    if wanted.profile == "fisher":
-        return _free_form(wanted, options, radius_um)
-    shape: dict[str, DoubleHelix | Cubic | PhaseMap | None] = {
-        "double-helix": wanted.double_helix,
-        "cubic": wanted.cubic,
-        "map": _located(wanted, options.config),
+        quality = replace(quality, focuses=meets)
+        if not meets:
+            notes.append(_meeting_note(phase, focus, radius_um, cell))
+    if made.one_light:
+        notes.append(
+            f"for {made.one_light} only: {cell.described} has another response for x "
+            "and y (lengths_um in [sweep] makes a library for both)"
+        )
+    made, coupling = _couple(made, quality, radius_um, options, rotated=rotated)
+    checkable = wanted.profile == "hyperbolic"
+    expected = quality.strehl if others else 1.0
+    check = _check(made, quality, options, wanted=checkable, expected=expected)
+    values = _summarize(made, quality, check) | values
+    if coupling is not None:
+        values["neighbours"] = asdict(coupling)
+    checks, several = [check], []
+    for light, target, one in zip(wanted.wavelengths, targets, others, strict=True):
+        seen = replace(
+            made,
+            wavelength_um=target.focus.wavelength_um,
+            sensor_distance_um=target.focus.sensor_distance_um,
+            source_distance_um=target.focus.source_distance_um,
+        )
+        check = _check(seen, one, options, wanted=checkable, expected=one.strehl)
+        checks.append(check)
+        named = {"wavelength_nm": light.wavelength_nm, "weight": light.weight}
+        several.append(named | _summarize(seen, one, check))
+    if several:
+        values["wavelengths"] = several
+    elif quality.turns < 1:
+        hint = design.phase_coverage_hint(proxy, cell, wanted.limits, quality.turns)
+        notes.append(f"for a whole turn: {hint}")
+    if quality.steepest > quality.sampled_aperture:
+        notes.append(
+            "at the rim the phase is steeper than the lattice samples: light leaves in "
+            "other directions too; take a smaller pitch"
+        )
+    values |= {
+        "proxy_phase_error_rad": proxy.max_phase_error_rad,
+        "proxy_transmission_error": proxy.max_transmission_error,
+        "entry_error": proxy.entry_error,
+        "loss": pillars.mean_loss(made.diameters.diameter_um, focus.wavelength_um),
     }
-    return (
-        design.phase_of(shape.get(wanted.profile), wanted.focus, radius_um=radius_um),
-        wanted.focus,
-        None,
-    )
+    return made, wanted, values, notes, checks
 
 
-def _free_form(
-    wanted: DesignSettings, options: Options, radius_um: float
-) -> tuple[PhaseOf, Focus, _Judged | None]:
-    """A designed phase; where it was made for axial information, beside simple lenses
-    tuned as hard.
+def _is_two_size_library(path: Path) -> bool:
+    return path.is_file() and store.load(path).kind == axes.KIND
+
+
+def _common(wanted: DesignSettings, inputs: dict[str, str]) -> dict[str, Any]:
+    """Arguments of every assignment."""
+    return {
+        "aperture_um": wanted.aperture_mm * 1e3,
+        "limits": wanted.limits,
+        "profile": wanted.profile,
+        "provenance": store.Provenance(config=config.dumps(wanted), inputs=inputs),
+    }
+
+
+def _fill_limits(
+    wanted: DesignSettings, options: Options, cell: Cell, inputs: dict[str, str]
+) -> DesignSettings:
+    """The limits of a process file (by a package above this one that the command line
+    names), the gap behind the pillars filled by the cover; notes the files read.
     """
+    inputs[options.config.name] = reading.sha256(options.config)
+    layers = wanted.layers.covered_by(cell.cover)
+    if options.process is None:
+        return replace(wanted, layers=layers)
+    inputs[options.process.name] = reading.sha256(options.process)
+    thinnest, gap = importlib.import_module(OBJECTIVES["process"]).printable_limits(
+        options.process, pitch_um=cell.pitch_um, height_um=cell.height_um
+    )
+    limits = replace(wanted.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
+    return replace(wanted, layers=layers, limits=limits)
+
+
+def _pillars(
+    wanted: DesignSettings, folder: Path, console: Console
+) -> tuple[PillarLibrary, dict[str, str]]:
+    """The library of the pillars, and the hash of its file if there is one."""
+    if wanted.library is not None:
+        path = folder / wanted.library
+        return library.load(path), {path.name: reading.sha256(path)}
+    others = (1e-3 * one.wavelength_nm for one in wanted.wavelengths)
+    waves = tuple(sorted((wanted.focus.wavelength_um, *others)))
+    cell = wanted.cell or library.DEFAULT_CELL
+    return library.sweep(cell, wavelengths_um=waves, console=console), {}
+
+
+def _find_phase(
+    wanted: DesignSettings, options: Options, draft: Path
+) -> tuple[PhaseOf, Focus, dict[str, Any]]:
+    """The phase of the profile, what it images onto what, and for a free form made for
+    axial information the comparison with simple lenses, whose picture it writes.
+    """
+    if wanted.profile != "fisher":
+        return wanted.phase(options.config.parent), wanted.focus, {}
     from metalens.design.free_form import design_pupil, fisher_profile
     from metalens.design.free_form import report as reports
 
-    console, settings = options.console, wanted.fisher.about(wanted.focus, radius_um)
+    radius_um, console = wanted.aperture_mm * 500, options.console
+    settings = wanted.fisher.about(wanted.focus, radius_um)
     pupil = design_pupil(wanted.focus, radius_um, settings)
-    objective = (
-        _scene_objective(settings, pupil) if settings.objective == "scenes" else None
-    )
+    scenes = settings.objective == "scenes"
+    objective = _scene_objective(settings, pupil) if scenes else None
     console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
     phase, found = fisher_profile(
         wanted.focus, radius_um=radius_um, settings=settings, objective=objective
     )
-    least, mean = (
-        float(found.score.encircled.min()),
-        float(found.score.information.mean()),
-    )
-    figure = (
-        f"I(z) {mean:.3f} /mm²"
-        if objective is None
-        else f"Eq. 6 {-mean:.3f} (0 without blur)"
-    )
+    mean = float(found.score.information.mean())
+    goal = f"Eq. 6 {-mean:.3f} (0 without blur)" if scenes else f"I(z) {mean:.3f} /mm²"
+    least = float(found.score.encircled.min())
     console.say(
-        f"free form: {figure}, encircled energy {least:.2f} or more; {found.reason}"
+        f"free form: {goal}, encircled energy {least:.2f} or more; {found.reason}"
     )
     focus = replace(wanted.focus, source_distance_um=found.focus_um)
-    if objective is not None:
-        return phase, focus, None
-    console.say(
-        "tuning a hyperbolic lens and a double helix for the same pixels, depths and angles"
-    )
+    if scenes:
+        return phase, focus, {}
+    console.say("tuning a hyperbolic lens and a double helix for the same task")
     lenses = reports.judge_designs(found, pupil, settings)
     picture = reports.report_picture(lenses, pupil, settings)
-    return (
-        phase,
-        focus,
-        _Judged(
-            reports.report_values(lenses, settings),
-            reports.report_text(lenses, settings),
-            picture,
-        ),
-    )
+    write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
+    return phase, focus, {"fisher": reports.report_values(lenses, settings)}
 
 
 def _scene_objective(settings: ResolvedFisherSettings, pupil: "Pupil") -> Any:
@@ -468,34 +501,115 @@ def _scene_objective(settings: ResolvedFisherSettings, pupil: "Pupil") -> Any:
     return importlib.import_module(OBJECTIVES["scenes"]).SceneObjective(pupil, settings)
 
 
-def _pillars(
-    wanted: DesignSettings, where: Path, console: Console
-) -> tuple[PillarLibrary, dict[str, str]]:
-    """The library of the pillars, and the hash of its file if there is one."""
-    if wanted.library is not None:
-        path = where.parent / wanted.library
-        return library.load(path), {path.name: reading.sha256(path)}
-    cell = wanted.cell or library.DEFAULT_CELL
-    waves = (
-        wanted.focus.wavelength_um,
-        *(1e-3 * one.wavelength_nm for one in wanted.wavelengths),
+def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:
+    """Where the rays of a map that does not focus on the sensor meet."""
+    meets = design.meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
+    sensor, source = focus.sensor_distance_um, focus.source_distance_um
+    if meets is None or abs(meets[2] / sensor - 1) <= 0.01:
+        return "the rays of the map meet in no bright spot of the sensor"
+    return (
+        f"the rays of the map meet {format_place(meets)}; source at "
+        f"{source / 1e3:g} mm, sensor at {sensor / 1e3:g} mm"
     )
-    return library.sweep(cell, wavelengths_um=tuple(sorted(waves)), console=console), {}
 
 
-def _printable(path: Path, cell: Cell, limits: Limits) -> Limits:
-    """The limits of a process file, through a package above this one that the command
-    line names.
+def format_place(at_um: tuple[float, float, float]) -> str:
+    """Words for a place behind the lens.
+
+    Args:
+        at_um: x, y and z.
     """
-    module = importlib.import_module(OBJECTIVES["process"])
-    thinnest, gap = module.printable_limits(
-        path, pitch_um=cell.pitch_um, height_um=cell.height_um
-    )
-    return replace(limits, min_diameter_nm=thinnest, min_gap_nm=gap)
+    x, y, z = (round(value, 3) + 0.0 for value in at_um)
+    return f"at ({x:+.4g}, {y:+.4g}) um, {z * 1e-3:.4g} mm behind the lens"
 
 
-def _located(wanted: DesignSettings, where: Path) -> PhaseMap | None:
-    """The phase map with its file relative to the config."""
-    if wanted.map is None:
+def _couple(
+    made: Lens, quality: Quality, radius_um: float, options: Options, *, rotated: bool
+) -> tuple[Lens, design.NeighbourCouplingLoss | None]:
+    """The lens, with its rows solved where asked for, and the loss by neighbour
+    coupling; None where there is no such number.
+    """
+    if rotated or not quality.focuses:
+        if options.own_cell:
+            why = "pillars that are turned" if rotated else "a phase without a focus"
+            raise ConfigError(
+                f"own_cell: {why}: no rows are solved for it; leave --own-cell out"
+            )
+        return made, None
+    if not options.own_cell:
+        return made, design.estimate_neighbour_coupling_loss(made, radius_um=radius_um)
+    rows = design.solve_coupling_rows(made, radius_um=radius_um)
+    made = replace(made, neighbours=rows)
+    return made, design.neighbour_coupling_loss(made, radius_um=radius_um)
+
+
+def _check(
+    made: Lens,
+    quality: Quality,
+    options: Options,
+    *,
+    wanted: bool,
+    expected: float = 1.0,
+) -> FocusCheck | None:
+    """The exact sum around the focus, where the profile has one and it is asked for."""
+    if options.skip_focus_check or not wanted:
         return None
-    return replace(wanted.map, file=where.parent / wanted.map.file)
+    if quality.pillars > MOST_SUMMED:
+        options.console.say(f"more than {MOST_SUMMED:,} pillars: no exact focus check")
+        return None
+    return design.check_focus(made, expected=expected)
+
+
+def _summarize(
+    made: Lens, quality: Quality, check: FocusCheck | None
+) -> dict[str, Any]:
+    """Quality of a lens, its PSF and its focus; None for what JSON does not know.
+
+    The PSF is left out of a phase without a focus, of a lens of more pillars than fit
+    in memory at once, and where torch is not installed.
+    """
+    values: dict[str, Any] = {"pillars": quality.pillars, "focuses": quality.focuses}
+    if quality.focuses:
+        values |= {
+            "numerical_aperture": quality.numerical_aperture,
+            "field_of_view_deg": math.degrees(quality.field_of_view_rad),
+            "efficiency": None,
+        }
+        if quality.pillars <= MOST_SUMMED:
+            try:
+                values |= _of_psf(design.focus_figures(made))
+            except ModuleNotFoundError as error:
+                if error.name != "torch":
+                    raise
+    names = (
+        "wavefront_efficiency",
+        "sampled_aperture",
+        "steepest",
+        "transmission",
+        "strehl",
+        "max_phase_error_rad",
+        "rms_phase_error_rad",
+        "turns",
+    )
+    values |= {name: getattr(quality, name) for name in names}
+    if check is not None:
+        values |= {
+            "focus_x_um": check.x_um,
+            "focus_y_um": check.y_um,
+            "focus_z_um": None if math.isnan(check.z_um) else check.z_um,
+            "exact_strehl": check.strehl,
+            "focus_passed": check.passed,
+        }
+    return values
+
+
+def _of_psf(figures: Any) -> dict[str, Any]:
+    """Focusing efficiency and widths of the PSF of the design source."""
+    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
+    found = {name: getattr(figures, name) for name in names}
+    found |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
+    plain = {
+        name: None if isinstance(v, float) and math.isnan(v) else v
+        for name, v in found.items()
+    }
+    return plain | {"diffraction_limit": asdict(figures.limit)}

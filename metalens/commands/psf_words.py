@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from metalens import psf
-from metalens.commands import design_words
+from metalens.commands.design import format_place
 from metalens.core.report import Figure, KeyFigure, Section, Table
 
 DARK = 0.1  # share of the light in the window, below which it holds no image
@@ -65,7 +65,7 @@ def dark(found: Computed) -> str:
     where = (
         "rays of the design source meet nowhere (psf --far-field shows where its light goes)"
         if meets is None
-        else f"rays of the design source meet {design_words.place(meets)}; --offset-um moves the window"
+        else f"rays of the design source meet {format_place(meets)}; --offset-um moves the window"
     )
     return f"the window of {angles} holds {share:.2g} of the light: {where}"
 
@@ -94,7 +94,7 @@ def text(target: Path, found: Computed) -> str:
         )
     meets = found.meets_um
     if meets is not None and math.hypot(*meets[:2]) > stack.step_um:
-        lines.append(f"  rays of the design source meet {design_words.place(meets)}")
+        lines.append(f"  rays of the design source meet {format_place(meets)}")
     return "\n".join(lines)
 
 

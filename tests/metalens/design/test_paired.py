@@ -226,7 +226,7 @@ def test_a_lens_of_two_sizes_is_kept_drawn_and_refused_where_one_size_is_known(
 
 
 def test_targets_are_checked():
-    from metalens.commands.paired import YPolarizationTarget
+    from metalens.commands.design import YPolarizationTarget
 
     with pytest.raises(ConfigError, match=r"along_y\.map"):
         YPolarizationTarget(profile="map")
