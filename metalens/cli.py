@@ -1,13 +1,5 @@
 """The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails
 its own check, 2 on bad input.
-
-A verb lives beside its stage, as a frozen dataclass of its options and a function
-``run(options) -> int``; only
-the verb that is asked for is imported. Options may lie apart from the work, in a module
-that names that of ``run`` as
-``WORK``, so that help needs neither torch nor time. A module with a table ``PARTS`` in
-place of them has verbs of its
-own; its ``part_of(word)`` may name the one that a path is meant for.
 """
 
 import atexit

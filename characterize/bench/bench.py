@@ -1,12 +1,5 @@
 """A virtual bench: frames of a hidden as-built lens by the sum over every pillar, with
 the noise of a real sensor.
-
-Independent of the fit: pillars are changed one by one, the field comes from
-:func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
-Shared with the fit, and so not tested by it: the pillars' response (proxy, slopes by
-height, index and sidewall), the paths through films and a plate of glass (``Films``,
-``extra_path``), the map of uneven light, and the colours of a spectrum. The referee of
-the tests (``tests/referees/pillar_bench.py``) shares none of these.
 """
 
 import math

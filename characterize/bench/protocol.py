@@ -1,12 +1,5 @@
 """Which frames to take: source depths, field angles and exposures that tell most about
 the lens (optimal design).
-
-Every candidate frame has a Fisher information J^T W J at the nominal lens; that of a
-set of frames is the sum, on
-top of what metrology says. Frames are picked greedily for the largest determinant (D)
-or the least trace of the
-covariance in typical units (A), then exchanged one by one as long as that helps
-(Fedorov 1972).
 """
 
 import math

@@ -1,13 +1,5 @@
 """Counts that are coarser than their noise: what a rounded count says of the light, in
 closed form.
-
-A converter gives k where light and noise together lie between k - 1/2 and k + 1/2. With
-s counts of Gaussian noise
-about m counts of light P(k) = Phi((k + 1/2 - m) / s) - Phi((k - 1/2 - m) / s). Rounding
-adds a variance of 1/12 and
-nothing else where s is a third or more; below, it errs alike wherever light is alike,
-and light half-way between two
-counts is known far better than light in the middle of one.
 """
 
 import math

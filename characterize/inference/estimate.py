@@ -37,7 +37,7 @@ from characterize.inference.prepare import (
     setting_of,
     stated_priors,
 )
-from characterize.inference.uncertainty import Posterior
+from characterize.inference.uncertainty import FitPosterior
 from characterize.model import (
     NAMES,
     PARAMETERS,
@@ -314,7 +314,7 @@ def _as_laid(task: SearchTask, found: FrameArrangement) -> SearchTask:
 def _result(
     capture: Capture,
     task: SearchTask,
-    found: Posterior,
+    found: FitPosterior,
     cautions: list[str],
     gain: SensorNoise,
     looked: ScoreTests,
@@ -380,7 +380,9 @@ def _result(
     )
 
 
-def _within(found: Posterior, covariance: Array, names: tuple[str, ...]) -> WithinModel:
+def _within(
+    found: FitPosterior, covariance: Array, names: tuple[str, ...]
+) -> WithinModel:
     """The posterior with the error of the gain in what is counted in electrons."""
     value = found.best.value
     counted = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
@@ -414,7 +416,7 @@ def _nominal(task: SearchTask, fitted: dict[str, float]) -> Array:
 
 
 def _verdicts(
-    task: SearchTask, found: Posterior, unseen: float, unstated: UnmodelledShifts
+    task: SearchTask, found: FitPosterior, unseen: float, unstated: UnmodelledShifts
 ) -> tuple[str, str]:
     rows = usual_parameters(task.names, task.model.lens)
     known = verdict.process_verdict(
@@ -452,7 +454,7 @@ def _extrapolation(unseen: float) -> list[str]:
 
 
 def _open(
-    task: SearchTask, found: Posterior, covariance: Array, looked: ScoreTests | None
+    task: SearchTask, found: FitPosterior, covariance: Array, looked: ScoreTests | None
 ) -> tuple[str, ...]:
     """What cannot be told apart: bent and double posteriors, pairs, and causes that
     nobody fitted.
@@ -469,7 +471,7 @@ def _named(names: tuple[str, ...]) -> Array:
     return np.array([not name.startswith(("log_gain", "background")) for name in names])
 
 
-def _told(task: SearchTask, found: Posterior) -> Array:
+def _told(task: SearchTask, found: FitPosterior) -> Array:
     """(p,) width of the intervals over that of the prior."""
     return np.asarray(
         (found.high - found.low) / (2 * uncertainty.REACH) / task.prior.sigma
@@ -511,7 +513,7 @@ def _problems(
     return problems
 
 
-def _with_gain(names: tuple[str, ...], found: Posterior, gain: SensorNoise) -> Array:
+def _with_gain(names: tuple[str, ...], found: FitPosterior, gain: SensorNoise) -> Array:
     """Covariance with the error of the sensor's gain, which scales everything that is
     counted in electrons.
     """

@@ -1,14 +1,5 @@
 """Maximum likelihood for images: Levenberg-Marquardt with model-based weights,
 censoring, outliers and priors.
-
-The score of a Poisson count plus Gaussian noise, sum (d - I) dI / (I + v), is that of a
-weighted least-squares
-problem whose weights follow the model, so iterating the weights gives the
-maximum-likelihood estimate (quasi-score
-equations, McCullagh and Nelder). A saturated pixel says only "at least this much": it
-pulls while the model
-is below it and is silent above. Residuals beyond ``huber`` sigma count linearly (Huber
-1964).
 """
 
 import dataclasses

@@ -1,19 +1,5 @@
 """Causes that the fit leaves out: each leans the residuals its own way, and is looked
 for along that (score test).
-
-With residuals r over their noise at the mode, the fitted slopes A (priors included) and
-the change of the images by
-a cause G, both over the noise, what the fit cannot make up for is G' = G - A (AᵀA)⁻¹
-AᵀG. Then s = Gᵀr scatters with
-covariance I = GᵀG' where the cause is absent, and sᵀI⁻¹s follows chi-square of as many
-degrees (Rao 1948). One number
-for each cause: more telling than the chi-square of all pixels, in which a twentieth of
-a sigma a pixel drowns.
-
-What the frames cannot tell goes into the intervals as considered parameters (Schmidt
-1966), c of plausible size each:
-the fit moves by M c with M = (AᵀA)⁻¹ AᵀG, and the frames know of c what its score says
-and no more.
 """
 
 import dataclasses

@@ -1,11 +1,4 @@
-"""Posterior about the modes of a fit: profiles where the parabola fails, weighted draws.
-
-The one objective is -2 ln posterior of :mod:`leastsquares`. Where it is a parabola at
-the ends of a 95 % interval, the Laplace covariance is the answer; elsewhere the
-parameter is profiled (Venzon and Moolgavkar 1988) at up to four places a side. Draws
-come from a mixture of the Gaussians about all modes and profiled places, with
-importance weights.
-"""
+"""Posterior about the modes of a fit: profiles where the parabola fails, weighted draws."""
 
 import dataclasses
 import itertools
@@ -49,7 +42,7 @@ _HELD = SolverSettings(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Profile:
+class ProfileLikelihood:
     """Profile likelihood of one parameter about a mode.
 
     low, high: 95 % interval. value, rise: (k,) the parameter, and by how much -2 ln
@@ -68,7 +61,7 @@ class Profile:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Posterior:
+class FitPosterior:
     """What is left open about the fitted parameters.
 
     modes: best first; share: (k,) probability of each. low, high: (p,) 95 % intervals
@@ -84,7 +77,7 @@ class Posterior:
     parabolic: Array
     draws: Array
     effective_draws: float
-    profiles: dict[str, Profile]
+    profiles: dict[str, ProfileLikelihood]
     covariance: Array
 
     @property
@@ -93,7 +86,7 @@ class Posterior:
         return self.modes[0]
 
 
-def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> Posterior:
+def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> FitPosterior:
     """Intervals, profiles, covariance and draws about the modes ``ends`` (best first)
     of ``task``; a place below a mode that a profile meets is followed first.
 
@@ -122,7 +115,7 @@ def explore_posterior(task: SearchTask, ends: Sequence[FitSolution]) -> Posterio
 
 def profile_parameters(
     problem: FitProblem, mode: FitSolution, index: Sequence[int], level: float
-) -> dict[int, Profile]:
+) -> dict[int, ProfileLikelihood]:
     """Profile of each parameter in ``index`` about ``mode``, to a rise of ``level``.
 
     Where -2 ln posterior at both ends of the parabola's interval is that of the
@@ -142,7 +135,9 @@ def profile_parameters(
     )
 
 
-def _profile(problem: FitProblem, mode: FitSolution, i: int, level: float) -> Profile:
+def _profile(
+    problem: FitProblem, mode: FitSolution, i: int, level: float
+) -> ProfileLikelihood:
     sigma, goal = math.sqrt(float(mode.covariance[i, i])), math.sqrt(level)
     middle, along = float(mode.value[i]), mode.covariance[:, i] / sigma
     low, high = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
@@ -153,7 +148,7 @@ def _profile(problem: FitProblem, mode: FitSolution, i: int, level: float) -> Pr
     if inside and all(low < problem.merit(x) - mode.merit < high for x in places):
         steps = np.array([-2.5, -1.96, -1.0, 0.0, 1.0, 1.96, 2.5])
         value = middle + steps * sigma
-        return Profile(
+        return ProfileLikelihood(
             middle - goal * sigma, middle + goal * sigma, value, steps**2, True
         )
     sides = [_profile_side(problem, mode, i, sign, goal) for sign in (-1, 1)]
@@ -166,7 +161,7 @@ def _profile(problem: FitProblem, mode: FitSolution, i: int, level: float) -> Pr
     ratio = np.abs(np.array(ends) - middle) / (goal * sigma)
     straight = bool(((ratio > _PARABOLIC[0]) & (ratio < _PARABOLIC[1])).all())
     found = sides[0][1], sides[1][1]
-    return Profile(ends[0], ends[1], value, rise, straight, found, stops)
+    return ProfileLikelihood(ends[0], ends[1], value, rise, straight, found, stops)
 
 
 def _profile_side(
@@ -305,8 +300,8 @@ def _joined(
     task: SearchTask,
     problem: FitProblem,
     modes: list[FitSolution],
-    found: dict[int, Profile],
-) -> Posterior:
+    found: dict[int, ProfileLikelihood],
+) -> FitPosterior:
     """The posterior over all modes, with the errors of dark and flat."""
     best, names, prior = modes[0], task.names, task.prior
     spread = max(1.0, best.chi2_per_dof)
@@ -342,12 +337,12 @@ def _joined(
         names[i]: dataclasses.replace(one, low=float(low[i]), high=float(high[i]))
         for i, one in found.items()
     }
-    return Posterior(
+    return FitPosterior(
         tuple(modes), share, low, high, parabolic, draws, size, profiles, covariance
     )
 
 
-def posterior_text(names: Sequence[str], found: Posterior) -> list[str]:
+def posterior_text(names: Sequence[str], found: FitPosterior) -> list[str]:
     """What the posterior ``found`` of parameters ``names`` leaves open, in words:
     ends that were not reached, skewed intervals, second modes.
     """

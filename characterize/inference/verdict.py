@@ -20,7 +20,7 @@ from characterize.inference.leastsquares import (
 )
 from characterize.inference.missing import ResidualFinding, UnmodelledShifts
 from characterize.inference.multistart import WAVES_RAD, SearchTask, named_images
-from characterize.inference.uncertainty import Posterior
+from characterize.inference.uncertainty import FitPosterior
 from characterize.model import FitParameter, ForwardModel, KnownValue
 from metalens.core import threads
 from metalens.core.arrays import Array
@@ -352,7 +352,7 @@ def process_verdict(
     )
 
 
-def predicted_error(task: SearchTask, found: Posterior) -> tuple[float, float]:
+def predicted_error(task: SearchTask, found: FitPosterior) -> tuple[float, float]:
     """Expected NRMSE of the as-built images: at the captured depths, and half-way
     between them.
 
@@ -369,7 +369,9 @@ def predicted_error(task: SearchTask, found: Posterior) -> tuple[float, float]:
     )
 
 
-def predicted_aside(task: SearchTask, found: Posterior) -> tuple[float, float] | None:
+def predicted_aside(
+    task: SearchTask, found: FitPosterior
+) -> tuple[float, float] | None:
     """As :func:`predicted_error` at the captured depths: half-way between neighbouring
     field angles, and half a step
     beyond the outermost; None of frames at one angle.
@@ -421,7 +423,7 @@ def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     return ForwardModel(model.lens, there, model.response).about(model.grid.middle_um)
 
 
-def _shown(task: SearchTask, found: Posterior) -> Array:
+def _shown(task: SearchTask, found: FitPosterior) -> Array:
     """(draws, p) of the posterior, within the bounds."""
     if len(found.draws):
         values = found.draws[:_SHOWN]

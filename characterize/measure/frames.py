@@ -1,11 +1,5 @@
 """Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths;
 distortion, field curvature.
-
-The Strehl ratio compares like with like: the Airy pattern of the design's aperture is
-laid under the pixels where the
-spot lies (a pixel as wide as the spot's core holds from half to all of its peak as that
-may be), and loses the median
-of its border as the frame does.
 """
 
 import math

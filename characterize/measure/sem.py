@@ -1,15 +1,5 @@
 """Electron micrographs to pillar diameters: radial edges to a fraction of a pixel,
 missing and collapsed pillars.
-
-Edges are found along many rays from each pillar's centre, as the place where the
-smoothed profile falls through half of
-the step from the pillar's rim to the gap, whether its top is bright or dark; the
-diameter is that of the area within,
-and what the picture's blur takes of a disc (s² / R of its diameter, Gaussian of s; of
-one that is not wide beside it,
-what is read of such a disc: ``radial``) is given back. Charging
-(slow shades), noise and drift of the scan are taken off or averaged over the rays. The
-lattice may be of any kind.
 """
 
 import dataclasses

@@ -1,14 +1,5 @@
 """The kernel from a lens to a sensor window, split into factors of two coordinates and
 a rest as smooth as can be.
-
-With the path F(p, q, X, Y) = r - r_w, seen from the window's centre, and the lens's
-middle direction (a, b):
-F = F(p, b, X, 0) + F(a, q, 0, Y) + H(X, Y) + rest, where H makes the rest vanish at p =
-a, q = b, and wherever X = 0
-and q = b, or Y = 0 and p = a. The three factors are put on exactly; what the window
-bends by itself, and along each
-axis with the direction, is in them. The rest begins with X² q²: a window as wide as the
-lens is far needs few nodes.
 """
 
 import dataclasses

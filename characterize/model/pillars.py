@@ -1,10 +1,5 @@
 """What a change of the pillars does to their transmission, as few functions of the
 designed diameter.
-
-t(D + b; height, index, sidewall, wavelength) for all small changes lies close to a
-space of a few functions u_k(D);
-summing the lens once for each u_k makes every change of process act on coarse nodes
-(see :mod:`reduced`).
 """
 
 import dataclasses

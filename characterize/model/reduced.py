@@ -1,15 +1,4 @@
-"""The lens gathered on coarse nodes, and the way from there to a sensor window.
-
-E(X, Y) = sum over nodes of G_pq f_pq K, where the nodes are direction cosines (p, q)
-seen from the window's centre,
-G is the lens without its known focusing phase, f is whatever acts smoothly over the
-aperture, and
-K = d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) is a factor of (p, X), one of (q, Y), one
-of (X, Y) and a smooth rest of
-low rank (:mod:`kernel`). The adjoint of interpolation between nodes gathers the
-pillars, so the result is that of the
-full sum for every smooth f.
-"""
+"""The lens gathered on coarse nodes, and the way from there to a sensor window."""
 
 import copy
 import dataclasses

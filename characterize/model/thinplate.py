@@ -1,9 +1,5 @@
 """Smooth phases over the aperture without a formula: thin-plate modes of what the
 parameters cannot do.
-
-A bicubic spline less piston, tilt, defocus and the low Zernikes; its modes (Wahba 1990)
-are equal in rms and ordered by
-bending energy: the more a mode bends, the less likely it is.
 """
 
 import functools

@@ -1,13 +1,5 @@
 """From nodes to a sensor window: products with two factors and few terms, on samples as
 coarse as the band allows.
-
-Along each axis the field less its carrier, the turns of the middle direction, holds no
-frequency above k times half the
-span of direction cosines. It is computed on an even grid ``ROOM`` times as fine as that
-asks, and interpolated to the
-window's samples by the weights of least error over the band: as in any prolate problem,
-that falls geometrically with
-their number (Slepian and Pollak 1961; Knab 1979).
 """
 
 import functools

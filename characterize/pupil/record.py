@@ -1,10 +1,5 @@
 """A generic pupil: through-focus images of a small bead by any objective, from NA,
 wavelength and pixel alone.
-
-Vectorial Debye integral for an isotropic incoherent emitter (Richards and Wolf 1959;
-six components, aplanatic
-apodisation 1 / sqrt(cos theta)), or its scalar form for low apertures; phase and
-log-amplitude are Zernike sums.
 """
 
 import math

@@ -1,12 +1,5 @@
 """What the next lithography run should draw: a bias table from the as-built lens, a
 corrected map, and their gain.
-
-The table undoes what depends on the diameter alone: the mean bias, and through the
-diameters the phase that height,
-index and sidewall took. What varies over the lens (gradient, bow, saddle) is no table:
-a corrected diameter map undoes
-it. Both follow from the fit; the gain is simulated on the true lens, or on others of
-the posterior.
 """
 
 import dataclasses

@@ -1,11 +1,5 @@
 """The network trained on for the lens that was made: the inner loop on its PSFs, with
 the optics fixed.
-
-Training draws a lens from the posterior of the fit at every step, so the network trusts
-no parameter more than the
-captures do. What retraining bought is measured against three others: the nominal lens,
-the made lens before, and, on
-a virtual bench, a network that was trained with the truth known.
 """
 
 import math

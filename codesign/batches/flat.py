@@ -1,12 +1,5 @@
 """Frames as one surface of varying depth in three bytes a pixel, and their image: what
 training affords.
-
-The two sheets of :mod:`metalens.image.scene` blur separately, with their coverage,
-because lids hide the eye. Where
-both lie at similar depths (as at a lid's margin) the light of both may be added without
-division: one channel in place
-of four. The error is that of occlusion edges alone, measured in the tests and in
-``python -m benchmarks codesign``.
 """
 
 from dataclasses import dataclass

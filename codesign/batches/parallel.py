@@ -1,10 +1,5 @@
 """Training and search under ``torchrun``: every process takes its part of each batch,
 and all move alike.
-
-Gradients are averaged and batch statistics taken over the whole batch, so two processes
-do what one does, to rounding.
-Candidates of a search are judged by one process each.
-Outside ``torchrun`` there is one process and nothing here costs anything.
 """
 
 import contextlib

@@ -1,20 +1,4 @@
-"""The error budget of a lens: each link of the chain as phase, PSF and gaze error.
-
-    true pupil and slippage -> the person's calibration          subject and calibration
-    where the person really looks                                fixation
-    pupil, then slippage and axis read from noiseless frames     reader, pupil and slippage
-    noise of the sensor                                          sensor noise
-    what training left out of its image                          field, radiometry, spectrum
-    pillars, films, solver, mask, process, calibration of the lens
-
-Down to training, each state has the causes of the one before and one more; persons are
-calibrated anew in each, and a cause costs what the mean error grows by, in quadrature.
-The last state is the virtual experiment. From the pillars on each link is changed alone
-in the device's image, and costs the mean angle by which it turns the network's answers.
-A cause that the network was trained with is no error of its answer: it is switched off
-to show what it does, and is not in the sum. Without a run nothing reads gaze, and the
-budget has the errors of phase and PSF alone.
-"""
+"""The error budget of a lens: each link of the chain as phase, PSF and gaze error."""
 
 import math
 from collections.abc import Iterator

@@ -1,13 +1,5 @@
 """The experiment of the paper's Sec. 5 with synthetic subjects: a grid of stimuli under
 known slippage of the camera.
-
-The paper's bench holds the head, shows 7 x 7 stimuli over 25 x 35 degrees, and moves
-the camera to seven places that
-share an origin: two to the side and four along the axis, in steps of 2.5 mm. Here the
-subjects are drawn from the
-population of :mod:`codesign.eye.population`, none of whom training saw; every run sees
-the same frames through its
-own lens.
 """
 
 import math

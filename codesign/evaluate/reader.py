@@ -1,14 +1,5 @@
 """A fixed, cheap reader that judges any lens by what a small reader really collects of
 the depth in its images.
-
-    frames → log power of windows → depth of each window (labels of the renderer) →
-    slippage, with its uncertainty
-
-The same for every lens: frames, noise, layers, schedule and order of the frames come
-from the seed alone, so a lens has
-one number. The lens images through its true image: whole field, depth, spectrum. An
-information bound of stationary
-texture ranks lenses that readers cannot tell apart; what is read of them does not.
 """
 
 import math

@@ -1,11 +1,5 @@
 """A free-form lens from Eq. 6 itself: triplets of rendered eyes through the PSFs of the
 phase, and their Fisher matrix.
-
-For :func:`metalens.design.free_form.search.optimize_free_form`. The images are
-energy-matched as
-in Table 1, and every entry of
-the Fisher matrix is relative to that of images without any blur, so that 0 is a lens
-that loses nothing to a pinhole.
 """
 
 import torch

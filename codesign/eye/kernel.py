@@ -1,16 +1,4 @@
-"""What a pixel sees, compiled for float32: lids, skin and eye in front of a pinhole.
-
-Lengths are um; the camera is at the origin and looks along +z, x to the right, y down.
-Pixels are shaded in tiles of :data:`LANES` rays, in passes over all rays of a tile: a
-loop of arithmetic without branches becomes vector instructions, and a pass that no pixel
-of the tile needs is left out. Texture pixels are fetched between two such loops.
-
-Every function below is inlined into :func:`frames`. A function that is called is
-optimised once alone and once within its caller, and these round differently with
-``fastmath``: then the process that compiles and the next one would differ.
-
-Reference: tests/codesign/eye/plain_eye.py, the same formulas on torch tensors.
-"""
+"""What a pixel sees, compiled for float32: lids, skin and eye in front of a pinhole."""
 
 import math
 from collections import namedtuple

@@ -1,15 +1,5 @@
 """The eye and face as numbers: a documented population, subjects drawn from it, and
 their states of gaze and slip.
-
-The model eye has one spherical cornea, one refracting surface, a plane iris and one
-centre of rotation (Guestrin and
-Eizenman 2006). Real eyes have none: the centre of vertical turns lies about 1 mm before
-that of horizontal ones (Fry
-and Hill 1962, 1963). At 20 degrees 1 mm moves the pupil by 0.34 mm, which reads as 1.5
-degrees; a personal
-calibration takes up most of it because it is nearly linear in the gaze. Corneal
-asphericity (Q about -0.25) moves the
-refracted limbus side of the iris by up to 0.1 mm and the pupil by less than 0.02 mm.
 """
 
 import math

@@ -1,10 +1,5 @@
 """What real frames have and the model of the eye has not: spectacles, make-up, uneven
 light, movement, other cameras.
-
-Every cause is a record of :data:`CAUSES` and changes rendered frames, their depth and
-their pupil masks, in the image.
-It is on in a share of the frames that grows with the ``variety`` of the scenes: none at
-1, the record's share at 2.
 """
 
 from collections.abc import Mapping

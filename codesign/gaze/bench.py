@@ -1,12 +1,5 @@
 """Gaze from a network's answers, three ways apart: population eye, the person's own
 eye, and personal calibration.
-
-With a population eye the error is that of anatomy, 3 degrees whatever the lens. So a
-test takes several frames of each
-of several people, calibrates on a fifth of them (the paper's 20 % of the points), and
-judges the rest. Where the optic
-axis is read too, :func:`learn_from_people` makes a calibrator of what other people's
-frames tell.
 """
 
 import math

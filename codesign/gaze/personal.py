@@ -1,10 +1,5 @@
 """Gaze of one person from pupil and slippage: the spherical eye fitted to a few points,
 then a small regressor.
-
-The paper's Secs. 3.2 and 5: a slippage-corrected ray meets the sphere on which the
-pupil moves, and one hidden layer
-learns what is left for this person. A regressor without the sphere has to learn the
-geometry itself from ten points.
 """
 
 import math

@@ -1,20 +1,5 @@
 """Gaze of one person from few points, with what is common to people learned from
 others: a linear mixed model.
-
-A network reads the optic axis, the pupil and the slippage of every frame, each with
-errors of its own. Over people,
-gaze follows them as
-
-    g = a + F (β + u_p) + e,    u_p ~ N(0, diag τ²),  e ~ N(0, σ²),    F = (1, x, x xᵀ),  x = (a, pupil, slippage)
-
-(Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all,
-u_p is of one person. β, τ²
-and σ² come from people whom nobody judges (:func:`learn_population`: expectation
-maximisation); a
-person's u_p is its mean under
-that prior, given a few frames. So terms by which people hardly differ, as how a network
-misreads large slippage, need
-no points of theirs, and kappa, by which they differ most, gets nearly all of them.
 """
 
 from dataclasses import dataclass

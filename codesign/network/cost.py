@@ -1,12 +1,5 @@
 """Multiply-accumulates of a network as a function of architecture and pixel pitch
 (paper Eq. 9).
-
-Every convolution costs (its multiply-accumulates per output pixel) x (output pixels),
-and the output of total
-stride s on an input of n pixels has ceil(n / s)² pixels. So a network is a short list
-of (stride, cost per
-output pixel) and a constant; at integer n the sum is exact, between integers it follows
-a C1 cubic.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,11 +1,4 @@
-"""Normalisation by what was seen before: the batch itself moves nothing.
-
-The blur of a frame says how deep it lies, and so does the mean power of a batch of
-frames: batch normalisation takes it
-away, with an error of one over the root of the batch, and the network learns depths
-beside those of the batch. A mean
-over many steps takes away what frames have in common alone.
-"""
+"""Normalisation by what was seen before: the batch itself moves nothing."""
 
 import torch
 from torch import Tensor, nn

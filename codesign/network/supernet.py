@@ -1,12 +1,4 @@
-"""Elastic MobileNetV3 with a branch for blur, and heads for mask, slip and depth.
-
-Every architecture of the space is a slice of one set of weights.
-
-A kernel is the centre of a larger one, channels are the first of more, blocks are the
-first of a stage (after
-Cai et al. 2019). Batch statistics belong to one architecture at a time:
-:func:`recalibrate_batch_norm` measures them.
-"""
+"""Elastic MobileNetV3 with a branch for blur, and heads for mask, slip and depth."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

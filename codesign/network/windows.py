@@ -1,19 +1,5 @@
 """What a window of the frame holds that blur changes: log powers of waves, and how its
 steps of brightness are spread.
-
-A window is a quarter of the frame wide; 7 x 7 of them overlap by half. The waves have 0
-… 8 periods a window under a
-Hann weight:
-
-    P(i, f) = |Σ_x w(x - x_i) e^{2πi f·x} frame(x)|² / Σ w²         log P: texture and blur add up in it
-
-Places and frequencies are fractions of the frame, so frames of any number of pixels
-give the same features as far as
-their pixels reach; waves beyond Nyquist are left out. A power says how much a window
-varies at a scale, not whether
-along one lash or everywhere; how the steps between neighbouring samples are distributed
-says it, and blur takes the
-steepest steps first.
 """
 
 import functools

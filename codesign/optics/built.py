@@ -1,10 +1,5 @@
 """The PSFs that a made lens gives to training: every pillar as built, gathered on the
 pupil, on the samples of a run.
-
-A draw from the posterior of a fit takes a tenth of a second: the pillars' transmission
-comes from a table over the
-diameter, and the light that one of them sends to other diffraction orders averages out
-over a few micrometres.
 """
 
 import math

@@ -1,9 +1,5 @@
 """Families of lenses that training starts from: what is added to one hyperbolic focus,
 and the terms that move.
-
-vortices     rings of a double helix, (2 ring - 1) θ
-parts        sectors of the aperture, each tilted along its own direction: their images lie ``apart_um`` about a circle
-foci         rings of equal area, from the middle to the rim, each with a focus of its own
 """
 
 import math

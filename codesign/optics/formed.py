@@ -1,14 +1,5 @@
 """The image that training sees: true over field, depth and spectrum, or by one PSF a
 depth, as the settings say.
-
-    true      every part of the image through the PSFs of its own field angle, summed over the light source's spectrum
-    uniform   the PSF of one chief ray and one wavelength for the whole image: a named approximation, see :func:`apart`
-
-While the lens moves, its PSFs over the field are formed anew every few steps; between
-them the gradient of the light at
-the nodes of the field goes to the phase through a few field points and wavelengths that
-are drawn at random, which is
-unbiased (:mod:`metalens.image.slopes`).
 """
 
 import functools

@@ -1,9 +1,5 @@
 """Lenses as they will be made, drawn while training: what the assembly and every cause
 of the table do to the light.
-
-Training knows the phase of its lens and the unit cell, but not the pillars one by one.
-Phases fill a turn evenly over the lens. What all pillars answer in common is a phase of
-the wave front; what they answer differently takes light out of the image.
 """
 
 import dataclasses

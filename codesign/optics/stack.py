@@ -1,9 +1,5 @@
 """The optics that training moves: a focus and a few dozen orthonormal polynomials of
 phase, and their PSFs.
-
-A smooth phase is enough to shape a PSF, keeps its gradients of one size, and leaves no
-pillar noise to overfit;
-:func:`phase_of` gives the same phase at every pillar of the full lens.
 """
 
 import functools

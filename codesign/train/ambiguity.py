@@ -1,10 +1,5 @@
 """Test frames on which only the blur tells depth: the pupil stays where it is, and size
 means nothing.
-
-Pairs of states share the place of the pupil at different slips
-(:func:`codesign.eye.dataset.ambiguity_pairs`, paper
-Sec. 3.6); then every frame gets a scale that brings its depth to one that has nothing
-to do with its picture.
 """
 
 from dataclasses import dataclass, replace

@@ -1,15 +1,5 @@
 """The inner loop: lens, pixel pitch and network weights move together against one loss
 (paper Eqs. 8 and 10).
-
-Every step draws its frames, architectures, noise and lens errors from the seed and the
-step's number alone, so a run
-that is stopped anywhere goes on bit for bit. Optics, pitch and weights have their own
-rates, clips and schedules: the
-gradients of phase coefficients are a hundred times smaller than those of weights, and
-one shared clip never acts.
-The dense layers that read blur are trained by SOAP (Vyas et al. 2024, arXiv:2409.11321)
-on the schedule of the weights: log powers of a window vary together, and Adam along the
-eigenvectors of their gradients learns what lies across that direction at once.
 """
 
 import math

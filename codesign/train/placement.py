@@ -1,12 +1,5 @@
 """Where a run computes: on the processor, or on a GPU while the processor renders the
 frames of the next step.
-
-PSFs, images, pixels, network and losses lie on the GPU; of the frames three bytes a
-pixel travel there. The noise is
-drawn on the processor, so that a step has the same everywhere, and gradients come back
-to lens and pitch, which stay.
-A GPU sums in another order than the processor: two runs on one are equal to rounding,
-not to the bit.
 """
 
 import os

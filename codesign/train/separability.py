@@ -1,14 +1,4 @@
-"""Eqs. 4 to 6 in training: how separably the sensor shows gaze and slippage.
-
-    J_i  = (I(state + step of motion i) - I(state)) / step                     on the sensor's pixels
-    F_ij = sum over pixels of J_i J_j                                          (Eq. 4)
-    L    = -sum log F_ii + w sum over i != j of F_ij² / (F_ii F_jj) + v (1 - E)        (Eq. 6)
-
-The triplets {anchor, gaze, slip} are rendered in two layers with occlusion, share one
-exposure, and go through the step's own optics and pixels. Images are in units of the
-anchor's mean, so that no lens wins by its light alone. The off-diagonal entries are
-relative to the diagonal: the plain ones of the paper change with units and brightness.
-"""
+"""Eqs. 4 to 6 in training: how separably the sensor shows gaze and slippage."""
 
 import math
 from collections.abc import Callable

@@ -1,13 +1,4 @@
-"""The inner problem of Eq. 10: optics, pitch and weights of one architecture.
-
-    θ*(α) = argmin over θ = {φ_opt, p, w} of [L_task + λ_o L_optics + λ_c [C(α, p) -
-    C_budget]_+]
-
-θ starts from the supernet's (warm start), so every candidate ends with a lens and a
-pixel pitch of its own. The candidate is judged by gaze: pupil and slippage as read,
-through the spherical-eye solver and the residual regressor, on people whom neither
-training nor test shows.
-"""
+"""The inner problem of Eq. 10: optics, pitch and weights of one architecture."""
 
 import copy
 import math

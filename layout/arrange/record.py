@@ -1,9 +1,5 @@
 """What stands on a die and on a wafer, as ARRANGEMENT.toml says it: lenses, cells of
 other files, a raster of dies.
-
-Places are middles, in micrometres from the middle of the die; +y is up, as on the mask.
-A turn is counter-clockwise,
-after a mirror at the x axis.
 """
 
 import math

@@ -1,11 +1,5 @@
 """Millions of placements by their sums alone: for each child how many, where on
 average, and a hash of all places.
-
-Each place (x, y) becomes 64 well-mixed bits (splitmix64), times an odd number for its
-quarter turn (1 for none); their
-sum over the placements of a child, modulo 2^64, does not depend on their order. Two
-different sets of places agree in
-count, both sums and hash by chance once in 2^64.
 """
 
 from collections.abc import Iterator

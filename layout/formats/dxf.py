@@ -1,9 +1,5 @@
 """DXF of a window of the mask (ezdxf): closed polylines in micrometres, one DXF layer
 for each mask layer; read back.
-
-The header says the unit ($INSUNITS 13, micrometres); a layer's name is that of the mask
-layer, its description the
-layer and datatype. Same input, same bytes.
 """
 
 import io

@@ -1,10 +1,5 @@
 """What the writer's operator gets beside the mask: the write fields in their order, and
 a job sheet as text.
-
-Fields go in rows from the lower left, every other row backwards, so that the stage
-moves least. Beam current, resist
-and file format of the machine are left open: the sheet says the charge, from which any
-current gives the time.
 """
 
 import csv

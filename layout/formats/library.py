@@ -412,7 +412,7 @@ class MaskLibrary:
         """
         found: dict[str, list[tuple[Array, Array]]] = {}
         for name, _, x, y in self.walk(top):
-            if name != top and not self.cells[name].children:
+            if name != top and not self.cell(name).children:
                 found.setdefault(name, []).append((x, y))
         joined = {name: list(zip(*parts, strict=True)) for name, parts in found.items()}
         return {

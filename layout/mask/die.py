@@ -1,9 +1,5 @@
 """The die around the lens: aperture, alignment and orientation marks, label, dose-test
 array, witness cells.
-
-Two lithography steps: the pillars with their marks, dose array, witness cells and
-label; and the aperture, drawn as
-the openings of an opaque film over the lens, the marks and the test structures.
 """
 
 import dataclasses

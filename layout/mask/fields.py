@@ -1,10 +1,4 @@
-"""Write fields: the e-beam tool writes squares, and no border may cut a pillar.
-
-Borders run midway between lattice sites, so that every pillar lies whole in one field
-and keeps at least half a gap
-from the border. A field is then a block of rows and columns: no pillar needs a field
-number of its own.
-"""
+"""Write fields: the e-beam tool writes squares, and no border may cut a pillar."""
 
 import itertools
 from dataclasses import dataclass

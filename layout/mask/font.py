@@ -1,9 +1,5 @@
 """Letters of 5 x 7 squares for labels: rectangles only, so that any writer draws them
 exactly.
-
-Where two squares of a letter meet at a corner alone, two quarter squares beside it join
-them: no width of a letter and
-no gap in it is 0. Nothing lies on another, which a writer would expose twice.
 """
 
 import itertools

@@ -1,13 +1,5 @@
 """Marks of a die: crosses, coarse and fine, an F for its orientation, verniers and
 boxes in boxes for its two steps.
-
-A vernier is two scales side by side: bars of pitch p1 drawn with the pillars, and of
-pitch p2 > p1 opened in the film
-of the aperture. Where the film lies d to the right of the pillars, bar n of both meets
-where n p1 = n p2 + d, so the
-reading is d = n (p1 - p2), with n counted from the middle bar, which is longer, to the
-right (upwards for the upright
-scale). A box in a box shows the same shift as a difference of the two margins, twice.
 """
 
 from collections.abc import Iterator

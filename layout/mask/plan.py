@@ -1,16 +1,5 @@
 """The mask as a record: lattices of pillar classes, fixed figures, layers. Writers and
 checks need nothing else.
-
-Coordinates are whole database units (``unit_nm``, 1 nm by default) along the axes of
-the lens: a pillar of the map at
-(x, y) um is drawn at (x, y). Mask readers show +y upwards, and the mask is seen from
-the pillar side, against the
-light: along the light (+x right, +y down, +z away, right-handed) the same lens shows +y
-downwards. So the first row
-of a diameter map is the lowest of the mask, and the first row of a lattice here, its
-topmost, is the last of the
-map. Millions of pillars stay an array of class numbers: 0 for no
-pillar, k for ``classes[k - 1]``.
 """
 
 import dataclasses

@@ -1,13 +1,5 @@
 """Pillars that are not round, or turned one by one: a class for every drawn size and
 turn.
-
-Of a film with openings the openings are drawn. All edges of a pillar (or opening) move
-alike, by the bias of the
-process at its size; its turn is rounded to a step, its corners to the grid (a circle,
-also that of a ring's hole, keeps
-its area as round pillars do). A pillar with a hole is written as polygons that share
-the cut through the middle of the
-hole. Rounding of the corners by the etch is not made up for.
 """
 
 import math

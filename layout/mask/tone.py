@@ -1,17 +1,5 @@
 """Negative tone: what the mask of the standing structures leaves empty is drawn, and
 nothing else.
-
-The exposed area is the die without pillars, marks, verniers and labels. It is written
-as lattice squares without their
-pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around
-the marks and labels without
-these, each on its own layer, and the rest of the die (FRAME). All of them abut; none
-overlaps another. Without a die a
-frame one pitch wide (RIM) goes around the lattice: the squares of its last pillars
-would end in slits half a gap wide.
-A lattice square is a rectangle where rows lie closer or farther than columns; of a
-hexagonal lattice it is a brick, two
-columns of the grid wide, and those of the next row stand half a brick off.
 """
 
 import dataclasses

@@ -1,17 +1,5 @@
 """Proximity correction: a dose for each shape, so that all edges receive the exposure
 that clears the resist.
-
-The exposure at the edge of pillar i is d_i s_i + B_i: by itself
-(:mod:`layout.pec.drawn`: s(D) of a disc), and the
-background B = K * (A d) of all other shapes of the die. Setting it to g_i / 2 (1/2: the
-edge of a wide area of dose 1;
-g: the goal, 1 but for a dose test) gives d = (g / 2 - B) / s, and for the background
-the linear equation
-B = K * [(g / 2 - B) A / s], solved on a coarse grid of nodes over the die. What varies
-from pillar to pillar is then a
-product of a number per kind and a smooth function of place. Gaussians too narrow for
-coarse nodes are solved on the
-sites of each lattice.
 """
 
 from collections.abc import Sequence

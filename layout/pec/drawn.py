@@ -1,16 +1,5 @@
 """What each kind of pillar exposes at unit dose: discs in closed form, any other shape
 by its polygons.
-
-The edge that counts is the one in the resist. At dose d on a background B it is where d
-E(x) + B = 1/2, E the exposure
-by the pillar itself at unit dose; the pillar keeps its area A where E's level set of
-area A lies there:
-
-    d own + B = 1/2,   own: the level that E exceeds on the area A.
-
-Of a disc that is the exposure of its rim; rounded corners are made up for by the
-straight edges. Turns about the site
-leave ``own`` as it is, so that the table is smooth in turn and size.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,5 @@
 """Rectangles of marks and labels cut into pieces of one dose each: short where the
 background changes, long elsewhere.
-
-The background along a straight edge changes next to its ends and next to other shapes
-only, over a range of the
-Gaussian; so the number of pieces goes with the number of corners, and not with area
-over range squared.
 """
 
 from dataclasses import dataclass

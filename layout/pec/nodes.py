@@ -1,14 +1,5 @@
 """Sums over all shapes of a smooth kernel, through a coarse grid: cubic interpolation
 and its transpose.
-
-A kernel that is smooth over some pitches needs no sum over sites: spread each pillar to
-the four nearest nodes of
-each axis with the weights of cubic interpolation, convolve on the nodes, and
-interpolate back. Both interpolations
-are of order 4, also at the edge of the lens, since what is interpolated is the kernel
-and not the pattern. The nodes
-lie anywhere: lattices of any place and pitch, and shapes off any lattice, share one
-grid.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,5 @@
 """Point exposure of an electron beam as a sum of Gaussians, and the exact exposure that
 discs make of it.
-
-A beam at one point deposits the energy density f(r) = sum_k w_k exp(-r^2 / a_k^2) / (pi
-a_k^2) with sum w_k = 1:
-the double Gaussian of forward and back-scattered electrons (Chang, J. Vac. Sci.
-Technol. 12, 1271 (1975)) has
-w = (1, eta) / (1 + eta), a = (alpha, beta). Measured functions have longer tails; they
-are fitted with a ladder
-of Gaussians.
 """
 
 from dataclasses import dataclass

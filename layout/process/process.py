@@ -1,10 +1,4 @@
-"""The process: what the writer and the etch can do, read from PROCESS.toml.
-
-Lengths in nm where a mask is meant and in um where a machine is, as the names say. The
-defaults suit 100 kV
-electron-beam lithography and a pseudo-Bosch etch of 700 nm amorphous silicon on fused
-silica.
-"""
+"""The process: what the writer and the etch can do, read from PROCESS.toml."""
 
 import dataclasses
 import math

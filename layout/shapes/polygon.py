@@ -1,9 +1,5 @@
 """Pillar polygons: the area of the circle, on the mask grid, centred exactly, symmetric
 under the square.
-
-A polygon is one eighth of a turn and its mirror images, so its centroid is the site to
-the last digit. Its half width is the radius to the nearest grid step; the other
-vertices carry the area. Widths and areas therefore rise with the diameter.
 """
 
 import functools

@@ -1,13 +1,5 @@
 """The light of pillars on a small window of the sensor, for many amplitude maps at
 once, without torch.
-
-The field is that of :mod:`metalens.propagate.paths`, films and all. Its phase is fast
-over the lens, but what differs
-between depths and window points is slow: with the phase to the middle of the window
-taken off, it is a polynomial on
-Chebyshev nodes, and the pillars enter only by their sums against that polynomial basis:
-two matrix products for each
-map, exact to the tolerance that sets the number of nodes.
 """
 
 from dataclasses import dataclass

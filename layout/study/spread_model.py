@@ -1,15 +1,5 @@
 """A lens reduced to what draws of its process need: few sums over the pillars, weighted
 anew for each draw.
-
-A draw changes t of every pillar through a local bias b(x) and, for the whole lens,
-through what all pillars answer
-alike (height, wall, index). Over all such changes the curve t(D) stays in a space of
-few dimensions, found by a
-singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are
-summed once for each B_k (times
-the phase of their turn, which no draw changes but for all alike); a draw only weights
-these sums, at the nodes of
-:mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
 """
 
 import functools

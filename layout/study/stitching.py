@@ -1,11 +1,4 @@
-"""What misplaced write fields do to the point-spread function.
-
-The light of a field that stands off by a vector is the light of its pillars from there:
-to second order in the
-offset, the field's own amplitude and its derivatives on the window, which are computed
-once; any number of draws
-of all offsets then costs fields times window.
-"""
+"""What misplaced write fields do to the point-spread function."""
 
 from dataclasses import dataclass
 

@@ -1,12 +1,4 @@
-"""Verification of the exposure: what the written files and their dose table make.
-
-Shapes and doses come from the files as read back; of the plan the places of pillars are
-taken, which the file was compared with. Shared with the correction: the Gaussians of
-the
-process file, the threshold of half of a wide area, and the field on nodes. That field
-is
-judged by direct sums at sample pillars; edges of marks and labels are in closed form.
-"""
+"""Verification of the exposure: what the written files and their dose table make."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,16 +1,5 @@
 """Exposure at the edges of marks, labels and any other polygon, exact for every
 Gaussian (Owen's T function).
-
-The divergence theorem takes the integral of a Gaussian over a polygon to its edges.
-Seen from a point, with h the
-distance to the line of an edge and theta the angle from its foot, range a:
-
-    integral = sum over edges of (theta2 - theta1) / (2 pi) - T(h sqrt(2) / a, tan
-    theta2) + T(..., tan theta1)
-
-with the sign of the side on which the point lies; T(h, t) = 1 / (2 pi) int_0^t exp(-h^2
-(1 + x^2) / 2) / (1 + x^2) dx
-(D. B. Owen, Ann. Math. Stat. 27, 1075 (1956)).
 """
 
 from collections.abc import Sequence

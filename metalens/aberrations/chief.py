@@ -1,22 +1,5 @@
 """The chief ray of a field angle by the local grating equation, and the rays close to
 it.
-
-Behind the pillars light goes on along p = p_in + grad φ / k (n sin θ as a vector) and
-meets the sensor at
-X = x + b(p) p, b = Σ t / √(n² - p²) over the media behind (:mod:`metalens.optics.media`).
-Close rays, with Q = ∂p/∂x on
-the pillars and B = ∂(b p)/∂p:
-
-    ∂X/∂x = 1 + B Q,        B = Σ t [1 / √(n² - p²) + p pᵀ / √(n² - p²)³]
-
-B is linear in the distance. Along a direction u of the sensor close rays spread as
-|uᵀ(1 + B Q)|, least at one
-distance: the tangential focus for u along the field angle, the sagittal one for u
-across it (Coddington's where Q has
-these axes).
-
-The slope of the phase and its curvature are those of a polynomial of fourth degree
-through the pillars about the ray.
 """
 
 import math

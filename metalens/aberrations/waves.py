@@ -1,18 +1,5 @@
 """The plane waves of the light behind a lens, and line images and transfer functions at
 any distance from them.
-
-    A(p) = ∫ t(x) S(x) U_in(x) exp(-ik p·x) d²x,    U(X; z) = ∫ √T(p) A(p) exp(ik[p·X + Σ t √(n² - p²)]) d²p / λ²
-
-t the pillars, S the shadow of a stop, T the power that the faces behind let through:
-all of the plane at once, no
-window cuts anything off. A line image L(X) = ∫ |U|² dY (a source that is a line along
-y) is, by Parseval along y, a sum
-over p_y of squared transforms along p_x; its transform is the transfer function along
-x, the autocorrelation of A.
-
-Only waves in the directions of the rays behind the pillars are kept, by the slopes of
-the light's phase, and BAND times
-as many; what zone borders scatter beyond them counts as light without detail.
 """
 
 import math

@@ -1,10 +1,5 @@
 """Pages of the refractiveindex.info database as they come: dispersion formulas 1 to 9
 and tables nk, n or k in YAML.
-
-Wavelengths in um. A page without k is that of a transparent material: k = 0. Where n
-and k have their own ranges, both
-must hold. The formulas are those of the database's own description
-(https://refractiveindex.info/about).
 """
 
 import math

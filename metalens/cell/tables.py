@@ -1,10 +1,5 @@
 """Own tables of n and k: CSV, or semicolons or tabs with decimal commas; # opens
 comments.
-
-The wavelength is in um or nm, as its column says (``wavelength_um``, ``wavelength_nm``,
-``Wavelength (nm)``; or ``wl``,
-um, as refractiveindex.info writes it); rows rise or fall with it. A table without k is
-of a transparent material.
 """
 
 import csv

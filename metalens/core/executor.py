@@ -1,11 +1,4 @@
-"""Parallel tasks in worker processes of this machine (loky).
-
-loky, since its workers start without running the caller's script again; a process pool
-of the standard library does,
-and a script without a main guard would start itself over. The answers are the same for
-any number of workers: a task is
-done by one process with one BLAS thread, and knows nothing of the others.
-"""
+"""Parallel tasks in worker processes of this machine (loky)."""
 
 import contextlib
 import functools

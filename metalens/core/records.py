@@ -1,9 +1,4 @@
-"""Records (frozen dataclasses) as the arrays and attributes of an artefact file.
-
-A record that is compared by identity (``eq=False``) holds arrays and becomes a group;
-one that is compared by value holds settings and becomes an attribute of TOML text. The
-entries of a field with the metadata ``flat`` stand beside those of its owner.
-"""
+"""Records (frozen dataclasses) as the arrays and attributes of an artefact file."""
 
 import dataclasses
 import types

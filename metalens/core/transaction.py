@@ -1,9 +1,4 @@
-"""Outputs appear whole or not at all: written beside their target, synced, renamed.
-
-A lock keeps a second writer away. What exists is replaced only with force, and only if
-this toolchain made it. A killed process leaves the old output or the new one; its
-scratch goes with the next writing of the same output.
-"""
+"""Outputs appear whole or not at all: written beside their target, synced, renamed."""
 
 import contextlib
 import os

@@ -1,15 +1,4 @@
-"""Choice of pillars for several channels at once: wavelengths, or polarisations.
-
-At every site the pillar j is taken whose transmissions lie nearest to what all channels
-c want,
-
-    sum_c w_c |t_cj - exp(i (phi_c + p_c))|²   least over the candidates j.        (1)
-
-No intensity depends on the pistons p, so they are part of the search. For given pillars
-the best pistons are the phases of sum t exp(-i phi), the amplitudes in the foci. For
-given pistons the best pillars are those of (1). Both in turn never raise the sum over
-the sites, and end where neither lowers it, from several starts.
-"""
+"""Choice of pillars for several channels at once: wavelengths, or polarisations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

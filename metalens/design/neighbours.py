@@ -1,10 +1,5 @@
 """What the locally periodic approximation leaves out: rows of a lens's own pillars,
 solved as one supercell, against the pillars one by one.
-
-A lens is designed as if every pillar stood among its like. In a row that repeats
-(:func:`metalens.rcwa.solve_row`) every pillar feels its real neighbours; light leaves
-in the orders of that grating, and the wanted one is compared with what the pillars
-would give one by one, at the same truncation, so that truncation all but cancels.
 """
 
 import math

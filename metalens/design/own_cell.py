@@ -1,10 +1,5 @@
 """What a lens's own pillars leave out of its PSF: unlike neighbours and the angle of
 the light, solved for its cell.
-
-A few rows of unlike pillars (:mod:`metalens.design.neighbours`) with the zones that the
-lens has at its rim and
-beyond, and some of its diameters at normal incidence and at an angle. Seconds to a
-minute.
 """
 
 import math

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metalens.cell import Cell, Index, Layer, index
+from metalens.cell import Cell, Index, index
 from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
@@ -18,10 +18,9 @@ from metalens.library.axes import cell_of_sizes
 if TYPE_CHECKING:
     from metalens.lens import Lens
 
-_TRUNCATIONS = (5, 7)  # harmonics of the coarser and the finer solution
+_TRUNCATIONS = (6, 8)  # harmonics of the coarser and the finer solution
 _STEP = 1e-3  # um, rad or 1 of a number of the pillar, to either side
 _WALL_STEP_RAD = 5e-3  # 0.7 um of height then moves foot and top by 3.5 nm
-_SECTIONS = 6  # upright sections that stand for a tilted wall: 1 % of its derivative
 _HANDS = {"left": -1.0, "right": 1.0}
 _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 
@@ -172,13 +171,19 @@ def _slopes(
     cell, size_um, harmonics = task
     if not numbers:
         return [0j] * len(weights)
-    step = _WALL_STEP_RAD if "sidewall_rad" in numbers else _STEP
+    tilts = "sidewall_rad" in numbers
+    step = _WALL_STEP_RAD if tilts else _STEP
     less, middle, more = (
         changed_pillar(cell, size_um, numbers, amount, wavelength_um)
         for amount in (-step, 1e-6 * step, step)
     )
     t_less, t_more = (
-        solve_truncation(*end, wavelength_um, harmonics=harmonics, normals_of=middle).t
+        solve_truncation(
+            *end,
+            wavelength_um,
+            harmonics=harmonics,
+            normals_of=None if tilts else middle,  # normals move with a tilted wall
+        ).t
         for end in (less, more)
     )
     return [
@@ -194,7 +199,7 @@ def changed_pillar(
     amount: float,
     wavelength_um: float,
 ) -> tuple[Cell, float]:
-    """A pillar whose numbers have grown, with upright sections for a tilted wall.
+    """A pillar whose numbers have grown.
 
     Args:
         cell, size_um: the pillar as designed.
@@ -207,8 +212,6 @@ def changed_pillar(
     Returns:
         Cell and size of the changed pillar.
     """
-    from metalens.rcwa import staircase_layers
-
     layers = list(cell.layers)
     for name, rate in numbers.items():
         first, *rest = name.split(".")
@@ -229,9 +232,6 @@ def changed_pillar(
     if layers:
         height_um = sum(layer.height_um for layer in layers)
         cell = dataclasses.replace(cell, layers=tuple(layers), height_um=height_um)
-    if cell.sidewall_rad:
-        sections: tuple[Layer, ...] = tuple(staircase_layers(cell, _SECTIONS))
-        cell = dataclasses.replace(cell, sidewall_rad=0.0, layers=sections)
     return cell, size_um
 
 

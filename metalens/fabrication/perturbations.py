@@ -1,12 +1,5 @@
 """Fabrication perturbations of a lens: one table with unit, prior, bounds, derivative,
 symmetry and measurement of each.
-
-Fit, tolerance study, error budget, training spread and mask correction read this table
-and nothing else: a new cause is a new row. Three kinds of derivative hold all of them:
-
-    CDError    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
-    ResponseError   t of every pillar alike, by its diameter                          t exp(sum a_c s_c(D))
-    WavefrontError     phase of the wave front at (u, v)                                 t exp(i sum a_c z_c(u, v))
 """
 
 import dataclasses

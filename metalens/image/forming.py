@@ -1,16 +1,5 @@
 """Image of a scene through a lens whose PSF varies over the field, with depth, and over
 the spectrum.
-
-    I(X) = Σ_sheets Σ_points L(x) E(x, z) P(X; x, z)
-
-E is the relative illumination: cos⁴ of the field angle (projected aperture and solid
-angle of a sample; of the ray through the middle of the stop where there is one) times
-the light of the PSF's window. 1 is what an ideal lens of the same aperture sends to a
-sample on the axis from radiance 1; the irradiance in watts is that times π NA'² L with
-sin of the rim's angle NA' (small angles: area / distance²).
-The near sheet hides the far one as in :mod:`metalens.image.scene`. Where one sheet is
-visible the sum is as above, and frames whose far sheet covers all take that sum alone,
-at less than half the cost. Plain reference: :func:`image_direct`.
 """
 
 import math

@@ -1,12 +1,4 @@
-"""Field-varying PSFs as one low-rank sum over the whole field and all depths.
-
-    E(x, z) P(δ; x, z) ≈ Σ_r w_r(x, z) K_r(δ)
-    I(X)               = Σ_r K_r * [w_r(x, z) L(x)]
-
-The kernels are principal components of the PSFs at the nodes. The weights, which hold
-the relative illumination E, are cubic splines in x, y and 1/z: an evenly lit plane
-shows the derivative of the interpolated centroid, which is then continuous.
-"""
+"""Field-varying PSFs as one low-rank sum over the whole field and all depths."""
 
 from dataclasses import dataclass, replace
 

@@ -1,18 +1,5 @@
 """PSFs of single field points: the pupil in the direction p that all media share, as
 the window's centre sees it.
-
-    x(p) = X - reach(p) p/|p|                 where the ray that arrives at X with direction p leaves the lens
-    U(X + δ) = ∫ √spread(p) T(x) exp(ik [source path(x) + path(p)]) exp(ik p·δ) d²p
-
-The transform is exact to first order in δ, and √spread keeps ∫|U|². Second order, Q =
-δᵀH(p)δ/2 with H = ∂p/∂X, is put
-right on the samples: about the middle p0 of the pupil its slope s(δ) = ∇Q moves the
-light, and its curvature
-M(δ) = ∇∇Q, where asked for, adds ∇·(M S) with the flux S = Re(U* W), W the transform of
-(p - p0) T.
-The low frequencies of |U|² are the autocorrelation of the pupil; one padded transform
-gives all that squares of a
-sample's size can show.
 """
 
 import functools

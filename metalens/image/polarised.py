@@ -1,22 +1,4 @@
-"""Both polarisations of a field point, as a few pupils whose images add.
-
-What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), whatever
-the slope of the rays. Of rays
-that leave a lens in directions b with the fields E and H = b x E, two polarisations
-together,
-
-    S_z = Σ_c s_c |∫ f_c(p) S(p) exp(ik p·δ) d²p|²    S: the scalar; f_c: (Ex ± Hy)/2, (Ey ± Hx)/2; s_c = ±1
-        = Σ_c s_c |∫ g_c(p) S(p) exp(ik p·δ) d²p|²    g_c: principal axes of Σ_c s_c f_c(p) f_c(p'), light as weight
-
-Of the eight g_c four are not 0, and the first is nearly 1: on the axis S_z is I0² - I2²
-of Richards and Wolf (1959),
-with (1 + cos θ)/(2 √cos θ) = 1 + O(θ⁴) in I0. So |S|² of the scalar, whose rays carry
-their power, is the flux to 7e-5
-of a PSF at NA 0.24 and 4e-3 at NA 0.6. |Ex|² + |Ey|² + |Ez|², six f_c with s_c = 1, weighs every ray by 1/cos θ: it
-differs from the flux by 1e-2 and 0.1 there, and by more from the side. A field point
-keeps the light that its pupil
-passes; fields are how it lies on the window.
-"""
+"""Both polarisations of a field point, as a few pupils whose images add."""
 
 import torch
 from torch import Tensor

@@ -1,13 +1,5 @@
 """Quick PSFs of smooth pupil phases: two matrix products an image, for design studies
 and first guesses.
-
-The pupil is sampled in direction cosines q as seen from the window's centre, where the
-chief ray meets the sensor: in
-them the lens-to-window propagation is a Fourier transform to first order in the
-window's size. On the axis these are
-the nodes that carry the phase; off it, each of them takes the phase of the nearest
-node. Pillars are not resolved; the
-full lens goes through :mod:`metalens.psf`.
 """
 
 import functools

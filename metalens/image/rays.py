@@ -1,9 +1,5 @@
 """Rays of one field point: where they leave the lens, how the window bends them, and
 their paths from the sources.
-
-None of it depends on the wavelength but through the indices of films, so that all
-wavelengths of a spectrum whose nodes
-are the same directions share it: what was computed last is kept.
 """
 
 import functools

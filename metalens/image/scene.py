@@ -1,12 +1,5 @@
 """Image formation: a scene of depth layers through depth-dependent PSFs, with occlusion
 (paper Sec. 3.1).
-
-A scene is two opaque sheets, each a surface of varying depth: the near sheet (lids and
-skin) hides part of the far one
-(the eyeball). Slices of one sheet join without hiding each other; the near sheet hides
-the far one by its blurred
-coverage, and the far one is continued behind it. Weights are divided by their sum, so
-constant radiance stays constant.
 """
 
 import math

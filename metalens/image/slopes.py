@@ -1,25 +1,4 @@
-"""Gradients of an image's loss by the PSFs at the nodes: exact, and by few of them.
-
-Few kernels show the PSFs of a field, and not how they change: through them the
-derivative of an image of 1 % by a coma or by the depth of a point is off by half. So
-an image is formed through kernels, and its derivative is that of the sum over all nodes
-
-    image(X) = Σ_nodes Σ_x s_node(x, z) source(x) E_node P_node(X - x)
-    d loss / d P_node(k) = Σ_x s_node(x, z) source(x) E_node G(x + k)
-
-with the splines s of :mod:`metalens.image.splines` and G = d loss / d image:
-correlations of the source with G, one a node, by transforms.
-
-The image is linear in the light of the nodes. So a step goes in two halves: with the
-light of all nodes as a leaf (no graph through the pupils), the loss gives
-G' = d loss / d light; then for any set of (point, wavelength) drawn with
-probabilities q,
-
-    E[ Σ_drawn  w_λ <G'_point, light_point,λ(phase)> / (n q) ]  has the gradient
-    Σ_points,λ w_λ G' d light / d phase,
-
-the gradient of the loss itself. Wavelengths are drawn by their weights, points evenly.
-"""
+"""Gradients of an image's loss by the PSFs at the nodes: exact, and by few of them."""
 
 from collections.abc import Set
 from typing import Any

@@ -1,16 +1,5 @@
 """Light of other diffraction orders of the zones: each a blurred disc on the sensor,
 weak and wide.
-
-A ray that leaves the lens at r is turned by order m as a lens of m times the power
-would: on the sensor it lands at
-r (1 + d/z - m (1 + d/s)) from its chief ray (source depth z, focus s, sensor distance
-d, each reduced: Σ t/n of the
-media on the way). Order 1 is the image.
-
-Behind a stop a source lights a part of the lens about c, which moves with its
-direction: the disc is as large as that
-part, lies about c times the same factor, and is dim where the lens takes in little of
-what the stop lets through.
 """
 
 import math

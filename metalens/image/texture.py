@@ -1,9 +1,4 @@
-"""Errors of PSFs as the image of a natural texture shows them.
-
-Natural scenes have an amplitude spectrum near 1/f (Field, J. Opt. Soc. Am. A 4, 2379,
-1987). The scene that errors are stated for has mean 1 and such a texture of standard
-deviation :data:`CONTRAST`.
-"""
+"""Errors of PSFs as the image of a natural texture shows them."""
 
 import torch
 from torch import Tensor

@@ -1,10 +1,5 @@
 """What a lens does to light, as the pupil of a field point sees it: a known carrier and
 a slowly varying factor.
-
-The focusing phase runs through thousands of radians; it is formed in float64 at every
-ray and joined with the paths
-before anything is rounded. What is left (polynomials of a design, pillars less the
-ideal phase) fits single precision.
 """
 
 import functools

@@ -1,10 +1,5 @@
 """Answers of all pillars to light of one wavelength and angle, by compiled loops that
 read each diameter once.
-
-    φ(D) = φ_0 + x(φ_1 + x(φ_2 + …)),  |T|(D) alike,  x = scale D^power + shift        paper Eq. 2, at one (λ, θ)
-
-Polynomials are taken in float64 over a part of a row that stays in the nearest cache,
-and whole turns come off before the cast to the dtype of the result.
 """
 
 import numba

@@ -1,17 +1,5 @@
 """What unlike neighbours do to the light of a lens: a factor by the angle that it is
 turned by.
-
-    C(s, α) = 1 + a s + b s²        on amplitudes whose squares are power; s: sine by which light is turned
-
-The first term is that of the zone borders, whose number grows with s; the second that
-of the slope between them. a and b go through solved rows
-(:mod:`metalens.design.neighbours`), apart for fields along the slope and across it, and
-for slopes along the lattice and along its diagonal; between these they go as sin² 2α,
-the least that a square lattice has. Beyond the steepest row along the lattice C stays
-as it is; beyond that along the diagonal, what sets it apart does. Rows are solved at
-one wavelength and at normal incidence. Light of another wavelength or from the side is
-given the same factor where the zones are as wide: s is that of the rows' wavelength.
-What that leaves out is for who uses it to count (:mod:`metalens.psf.budget`).
 """
 
 import math

@@ -1,16 +1,5 @@
 """Libraries over two sizes, the width and length of a rectangle or the axes of an
 ellipse: Jones matrices of every pair, an error bar on each.
-
-t is meromorphic in each size, with poles that move with the other one. Hence
-
-    t(x, y_k) = r_k(x) for every node y_k, a rational function through the nodes x_j
-    (AAA, one set of poles for all elements of the Jones matrix); then, at each x, a
-    rational function of y through t(x, y_k).
-
-The order of the two is arbitrary: the mean of both orders is the value. Where poles are
-not resolved yet both orders may err by the same, so the doubt is the larger of their
-disagreement and of that with a fit of fewer nodes (one in four inner lines left out),
-the largest within half a distance of nodes. Nodes are added where the doubt is largest.
 """
 
 import dataclasses

@@ -1,10 +1,5 @@
 """Reduced order in the diameter: t(D) and r(D) of one wavelength and angle from a few
 dozen exact solves.
-
-The response of a pillar is a meromorphic function of its diameter, so a rational
-function that shares its poles between t and r converges geometrically through every
-resonance. Nodes are added where two rational fits of the same data disagree; the
-disagreement that is left is the error estimate.
 """
 
 from collections.abc import Callable

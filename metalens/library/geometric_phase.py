@@ -1,11 +1,5 @@
 """Circular light on pillars that are turned one by one: the geometric phase, and what
 the lattice adds to it.
-
-A pillar with mirrors along its own axes passes diag(t_x, t_y). Turned by θ in the
-plane, and alone, it passes R(θ) diag(t_x, t_y) R(-θ): of the circular wave x ± iy the
-share (t_x + t_y)/2 keeps its hand, and (t_x - t_y)/2 leaves with the other hand and the
-phase ±2θ (Pancharatnam and Berry). On a lattice the neighbours see the turn; how much
-is solved, not guessed.
 """
 
 import dataclasses

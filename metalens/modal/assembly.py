@@ -1,13 +1,5 @@
 """Matrices of the quarter cell with every wall natural: what a geometry costs once, for
 all wavelengths.
-
-With edge-element functions N_i and scalar functions z_i of the quarter cell (lengths in
-half pitches):
-
-    mass_ij = ∫ N_i·N_j,   curl_ij = ∫ rot N_i rot N_j,   scalar_ij = ∫ z_i z_j,   grad z_j = sum_i gradient_ij N_i
-
-over the whole cell and over the disc alone. Heights, wavelengths, indices, angles and
-polarisations come later.
 """
 
 import math

@@ -1,22 +1,5 @@
 """Only the modes that carry: a few eigenvectors, and everything else in one matrix
 root.
-
-Between the ends of a layer travel the modes with |exp(i q h)| above a threshold, a
-dozen of hundreds. They are found
-by Rayleigh-Ritz in the low levels of the pencil, enlarged by residuals divided by the
-distance of the levels
-(Davidson 1975): the Ritz values of a symmetric pencil have the square of the error of
-the vectors.
-
-All others matter at the ends alone, by the admittance of a layer without end, Y =
-growth sqrt(growth⁻¹ stiffness).
-The modes that carry are first moved to a common level (deflated), which leaves a matrix
-X² = D² + R with D diagonal
-and R small beside it, so X = D + E by the fixed point E_ij = (R - E²)_ij / (D_i + D_j):
-products of matrices instead
-of a nonsymmetric eigenproblem, and no denominator near zero. Every iterate is symmetric
-with respect to growth: the
-scattering matrix is symmetric and unitary whatever the number of iterations.
 """
 
 import math

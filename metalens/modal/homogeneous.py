@@ -1,14 +1,4 @@
-"""Modes of a homogeneous layer in the element space: the basis of everything else.
-
-The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu
-= kx² + ky²) and the rest
-(TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as
-exp(i kz z) with
-kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by
-construction.
-In the half-spaces the zero order is given its exact wavenumber, so that it propagates
-up to grazing incidence.
-"""
+"""Modes of a homogeneous layer in the element space: the basis of everything else."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

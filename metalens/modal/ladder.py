@@ -1,30 +1,5 @@
 """The sequence of meshes: which one to try first for a tolerance, and how its error is
 estimated.
-
-To first order the error of a scattering matrix S is that of the wavenumbers q_j of the
-layer's modes and that of the fields at both ends; g_j is the transverse wavenumber:
-
-    dS = sum_j (dS/dq_j) dq_j + (fields at the ends),
-    dq_j = -(relative error of g_j^2) g_j^2 / (2 q_j).
-
-The electric and the magnetic form are dual: where one overestimates, the other
-underestimates, but for what both share. A solution therefore tells
-
-    rim      half the difference beyond wavenumbers: fields singular at the rim
-    waves    half the difference by wavenumbers, mode by mode
-    drift    the change by a relative error of all g_j^2: waves on polynomials of degree
-             p err, in both forms, as the 2p-th power of the waves in a pitch
-
-and its error is bounded by a sum of these with the factors of a mesh and a width of the
-disc. The factors are a fit to finer meshes times 1.9; ``python -m benchmarks
-hard_cells`` judges them on fresh cells.
-
-At a sharp resonance first order fails: dS goes as one over the least singular value of
-1 - R exp(iqh) R exp(iqh) (``damping``), and the forms may agree by accident. Cells
-outside the calibrated regime are judged by the change since two coarser meshes, times
-the root of how far the forms have drawn together since, over the damping; where every
-wave loses a tenth in a round trip the change needs no damping (:class:`DampedEstimate`).
-Near a cutoff both forms err alike: factors rise, less and less up to two fifths from it.
 """
 
 import math

@@ -1,22 +1,4 @@
-"""Modes of the patterned layer, in the basis of the homogeneous modes.
-
-Curl-curl equation in the layer, longitudinal field eliminated (u transverse field, p
-its continuous partner):
-
-    growth u'' = stiffness u,    p = growth u',    u = w exp(i q z):  -q² growth w = stiffness w
-
-``electric`` form, u = E_t: stiffness = curl - k0² mass_eps, 1/growth = 1/mass - grad
-(k0² scalar_eps)⁻¹ gradᵀ.
-``magnetic`` form, u = H_t: stiffness = curl_(1/eps) - k0² mass, 1/growth =
-1/mass_(1/eps) - grad (k0² scalar)⁻¹ gradᵀ.
-Both are Galerkin forms of the same Maxwell problem with errors of opposite tendency:
-their mean is better than
-either, their difference measures the error. All matrices are symmetric, and real
-without absorption.
-
-TM unknowns are scaled by k0 / sqrt(tm), the size of their growth, which keeps
-rim-graded bases accurate.
-"""
+"""Modes of the patterned layer, in the basis of the homogeneous modes."""
 
 from dataclasses import dataclass
 

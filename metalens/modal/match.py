@@ -1,13 +1,5 @@
 """Two interfaces: from the modes of a layer between half-spaces to the scattering
 matrix of its orders.
-
-Semi-infinite layer and half-space meet in the symmetric operator G = (Y_layer +
-Y_half)⁻¹. Only layer modes that
-survive the height (|exp(i q h)| above a threshold) travel between the interfaces;
-everything else is local to G.
-So each interface is one linear solve with a few right-hand sides, kept real where the
-case is lossless: what
-propagates enters through a small complex correction (Woodbury).
 """
 
 import math

@@ -1,19 +1,4 @@
-"""The quarter cell as curvilinear quadrilaterals that follow the disc.
-
-Lengths are in half pitches: the quarter cell is [0, 1]², the disc has radius rho =
-diameter / pitch. A core
-quadrilateral fills the middle of the disc, rings of quadrilaterals lead from it to the
-circle and from the circle
-to the edge of the cell (transfinite blending, Gordon and Hall 1973). Each ring has
-``sectors`` elements from the x
-axis to the diagonal (side A), and as many from the y axis to the diagonal (side B, the
-mirror image of A), so the
-mesh has the symmetry of the square, and the two parameters of neighbours run the same
-way along a shared edge.
-
-Every point is linear in rho: position = rho * P + Q, so the Jacobians and their
-derivatives in rho are exact.
-"""
+"""The quarter cell as curvilinear quadrilaterals that follow the disc."""
 
 import math
 from dataclasses import dataclass

@@ -1,24 +1,5 @@
 """The layer's equation with its diagonal blocks diagonalised: what finding few modes,
 and a root, start from.
-
-In the homogeneous basis the layer without absorption couples TE and TM unknowns by one
-block only, and each diagonal
-block is a symmetric definite problem of half the size. In their eigenvectors y,
-
-    growth = diag(sign),   stiffness = diag(sign * level) + [[0, coupling], [couplingᵀ, 0]],   sign = +-1,
-
-so that growth⁻¹ stiffness (whose eigenvalues are -q²) is diagonal but for the coupling,
-which is weak beside all
-levels but the lowest. The magnetic form is taken in its dual unknown, the partner p
-(tangential E): there
-stiffness⁻¹ plays the part of growth and growth⁻¹ that of stiffness, half-space
-admittances are inverted, and the
-reflection changes its sign. It needs no inverse of an indefinite matrix.
-
-One block of each form, the TE of the electric and the TM of the magnetic, is a diagonal
-plus k0² times permittivities:
-only its low levels are diagonalised, and what is left beside the others (``rest``) is
-as weak as the coupling.
 """
 
 from dataclasses import dataclass

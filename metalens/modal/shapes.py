@@ -1,20 +1,5 @@
 """One-dimensional shape functions of the curl-conforming elements, and the rules that
 integrate them.
-
-On the unit interval ``value[0] = 1 - s``, ``value[1] = s`` and every further value is a
-bubble, the integral of
-``slope[k - 1]``; ``slope[0] = 1`` and the others are orthonormal with zero mean.
-Products of a slope along one axis
-and a value along the other span the Nedelec space, products of two values its scalar
-space, and the gradient of
-the second lies in the first exactly (Demkowicz, Computing with hp-adaptive finite
-elements, 2007, ch. 11-14).
-
-Where an element touches the rim of the disc, bubbles ``d**tau - d`` of the distance d
-from the rim are added: the
-field at the upper and lower edge of a pillar behaves as d**tau with tau near 0.7 for a
-dielectric corner of high
-contrast (Meixner 1972), which no polynomial follows.
 """
 
 from dataclasses import dataclass

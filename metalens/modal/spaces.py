@@ -1,17 +1,4 @@
-"""Symmetry: the field of the whole cell from the matrices of its quarter, always real.
-
-Across the y walls the field is even or odd, so one kind of wall suffices (``natural``,
-or ``electric``: no
-tangential component). Across the x walls a Bloch wave exp(i kx x) is neither; but
-mirroring x and conjugating
-leaves the problem unchanged. Fields with that symmetry are complex on the quarter cell,
-real along x = 0, and
-real times exp(i kx pitch / 2) along x = pitch / 2. Their real and imaginary parts are
-the unknowns: real matrices
-of twice the size, also with absorption. At kx = 0 the two parts decouple; the imaginary
-one has electric x walls,
-which is the case of light polarised along x at normal incidence.
-"""
+"""Symmetry: the field of the whole cell from the matrices of its quarter, always real."""
 
 import math
 from dataclasses import dataclass

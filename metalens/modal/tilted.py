@@ -1,15 +1,4 @@
-"""Round pillars with tilted walls: RCWA corrected to the modal solution.
-
-At few harmonics a disc acts as one a nanometre or less wider or thinner would, by an
-amount that changes slowly with its diameter. The upright pillar is known from the modal
-method, so the shift s(D) of the diameter with
-
-    |t_N(D + s) - t(D)|^2 + |r_N(D + s) - r(D)|^2  least over s                       (1)
-
-is solved at a few diameters between foot and top, and every cross-section of the wall
-is taken as wide as (1) says. Four successive truncations then lie closer together by an
-order of magnitude, on both sides of the limit; their mean is the result.
-"""
+"""Round pillars with tilted walls: RCWA corrected to the modal solution."""
 
 import dataclasses
 import math

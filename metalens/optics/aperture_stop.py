@@ -1,40 +1,5 @@
 """An aperture stop before the pillars, as on the other face of their substrate: which
 rays pass it.
-
-Through plane-parallel media a ray keeps p = n sin θ. One from a source at s that
-reaches the pillars at x crosses the
-plane of the stop at
-
-    u = x - f (x - s),    f = bend(between) / bend(before),    bend = Σ t / √(n² - p²)    (:mod:`metalens.optics.media`)
-
-and one of collimated light at u = x - p bend(between): ``before`` are the media from
-source to pillars, ``between``
-those from stop to pillars. Of a field angle the lens then uses the part that its light
-falls on, which moves across
-the pillars by the thickness times the slope in the substrate: with it go astigmatism
-and field curvature.
-
-The edge's shadow is that of waves, by its distance s = R - |u| from the ray and the
-Fresnel length L along it, d reach
-/ d p of the media between (less by their share of the way for light that diverges), for
-an edge of radius R:
-
-    S(s) = E(w) - i λ L' / (4π R) dE/ds,    w = s √(2 / (λ L)),    E(w) = e^(-iπ/4) / √2 ∫_-∞^w e^(iπv²/2) dv
-
-E is the straight edge (Born and Wolf, Principles of Optics, 8.7.3). The second term is
-how far an edge bends away
-within the Fresnel zone: mean of its sagitta y² / 2R, <y²> = i λ L' / 2π, L' the Fresnel
-length along the edge.
-
-Light behind the edge of a round hole, compiled: shares of places a few nanoseconds
-each.
-
-    E(w) = e^(-iπ/4) / √2 ∫_-∞^w e^(iπv²/2) dv = [w > 0] + e^(iπ(w²/2 - 1/4)) / √2 A(w),    w >= 0, E(-w) = 1 - E(w)
-    A(w) = -e^(iπ/4) ∫_0^∞ e^(-πt²/2 + iπ e^(iπ/4) w t) dt,    A' = 1 - iπw A
-
-(Born and Wolf, Principles of Optics, 8.7.3, the contour turned by 45 degrees). A has no
-oscillation: a table of cubics
-up to ``LONGEST``, 1e-7, and 1 / (iπw) Σ (2n - 1)!! / (iπw²)^n beyond, 1e-7.
 """
 
 import math

@@ -1,32 +1,5 @@
 """Rays through plane-parallel media: reach and optical path as functions of what all
 media share, p = n sin θ.
-
-    reach(p) = Σ t_i p / √(n_i² - p²)          lateral distance that a ray gains (Snell)
-    path(p)  = Σ n_i t_i (n_i / √(n_i² - p²) - 1)    optical path less that along the normal
-    d path / d reach = p                       (Fermat): the phase on a plane moves by k p for every um
-
-The order of the media does not matter to either. Numbers, numpy arrays and torch
-tensors alike; complex arrays too, for
-derivatives by complex steps. Squares (w = p², reach²) are used where a root would have
-no derivative at the axis.
-
-What a ray through plane-parallel media leaves out of its plane waves: their sum
-about the ray, over the ray itself.
-
-    ∫ √T(p) exp(ik[p·ρ + Φ(p)]) d²p,    Φ = Σ t √(n² - p²),    T the power that the faces let through
-
-has a stationary point at the ray p0 of reach ρ, where the phase is kL. Its lowest order
-is the ray; all others together
-are the mean over the waves beside it, on the path of steepest descent p = p0 + (u, v)
-exp(-iπ/4):
-
-    1 + iC/(kL) = <√(T(p) / T(p0)) exp(ik[p·ρ + Φ(p) - L] + (k/2)(reach' u² + (reach/p)
-    v²))>
-
-u and v normal with variances 1/(k reach') and 1/(k reach/p): Gauss-Hermite sums. C
-depends on the cosine in the rarest
-medium, s = √(n² - p²), smoothly up to grazing rays, and is 1 in a single medium
-(d/(2πr²)(1/r - ik) exp(ikr) is exact).
 """
 
 import functools

@@ -1,11 +1,5 @@
 """Blocks of neighbouring pillars: a few nodes stand for each, and a polynomial carries
 the known phase across it.
-
-The kernel from a block to the window, its carrier removed, is smooth over some dozens
-of pillars, so that its values
-at ``nodes`` points inside the block give it at every pillar by interpolation. Read the
-other way round, the pillars'
-light may be moved to those points with the same weights.
 """
 
 import functools

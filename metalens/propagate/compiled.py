@@ -1,10 +1,5 @@
 """Compiled loops over pillars: light gathered at the nodes of blocks, and gradients
 given back to every pillar.
-
-Pillars are taken in tiles of one block of rows and some hundred columns, whose phasors
-never leave the nearest cache:
-a few rows of phasors are formed, added to the row nodes of the tile, and at the tile's
-end to its column nodes.
 """
 
 from typing import Any

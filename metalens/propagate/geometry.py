@@ -1,10 +1,5 @@
 """What is propagated: pillars, one direction of light at several depths, and the window
 on the sensor.
-
-Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor at z =
-+d. Time factor exp(-iωt).
-A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray
-meets the sensor at (d·tx, d·ty).
 """
 
 import itertools

@@ -1,13 +1,5 @@
 """How many nodes, directions and correction samples a propagation needs, and how a
 window is cut.
-
-The kernel (:mod:`metalens.propagate.paths`) is smooth in everything, so each of its
-dependencies is sampled just
-finely enough: every count below is the least whose Legendre tail on probing lines is
-under the tolerance. The smaller
-the window, the smoother the kernel: so the light on the nodes of the whole window is
-passed on to the fewer nodes of
-its tiles.
 """
 
 import functools

@@ -1,19 +1,5 @@
 """Paths and amplitudes of a case: closed forms in one medium, rays through
 plane-parallel films where there are some.
-
-The field of a point behind films is the sum of its plane waves about the ray,
-
-    h = -ik/(2π√spread) (1 + iC/(kL)) √passed exp(ikL),
-
-L the optical path of the ray, spread the area on the sensor per area of p = n sin θ,
-passed the power that the faces
-let through, C what all waves add to the stationary phase (:mod:`metalens.optics.media`).
-In one medium C = 1 and that is
-d/(2πr²)(1/r - ik) exp(ikr) itself.
-
-The kernel K is h times exp(ik(s_z - s_ref)), its carrier exp(ik r_w) removed: r_w is
-the path to the middle of the
-window, s_ref that from the source of the middle depth. It is smooth in everything.
 """
 
 from collections.abc import Callable

@@ -1,12 +1,5 @@
 """From millions of pillars to a few thousand Legendre moments, with the known phase
 taken off.
-
-M_mn = Σ_ij P̂_m(y_i) P̂_n(x_j) T_ij exp(i(φ_ij + k·carrier_ij)), the carrier being
-source path plus sensor path of a
-reference. Pillars are first gathered at the nodes of small blocks
-(:mod:`metalens.propagate.blocks`), and the
-polynomials are taken there: the moments stand for those nodes, which give the same
-light on the window.
 """
 
 import math

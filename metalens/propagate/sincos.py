@@ -1,10 +1,5 @@
 """Sine and cosine of whole turns as polynomials that a compiler turns into vector
 instructions.
-
-For t in [-1/2, 1/2] turns: s = sin(πt) and c = cos(πt) from polynomials in t², then sin
-2πt = 2sc, cos 2πt = c² - s².
-Accuracy: 4e-7 in float32 at most, 7e-8 root mean square, 7e-16 in float64, absolute;
-less where products are fused.
 """
 
 from math import factorial, pi

@@ -1,12 +1,5 @@
 """Light from a point source through the pillars to the sensor window: the exact sum,
 and faster ways to the same field.
-
-All functions take one direction of light and return complex fields (depth, y, x),
-incident amplitude 1, phase zero
-at the lens centre. The window is a square grid of ``samples`` cells of width
-``window_um / samples``, sampled at their
-centres and centred on the chief ray, which meets the sensor at d·(tan angle_x, tan
-angle_y).
 """
 
 import math

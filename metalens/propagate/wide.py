@@ -1,20 +1,5 @@
 """Wide windows: the field by three Fourier transforms, on grids as fine as aperture and
 window ask for.
-
-    U(c + δ) = Σ_x L(x) h(c + δ - x),    h(ρ) = ∫ √passed(p) exp(ik[p·ρ + Φ(p)]) d²p/λ²,    Φ = Σ t √(n² - p²)
-
-(the exact transfer of plane waves through plane-parallel media). Φ is split into the
-quadratic that follows its rays
-best, reach(p) ≈ A + D (p - p0) along each axis, and the rest ψ. The quadratic gives
-
-    V(δ) = exp(ikδ²/2D)/(iλD) Σ_x [L(x) exp(ik((x - x0)²/2D - p0 x))] exp(-ikδ(x - x0)/D),    x0 = c - A,
-
-one transform of the light on an even grid of the lens; U = F⁻¹[√passed exp(ikψ) F[V]]
-moves light by a few tens of
-um at most, by which the window is padded. Pillars are handed to the even grid as to the
-nodes of the windowed method
-(:mod:`metalens.propagate.pillars`), by a sinc under Kaiser's window, since the kernel's
-carrier is taken off first.
 """
 
 import functools

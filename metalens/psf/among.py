@@ -1,12 +1,5 @@
 """Pillars among unlike neighbours: the factor C of solved rows
 (:class:`metalens.lens.NeighbourRows`) on a lens's maps.
-
-    C(s, α),  s = λ |∇φ| / 2π,  α the azimuth of ∇φ          slope of the lens's own phase at every pillar
-    J = C_along g gᵀ + C_across (1 - g gᵀ),  g = ∇φ/|∇φ|      on the field of the light that comes (x, y)
-
-One scalar takes the mean of both, J = C; what it leaves out is in the budget. λ is that
-of the rows, whatever the
-light's: zones of one width have one factor.
 """
 
 import math

@@ -1,13 +1,4 @@
-"""What the error of a PSF is made of: what was computed, and what the model leaves out.
-
-The model's terms are relative L2 errors of the PSF of a perfect lens of the same
-aperture, from radial integrals
-
-    U(ρ) = ∫ √spread(p) C(p) J0(k p ρ) p dp        (scalar; C = 1 for pillars that do not feel their neighbours)
-
-and, for both polarisations, the flux of rays turned by the lens (Richards and Wolf
-1959) with |E|² cos θ kept.
-"""
+"""What the error of a PSF is made of: what was computed, and what the model leaves out."""
 
 import math
 from dataclasses import dataclass, fields, replace

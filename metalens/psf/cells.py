@@ -1,15 +1,4 @@
-"""Windows whose step is too coarse for samples: light integrated over their cells.
-
-|U|² holds spatial frequencies up to B = (largest - least n sin θ) / λ of the rays to
-the window; samples farther apart
-than 1/(2B) fold them. Such a cell is the mean of m x m points of half that distance or
-less, corrected for what the
-midpoint rule leaves of second and fourth differences along both axes,
-
-    1 + (δx² + δy²)/24 - 17 (δx⁴ + δy⁴)/5760 + δx² δy²/576 + …    (the inverse of (2/δ) asinh(δ/2) along each)
-
-and the rest falls with the sixth power of their distance.
-"""
+"""Windows whose step is too coarse for samples: light integrated over their cells."""
 
 import math
 from dataclasses import dataclass, replace

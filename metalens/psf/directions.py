@@ -1,14 +1,4 @@
-"""Light far behind a lens, over direction cosines: beam deflectors, holograms, axicons.
-
-    F(p) = a Σ_j t_j E_j exp(-ik p·x_j)            light of the pillars in the direction p = n sin θ (Snell keeps it)
-    dP / d²p = |F|² / λ²,  dP / dΩ = cos θ dP / d²p
-
-a is the area of a site, E_j the incident wave. Over one period of the lattice's own
-diffraction the first sums to the
-transmitted power a Σ |t_j E_j|² (Parseval); on a flat screen at a distance d it is |U|² dx dy of the sum of Rayleigh
-and Sommerfeld, whose |U|² = cos⁴θ |F|² / (λ d)². Samples of |F|² closer than λ over twice the aperture lose nothing:
-its autocorrelation is no wider.
-"""
+"""Light far behind a lens, over direction cosines: beam deflectors, holograms, axicons."""
 
 import math
 from dataclasses import dataclass

@@ -1,15 +1,5 @@
 """Sources of finite size: the PSF of a point, blurred by the geometric image of the
 source.
-
-    P(X) = ∫ w(s) P_s(X - M s) d²s,    M = ∂(chief ray on the sensor) / ∂(point of the source)
-
-s lies in the plane through the source parallel to the lens, sides of a square along x
-and y; without films M = -d/z.
-P_s is taken as that of the source's middle. |U|² on samples within Nyquist's step is
-band-limited, so that its product
-with the transform ŵ(Mᵀf) is the convolution itself. Where P_s changes over the source
-as D_x s_x/σ + D_y s_y/σ, σ the
-standard deviation of w, what is left out is D seen through |∇ŵ|/(2πσ); the estimate adds |ŵ| for changes that are even.
 """
 
 import math

@@ -1,32 +1,5 @@
 """Both polarisations: Ex, Ey, Ez of light whose rays the lens turns, each propagated as
 a scalar.
-
-The factors below are smooth over the lens. They go onto the light where a method knows
-the lens by a few nodes, behind
-the one sum over its pillars.
-
-A ray of direction a, polarised along e, leaves a pillar in direction b for the window:
-its field is turned with it,
-R e = e - (a + b)(b·e)/(1 + a·b), and |E|² cos θ is kept: E = t R e / √b_z (Richards and
-Wolf 1959, for the two
-polarisations of the source). The direction is that to the window's centre; what other
-points of a wide window see of
-another is measured (:func:`metalens.propagate.pupil_error`). Intensity is |Ex|² + |Ey|² + |Ez|², the mean of both
-polarisations.
-
-What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), whatever
-the slope of the rays. With
-H = b x E of every ray it is a sum of squares with signs, like that of E:
-
-    S_z = Σ_c s_c |Σ_j f_c(j) S_j|²        S_j: the scalar's light; f_c: (Ex ± Hy)/2, (Ey ± Hx)/2; s_c = ±1
-
-Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where
-pillars treat them alike and no
-face of a film tells s from p.
-
-Rays leave the pillars into their cover; at the faces of films s stays across them and p
-turns with the ray, each by its
-own share of the power that passes (the scalar's light holds the mean of both).
 """
 
 import math

@@ -1,14 +1,5 @@
 """Fourier basis of RCWA: orders of any lattice, reduced by the symmetries that shape,
 lattice and light share, and the plane waves made of them.
-
-With lengths in units of 1/k0 the tangential fields u = (Ex, Ey), w = (Hy, -Hx) obey
-
-    u' = i P w,  P = 1 - K [eps]^-1 K^T,   K = (kx, ky)   (Ez = -[eps]^-1 K^T w)
-    w' = i Q u,  Q = E - R R^T,            R = (-ky, kx)  (Hz = R^T u).
-
-They are expanded in p waves (u along k) and s waves (u across k), for which K and R
-become the length of k. With kz^2 = eps - |k|^2 an outgoing wave of unit electric
-amplitude has u = kz / n, w = n (p), or u = 1, w = kz (s).
 """
 
 import math

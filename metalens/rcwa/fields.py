@@ -1,19 +1,4 @@
-"""Near field of a unit cell: E and H at any points, from the eigenmodes of every slab.
-
-Films and sections are slabs alike. With the amplitudes a of the upward modes at the
-foot of a slab of height h and b of the downward ones at its top, lengths over k0,
-
-    u = (Ex, Ey) = W (e^(iqz) a + e^(iq(h-z)) b),
-    w = (Hy, -Hx) = V (e^(iqz) a - e^(iq(h-z)) b),
-    Ez = -[eps]^-1 K^T w,   Hz = R^T u,   D = Q u + R R^T u.                      (1)
-
-At a wall the normal part of E jumps, and the sum of its orders rings; that of D does
-not. With the unit normal n of the nearest boundary and a weight N that is 1 there,
-
-    E = E_sum + N n n^T (D_sum / eps - E_sum)                                     (2)
-
-takes the normal part from D near boundaries, and jumps where eps does.
-"""
+"""Near field of a unit cell: E and H at any points, from the eigenmodes of every slab."""
 
 import math
 from collections.abc import Sequence

@@ -1,14 +1,5 @@
 """Operators P and Q of a patterned layer: permittivity from the exact Fourier factors
 of its outlines, and a field of unit normals from its boundary.
-
-The tangential field is split at the boundary into a normal part, where D is
-continuous, and a tangential part, where E is (Li, J. Opt. Soc. Am. A 13, 1870 (1996);
-Popov and Neviere, J. Opt. Soc. Am. A 18, 2886 (2001)):
-
-    E = [eps] - (Delta N + N Delta) / 2,   Delta = [eps] - [1/eps]^-1,   N = w n n^T.
-
-n is the normal of the nearest boundary point and w a weight that is 1 there; the limit
-of many orders is the same for any smooth N.
 """
 
 import math

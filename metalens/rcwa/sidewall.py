@@ -1,17 +1,4 @@
-"""Tilted walls: u' = i P(z) w, w' = i Q(z) u by Gauss collocation, of high order in z.
-
-On a panel of height h with Gauss points c_j the derivative is a polynomial through its
-values there, so with a_jk = int_0^c_j l_k and b_k = int_0^1 l_k (Hairer, Norsett,
-Wanner, Solving Ordinary Differential Equations I, II.7)
-
-    u_j = u_0 + i h sum a_jk P_k w_k,    w_j = w_0 + i h sum a_jk Q_k u_k,
-    (u, w)_1 = (u, w)_0 + h sum b_k (i P_k w_k, i Q_k u_k),
-
-of order 2 m for m points. Stiff waves decay at foot and top, where panels are short.
-P and Q stay symmetric and Gauss collocation keeps quadratic invariants: power and
-reciprocity hold to rounding. (The error of a staircase falls as 1/steps only, and grows
-with the number of harmonics.)
-"""
+"""Tilted walls: u' = i P(z) w, w' = i Q(z) u by Gauss collocation, of high order in z."""
 
 import functools
 import math

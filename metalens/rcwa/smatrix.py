@@ -1,10 +1,5 @@
 """Eigenmodes of layers, and the scattering of a whole stack: half-spaces, films and
 patterned layers, matched without growing exponentials.
-
-Fields at a plane that only upward-radiating waves can make form a pair (U, V): u = U a,
-w = V a. A pair passes from the top of a layer to its foot by one linear solve with
-decaying factors only. P and Q are symmetric where every section has a half turn; then
-two solutions keep u1^T w2 - w1^T u2 from plane to plane.
 """
 
 from collections.abc import Callable

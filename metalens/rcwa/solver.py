@@ -1,8 +1,5 @@
 """RCWA of one unit cell: Jones matrices of any pillar, lattice and layers, refined over
 truncations until the error estimate meets a tolerance.
-
-Light comes from the substrate; phases run from the foot of the pillar (or the outer
-face of the films under it) to its top; time factor exp(-iwt).
 """
 
 import dataclasses

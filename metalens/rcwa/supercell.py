@@ -1,12 +1,6 @@
 """Rows of different pillars as one supercell: the exact answer that the locally
 periodic
 approximation leaves out.
-
-Rows run along the lattice, or along its diagonal, where every other pillar stands half
-a period to the side:
-
-    straight  o o o o   period N p, p across     diagonal  o   o      period N p / √2,
-                                                             o   o    √2 p across
 """
 
 import math

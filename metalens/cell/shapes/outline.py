@@ -1,10 +1,5 @@
 """The section of a pillar of a given size: signed ellipses and polygons, with
 everything that follows from them.
-
-Whatever asks for area, Fourier factors, boundary or mask polygon asks here; a new shape
-only says which ellipses and
-polygons it is made of. Lengths in um, +x right, +y down, the site of the pillar at the
-origin.
 """
 
 import math

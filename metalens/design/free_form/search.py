@@ -1,14 +1,5 @@
 """Free-form phases that carry depth: an objective climbed at a bounded spread of light,
 coarse to fine.
-
-The phase is a cubic spline on a control grid that is refined in stages, on top of a
-hyperbolic focus or of a double
-helix, whose vortices no smooth phase can grow. Adam climbs the objective (the honest
-axial information of Eq. 11 at
-random sub-pixel positions, or Eq. 6 on scenes); a penalty whose target follows the
-energy that is reached holds the
-encircled energy, and the best iterate that keeps it at every depth is returned. Several
-starts, all reported.
 """
 
 import math

@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from characterize.captures import Capture, SensorNoise, quantization_score, to_electrons
 from characterize.captures.electrons import photon_transfer
 from characterize.captures.rounding import DarkStatistics
-from characterize.inference import estimate, leastsquares, prepare, search
+from characterize.inference import estimate, leastsquares, multistart, prepare
 from characterize.inference.leastsquares import FitImages
 
 
@@ -264,13 +264,13 @@ def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(
         ) if jacobian else None
 
     monkeypatch.setattr(
-        search,
+        multistart,
         "refine_fit",
         lambda task, value: leastsquares.fit_levenberg_marquardt(
             model, task.data, value
         ),
     )
-    task = search.SearchTask(None, counts, np.zeros(1), {}, None)
+    task = multistart.SearchTask(None, counts, np.zeros(1), {}, None)
     first = leastsquares.fit_levenberg_marquardt(model, counts, np.array([3.0]))
     made, ends = estimate._unrounded(task, [first], SensorNoise(29.0, 0.3, read))
     assert (made is not task) == exact
