@@ -54,7 +54,7 @@ class Quality:
     turns: phase coverage of the pillars over 2 pi; below 1 some phases are replaced by
     the nearest.
     focuses: whether rays of the design source meet in one spot
-    (:func:`metalens.design.focuses`); where they do not, aperture and field have no
+    (:func:`metalens.design.has_focus`); where they do not, aperture and field have no
     meaning.
     steepest: phase slope at the rim over the wave number (of the hyperbolic lens).
     sampled_aperture: largest slope that the lattice samples, wavelength / (2 longest

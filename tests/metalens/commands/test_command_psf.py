@@ -129,7 +129,7 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
         asked.append(counts)
         return known
 
-    monkeypatch.setattr("metalens.design.own_cell.neighbours", rows)
+    monkeypatch.setattr("metalens.design.own_cell.estimate_neighbour_coupling", rows)
     monkeypatch.setattr(
         "metalens.design.own_cell.angle_change", lambda _, tilt: 0.03 * np.sin(tilt)
     )

@@ -176,7 +176,7 @@ def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(
     monkeypatch.setattr("metalens.design.own_cell.DIAMETERS", 2)
     counts = []
     monkeypatch.setattr(
-        "metalens.design.own_cell.neighbours",
+        "metalens.design.own_cell.estimate_neighbour_coupling",
         lambda _, counts, told=counts: told.append(counts) or "rows",
     )
     lens, tilt = _lens(), 0.3
@@ -316,7 +316,7 @@ def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
             lens, counts=counts, harmonics=2
         )  # a third of the time
 
-    monkeypatch.setattr("metalens.design.own_cell.neighbours", kept)
+    monkeypatch.setattr("metalens.design.own_cell.estimate_neighbour_coupling", kept)
     rows = design.solve_coupling_rows(steep, radius_um=10.0)
     found = design.neighbour_coupling_loss(
         dataclasses.replace(steep, neighbours=rows), radius_um=10.0
