@@ -80,7 +80,6 @@ def test_the_kinds_are_those_of_the_toolchain():
         "asbuilt",
         "pupil",
         "scene",
-        "pool",
         "layers",
         "budget",
     }

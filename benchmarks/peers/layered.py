@@ -61,7 +61,7 @@ def image_layers(layers: scene.Layers, psfs: Tensor, *, margin: int = 0) -> Tens
     transfer = scene._transfer(psfs, (shape[0], shape[1]))
     sheets = []
     for kind in (layers.radiance, layers.coverage):
-        padded = scene.padded(kind, (shape[0], shape[1]))
+        padded = scene.pad_borders(kind, (shape[0], shape[1]))
         blurred = torch.stack(
             [
                 torch.fft.irfft2(torch.fft.rfft2(padded[:, k]) * transfer[k], s=shape)
@@ -96,7 +96,7 @@ def published(layers: scene.Layers, psfs: Tensor, *, epsilon: float = 1e-3) -> T
     size = layers.radiance.shape[-2:]
 
     def blur(kind: Tensor) -> Tensor:
-        spectrum = torch.fft.rfft2(scene.padded(kind, (shape[0], shape[1])))
+        spectrum = torch.fft.rfft2(scene.pad_borders(kind, (shape[0], shape[1])))
         blurred: Tensor = torch.fft.irfft2(spectrum * transfer, s=shape)[
             ..., : size[0], : size[1]
         ]

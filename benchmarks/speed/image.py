@@ -13,8 +13,8 @@ from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
 from metalens.image import Frames, Grid, Optics, PillarWave, SmoothWave, Window, imager
-from metalens.image.left_out import Judged, neglected, unpolarised
-from metalens.image.plan import spectral
+from metalens.image.left_out import JudgedPsfs, polarisation_error, transform_error
+from metalens.image.plan import sum_over_spectrum
 from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.optics import Layers
@@ -76,10 +76,11 @@ def points_row(wave: SmoothWave) -> Row:
     optics, window = Optics(wave, Layers(), 2e3), Window(GRID.window, GRID.step_um)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     seconds = fastest(
-        lambda: spectral(optics, at.flatten(0, 1), depths, waves, window), repeats=1
+        lambda: sum_over_spectrum(optics, at.flatten(0, 1), depths, waves, window),
+        repeats=1,
     )
-    error = neglected(
-        Judged(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
+    error = transform_error(
+        JudgedPsfs(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
     )
     method = "25 field points x 9 wavelengths x 21 depths"
     judge, count = "rays seen from beside", torch.get_num_threads()
@@ -115,11 +116,13 @@ def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
             PillarWave(pillars), Layers(), 2e3
         )  # nothing kept of the last row
         seconds = fastest(
-            lambda o=optics, w=window: spectral(o, at.flatten(0, 1), depths, waves, w),
+            lambda o=optics, w=window: sum_over_spectrum(
+                o, at.flatten(0, 1), depths, waves, w
+            ),
             repeats=1,
         )  # type: ignore[misc]
-        error = unpolarised(
-            Judged(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
+        error = polarisation_error(
+            JudgedPsfs(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
         )
         name = (
             f"flux of both polarisations, {count} of {window.whole} components"

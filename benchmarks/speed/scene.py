@@ -67,7 +67,7 @@ def _imaging(threads: int) -> list[Row]:
                      sample_um=0.75, samples=372)  # fmt: skip
     stack = integrate_pixels(fine, 0.75, pitch_um=9.0, shape=(31, 31))
     stack = stack / stack.sum((1, 2), keepdim=True)
-    layers = scene.cut(frames, depths)
+    layers = scene.cut_layers(frames, depths)
     order = [int((depths - d).abs().argmin()) for d in layers.depth_um]
     exact = layered.image_layers(layers, stack[order])[:, 16:144, 16:144]
     empty = torch.zeros(8, 21, 160, 160)

@@ -349,7 +349,9 @@ class ForwardModel:
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
-            for group in (part for whole in self.groups for part in whole.lit):
+            for group in (
+                part for whole in self.groups for part in whole.illuminated_parts
+            ):
                 part, more = self._group_light(x, group, offset_nm, names)
                 light[group.index, *self._lit] += weight * part
                 for name in names:

@@ -179,7 +179,7 @@ class AngleGroup:
     apart: tuple["AngleGroup", ...] = ()
 
     @property
-    def lit(self) -> tuple["AngleGroup", ...]:
+    def illuminated_parts(self) -> tuple["AngleGroup", ...]:
         """Groups whose frames meet the same pillars."""
         return self.apart or (self,)
 

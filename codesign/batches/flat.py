@@ -183,7 +183,7 @@ def _elsewhere(
         .clamp(0, len(table) - 1)
         .long()
     )
-    sources = scene.padded(table[code].movedim(-1, 0) * light, optics.shape)
+    sources = scene.pad_borders(table[code].movedim(-1, 0) * light, optics.shape)
     blurred: Tensor = torch.fft.irfft2(
         (torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape
     )

@@ -4,7 +4,6 @@ another scale.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,10 +12,8 @@ from torch.nn import functional as F
 from codesign.batches.batch import EyePose, FrameBatch
 from codesign.batches.flat import SingleSurfaceFrames, flatten_layers
 from codesign.batches.scenes import EyeScenes, draw_depth_scales, pose_of
-from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
-from metalens.core.reading import typed_reader
 
 MASK = 64  # pixels along a side of the kept masks, where the frame allows it
 CHUNK = 64  # frames rendered at a time
@@ -62,30 +59,6 @@ def render_pool(scenes: EyeScenes, count: int) -> FramePool:
     return FramePool(
         light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um)
     )
-
-
-def save_pool(path: Path, pool: FramePool) -> None:
-    """Keep a pool (HDF5, kind ``pool``).
-
-    Args:
-        path: of the file.
-    """
-    store.save(
-        path, "pool", {name: getattr(pool, name) for name in FramePool.__slots__}
-    )
-
-
-@typed_reader
-def load_pool(path: Path) -> FramePool:
-    """A pool that was kept.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        StoreError: not a pool.
-    """
-    return FramePool(**store.load(path, "pool").arrays)
 
 
 def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:

@@ -199,7 +199,7 @@ def _write_layers(
     seen = frame.depth_um[frame.coverage > 0]
     low, high = float(seen.min()), float(seen.max())
     depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
-    layers = scene.cut(frame, depths)
+    layers = scene.cut_layers(frame, depths)
     arrays = {
         "radiance": layers.radiance[0].numpy(),
         "coverage": layers.coverage[0].numpy(),

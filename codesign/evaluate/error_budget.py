@@ -27,7 +27,7 @@ from metalens.image import (
     Optics,
     UniformImager,
     node_light,
-    normalised,
+    normalise_psfs,
     with_psfs,
 )
 from metalens.lens import Lens, NeighbourRows
@@ -128,7 +128,7 @@ class ImagingDevice:
     def image(self, optics: Optics) -> Imager:
         """The image through other optics."""
         light = node_light(optics, self.whole.plan).detach()
-        return with_psfs(self.whole, *normalised(light, optics, self.whole.plan))
+        return with_psfs(self.whole, *normalise_psfs(light, optics, self.whole.plan))
 
     def one_psf(self) -> Imager:
         """The image by the PSFs of the middle of the field alone."""
@@ -154,7 +154,7 @@ class ImagingDevice:
         waves = SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0)
         plan = replace(self.whole.plan, waves=waves)
         light = node_light(self.optics, plan).detach()
-        return with_psfs(self.whole, *normalised(light, self.optics, plan))
+        return with_psfs(self.whole, *normalise_psfs(light, self.optics, plan))
 
     @torch.no_grad()
     def both_polarisations(self) -> Imager:
@@ -188,7 +188,7 @@ class ImagingDevice:
             "ya,xb,abzhw->yxzhw", to_y.to(both), to_x.to(both), both - scalar
         )
         light = node_light(optics, plan) + change
-        return with_psfs(self.whole, *normalised(light, optics, plan))
+        return with_psfs(self.whole, *normalise_psfs(light, optics, plan))
 
 
 class NetworkReading:

@@ -68,7 +68,7 @@ class SceneObjective:
         self.optics = scene.uniform_imager(
             whole, (self.scenes.pixels, self.scenes.pixels)
         )
-        return scene.spectra(frames, self.optics)
+        return scene.layer_spectra(frames, self.optics)
 
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None

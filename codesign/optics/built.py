@@ -33,7 +33,7 @@ from metalens.image import (
     aperture_light,
     cell_um,
     coordinates,
-    view,
+    view_pupil,
 )
 from metalens.lens import Lens
 from metalens.optics.paths import path_difference, sensor_path, source_path
@@ -209,7 +209,7 @@ class MadeLens:
         known = of_lens(parameter_vector() if x is None else x)
         distance = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
         pupil, tangents = self._pupil(distance), self._field.tangents
-        seen = view(pupil, self._field, self.design.source_distance_um)
+        seen = view_pupil(pupil, self._field, self.design.source_distance_um)
         x_um, y_um = seen.x_um.numpy(), seen.y_um.numpy()
         made = process_state_of(known)
         cells = self._gathered(made)

@@ -20,9 +20,9 @@ from metalens.image import (
     Optics,
     SmoothWave,
     UniformImager,
-    normalised,
+    normalise_psfs,
     scene,
-    surrogate,
+    surrogate_loss,
     textured_frames,
     with_psfs,
 )
@@ -226,7 +226,7 @@ class DifferentiableImager:
         if self.light.grad is None:
             return
         optics = optics_of(settings, coefficients_rad)
-        value = surrogate(optics, self.ready.plan, self.light.grad, self.pairs)
+        value = surrogate_loss(optics, self.ready.plan, self.light.grad, self.pairs)
         value.backward()  # type: ignore[no-untyped-call]
 
 
@@ -242,7 +242,7 @@ def make_differentiable_imager(
         pairs: field points and wavelengths that were drawn; None for all.
     """
     with torch.no_grad():
-        unit = normalised(
+        unit = normalise_psfs(
             torch.ones_like(whole.stack[..., :1, :1]),
             optics_of(settings, torch.zeros(0)),
             whole.plan,

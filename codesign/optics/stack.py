@@ -33,14 +33,14 @@ from metalens.image import (
     Optics,
     PsfBasis,
     Pupil,
-    Seen,
+    PupilView,
     UniformImager,
     aperture_light,
     basis,
     coordinates,
     radius,
     uniform_imager,
-    view,
+    view_pupil,
 )
 from metalens.library import DEFAULT_CELL, Proxy
 from metalens.optics import Layers
@@ -418,11 +418,11 @@ def _start(settings: OpticsConfig) -> Tensor:
 
 
 @functools.lru_cache(maxsize=8)
-def _seen(settings: OpticsConfig) -> Seen:
+def _seen(settings: OpticsConfig) -> PupilView:
     """The pupil from where the chief ray meets the sensor; its nodes are those of the
     lens on axis.
     """
-    return view(
+    return view_pupil(
         settings.pupil, Field(math.radians(settings.angle_deg)), settings.focus_mm * 1e3
     )
 

@@ -1,7 +1,6 @@
 """How well a network reads frames that it never saw: slippage and pupil mask."""
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -43,22 +42,6 @@ class SensorFrames:
     vergence: Tensor | None = None
     wide: float = 1.0
     above: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class TaskErrors:
-    """Mean absolute errors of the slippage in mm, and mean intersection over union of
-    the pupil.
-    """
-
-    axial_mm: float
-    lateral_mm: float
-    iou: float
-
-    @property
-    def slip_mm(self) -> float:
-        """Mean over the three axes: what architectures are chosen by."""
-        return (self.axial_mm + 2 * self.lateral_mm) / 3
 
 
 SAME = 1.05  # ratio of errors up to which a result does not depend on the tolerance
@@ -252,29 +235,3 @@ def recalibrate_network(trainer: Trainer, architecture: Architecture) -> None:
     """
     frames = training_frames(trainer)
     recalibrate_batch_norm(trainer.model.net, architecture, frames)
-
-
-@torch.no_grad()
-def assess_architecture(
-    net: Supernet,
-    architecture: Architecture,
-    seen: SensorFrames,
-    inner: InnerConfig,
-    *,
-    measured: Sequence[Tensor],
-) -> TaskErrors:
-    """Errors of one architecture.
-
-    Args:
-        measured: (batch, 1, y, x) frames each, on which its batch statistics are
-            measured; see :func:`training_frames`.
-        net: elastic network. seen: frames of the sensor with their truth.
-        inner: settings of training.
-    """
-    recalibrate_batch_norm(net, architecture, measured)
-    answers = predict_frames(net, architecture, seen, inner)
-    error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
-    net.train()
-    return TaskErrors(
-        float(error[2]), float(error[:2].mean()), float(answers.iou.mean())
-    )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from codesign.optics import LensError, OpticsConfig, PixelPsfStack, formed
 from codesign.optics import stack as lens
-from metalens.image import Imager, UniformImager, drawn
+from metalens.image import Imager, UniformImager, draw_nodes
 
 Draw = Callable[[int], LensError | None]
 
@@ -82,7 +82,7 @@ class StepImaging:
         if not live:
             return made
         self._live = formed.make_differentiable_imager(
-            self.optics, made, drawn(made.plan, self.draws, self._generator(step))
+            self.optics, made, draw_nodes(made.plan, self.draws, self._generator(step))
         )
         return self._live.ready
 

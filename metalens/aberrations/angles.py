@@ -237,7 +237,7 @@ def vignetted_share(
     without a stop.
 
     Shares of patches of the pillars' plane that the hole lights
-    (:meth:`metalens.optics.Layers.lit`); the light is taken
+    (:meth:`metalens.optics.Layers.stop_share`); the light is taken
     as even there, as PSFs take it.
 
     Accuracy: 1e-4, and that of sites at the rim of the lens.
@@ -256,13 +256,15 @@ def vignetted_share(
     place, step = np.linspace(-half, half, PATCHES, retstep=True)
     there = middle[0] + place, (middle[1] + place)[:, None]
     hole = (
-        float(np.sum(lens.layers.lit(tangents, depth_um, wave, there, float(step))))
+        float(
+            np.sum(lens.layers.stop_share(tangents, depth_um, wave, there, float(step)))
+        )
         * float(step) ** 2
     )
     sites = d.x_um, d.y_um[:, None]
-    lit = lens.layers.lit(tangents, depth_um, wave, sites, math.sqrt(d.site_um2)) * (
-        np.asarray(d.diameter_um) > 0
-    )
+    lit = lens.layers.stop_share(
+        tangents, depth_um, wave, sites, math.sqrt(d.site_um2)
+    ) * (np.asarray(d.diameter_um) > 0)
     return max(0.0, 1 - float(lit.sum()) * d.site_um2 / hole)
 
 

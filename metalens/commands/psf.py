@@ -153,9 +153,13 @@ def run(options: Options) -> int:
     ) as draft:
         found = _compute(options.lens, settings, made, built)
         _write(draft.path, found, page=options.report)
-    failures = [words.above(found.stack), made.proxy.doubt, words.dark(found)]
-    values = words.numbers(found) | {"doubt": made.proxy.doubt}
-    text = words.text(target, found)
+    failures = [
+        words.tolerance_excess(found.stack),
+        made.proxy.doubt,
+        words.dark_window(found),
+    ]
+    values = words.psf_numbers(found) | {"doubt": made.proxy.doubt}
+    text = words.psf_text(target, found)
     text += describe_order_loss(made.cell, float(found.stack.wavelengths_um.min()))
     return options.console.judged(values, text, failures)
 
@@ -261,7 +265,9 @@ def _write(path: Path, found: words.Computed, *, page: bool) -> None:
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
     if page:
-        sections = words.sections(found, {CAPTIONS[n]: i for n, i in pictures.items()})
+        sections = words.psf_sections(
+            found, {CAPTIONS[n]: i for n, i in pictures.items()}
+        )
         write_report(
             path.with_suffix(".html"),
             "Point spread functions",

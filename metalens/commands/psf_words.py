@@ -46,7 +46,7 @@ class Computed:
     scan: "psf.FocusScan | None" = None
 
 
-def above(stack: psf.PsfStack) -> str:
+def tolerance_excess(stack: psf.PsfStack) -> str:
     """That the computed error is above the tolerance, and its cure; else empty."""
     if stack.converged:
         return ""
@@ -54,7 +54,7 @@ def above(stack: psf.PsfStack) -> str:
     return f"the relative error {error:.2g} is above the tolerance {stack.tolerance:g}: {_budget(stack).cure}"
 
 
-def dark(found: Computed) -> str:
+def dark_window(found: Computed) -> str:
     """That windows hold hardly any light, and where the rays meet; else empty."""
     missed = [one for one in found.figures if not one.window_share >= DARK]
     if not missed:
@@ -70,7 +70,7 @@ def dark(found: Computed) -> str:
     return f"the window of {angles} holds {share:.2g} of the light: {where}"
 
 
-def text(target: Path, found: Computed) -> str:
+def psf_text(target: Path, found: Computed) -> str:
     """Lines for people."""
     stack = found.stack
     counts = (
@@ -123,7 +123,7 @@ def _depth(depth_um: float) -> str:
     return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
 
 
-def numbers(found: Computed) -> dict[str, Any]:
+def psf_numbers(found: Computed) -> dict[str, Any]:
     """Numbers for programs; None for what JSON does not know."""
     stack = found.stack
     values: dict[str, Any] = {
@@ -183,7 +183,7 @@ def key_figures(found: Computed) -> list[KeyFigure]:
     return [*figures, beside]
 
 
-def sections(found: Computed, pictures: dict[str, bytes]) -> list[Section]:
+def psf_sections(found: Computed, pictures: dict[str, bytes]) -> list[Section]:
     """Of the report; pictures by their captions."""
     stack = found.stack
     figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]

@@ -173,7 +173,7 @@ def _lit(lens: Lens) -> Any:
     """
     d = lens.diameters
     places = d.x_um, d.y_um[:, None]
-    return lens.layers.lit(
+    return lens.layers.stop_share(
         (0.0, 0.0), lens.source_distance_um, lens.wavelength_um, places, d.pitch_um
     )
 

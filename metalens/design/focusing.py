@@ -223,7 +223,7 @@ def _lit(focus: Focus, radius_um: float, tangent: float) -> tuple[Array, Array, 
         there = np.hypot(x, y) <= radius_um * (1 + 1e-12)
         if focus.layers.stop is not None:
             source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um
-            there &= focus.layers.lit(*source, (x, y), 1e-6 * radius_um) > 0
+            there &= focus.layers.stop_share(*source, (x, y), 1e-6 * radius_um) > 0
         x, y = x[there], y[there]
         if not x.size:
             break

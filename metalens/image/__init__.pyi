@@ -3,7 +3,7 @@ from . import scene as scene
 from . import sensor as sensor
 from .engine import imager as imager
 from .engine import node_psfs as node_psfs
-from .engine import normalised as normalised
+from .engine import normalise_psfs as normalise_psfs
 from .engine import textured_frames as textured_frames
 from .forming import Imager as Imager
 from .forming import image_direct as image_direct
@@ -22,12 +22,12 @@ from .points import Window as Window
 from .points import psfs as psfs
 from .pupil import Field as Field
 from .pupil import Pupil as Pupil
-from .pupil import Seen as Seen
+from .pupil import PupilView as PupilView
 from .pupil import amplitude as amplitude
 from .pupil import aperture_light as aperture_light
 from .pupil import coordinates as coordinates
 from .pupil import radius as radius
-from .pupil import view as view
+from .pupil import view_pupil as view_pupil
 from .scene import CODES as CODES
 from .scene import Frames as Frames
 from .scene import PsfBasis as PsfBasis
@@ -38,10 +38,10 @@ from .scene import uniform_imager as uniform_imager
 from .scene import weight_maps as weight_maps
 from .sensor import Sensor as Sensor
 from .sensor import low_snr as low_snr
-from .slopes import drawn as drawn
+from .slopes import draw_nodes as draw_nodes
+from .slopes import gradient_term as gradient_term
 from .slopes import node_light as node_light
-from .slopes import surrogate as surrogate
-from .slopes import term as term
+from .slopes import surrogate_loss as surrogate_loss
 from .waves import PillarWave as PillarWave
 from .waves import SmoothWave as SmoothWave
 from .waves import Wave as Wave

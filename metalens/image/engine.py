@@ -14,13 +14,13 @@ from metalens.core.errors import SceneError
 from metalens.image import left_out
 from metalens.image.forming import Imager, build_imager
 from metalens.image.low_rank import PsfField, frame_maps, plane_images, psf_nodes
-from metalens.image.plan import Grid, Plan, depth_nodes, planned, spectral
+from metalens.image.plan import Grid, Plan, depth_nodes, plan_nodes, sum_over_spectrum
 from metalens.image.points import SPARE, Optics, Window, sampling
 from metalens.image.scene import Frames
 from metalens.image.splines import spline_matrix
 from metalens.image.stray import stray_of
 from metalens.image.texture import CONTRAST, scene_error
-from metalens.image.through import through
+from metalens.image.through import aperture_transmission
 from metalens.image.waves import PillarWave, SmoothWave, Wave, wave_of
 from metalens.lens import Lens
 from metalens.optics import Layers
@@ -109,7 +109,7 @@ def imager(
     about = scene_grid, found.plan, stack, energy
     with torch.no_grad():
         made = build_imager(*about, tolerance=found.tolerance)
-        parts = {**fitted(made), **_held_out(optics, made)}
+        parts = {**kernel_errors(made), **_held_out(optics, made)}
     if isinstance(wave, PillarWave):
         parts["unknown"] = spectra.share_outside_library(
             source, wave.lens.proxy.wavelengths_um
@@ -148,10 +148,10 @@ def _planned(
     if shaded > 1 and tolerance < 1:
         with contextlib.suppress(SceneError):
             return _Planned(
-                planned(*given, tolerance=tolerance / shaded, **about),
+                plan_nodes(*given, tolerance=tolerance / shaded, **about),
                 tolerance / shaded,
             )
-    return _Planned(planned(*given, tolerance=tolerance, **about), tolerance)
+    return _Planned(plan_nodes(*given, tolerance=tolerance, **about), tolerance)
 
 
 def _shaded(
@@ -193,12 +193,12 @@ def node_psfs(
     else:
         y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
         at = torch.stack([x.flatten(), y.flatten()], -1).to(device)
-        light = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
+        light = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
         light = light.reshape(*x.shape, *light.shape[1:])
-    return normalised(light, optics, plan)
+    return normalise_psfs(light, optics, plan)
 
 
-def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
+def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes'
     windows.
     """
@@ -235,7 +235,7 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs]).to(
         device
     )
-    few = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
+    few = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
     out = few.new_zeros(count, count, *few.shape[1:])
     for (i, j), psf in zip(pairs, few, strict=True):
         for row, up in ((i, psf), (count - 1 - i, psf.flip(-2))):
@@ -244,7 +244,7 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     return out
 
 
-def fitted(made: Imager) -> dict[str, float]:
+def kernel_errors(made: Imager) -> dict[str, float]:
     """Errors of the kernels beside the interpolated PSFs of the nodes.
 
     Of a textured scene, at places drawn at random, and of planes that are evenly lit,
@@ -261,10 +261,10 @@ def fitted(made: Imager) -> dict[str, float]:
     light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
     even = PsfField(light, torch.ones_like(light[..., 0, 0]), depths)
     maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
-    wanted = returned(plane_images(even, maps), made.grid)
+    wanted = crop_image(plane_images(even, maps), made.grid)
     one = torch.ones(1, *made.grid.frame).to(field.psf)
     found = [
-        returned(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
+        crop_image(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
         for depth in depths.tolist()
     ]
     wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
@@ -324,9 +324,9 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     depths = 1 / (
         ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64)
     )
-    true = spectral(optics, at, depths, plan.waves, plan.window).detach()
+    true = sum_over_spectrum(optics, at, depths, plan.waves, plan.window).detach()
     wave = float(plan.waves.wavelengths_um[0])
-    whole = through(
+    whole = aperture_transmission(
         optics, at, depths_um=depths, wavelength_um=wave, window=plan.window
     )
     light = true.sum((-1, -2))
@@ -339,18 +339,18 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     few = at[:NEGLECTED], depths
     # of the brightest of few places in the image
     share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
-    seen = left_out.Judged(optics, plan.waves, plan.window, few)
-    transform = left_out.neglected(seen) * share
+    seen = left_out.JudgedPsfs(optics, plan.waves, plan.window, few)
+    transform = left_out.transform_error(seen) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {
         "nodes": nodes,
         "spectrum": max(plan.waves.error, 0.0),
         "transform": transform,
     }
-    found["folded"] = left_out.folded(seen) * share
-    found["polarisation"] = left_out.unpolarised(seen) * share
+    found["folded"] = left_out.folding_error(seen) * share
+    found["polarisation"] = left_out.polarisation_error(seen) * share
     found["pillars"] = (
-        left_out.missing(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
+        left_out.gathering_error(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
     )
     if optics.layers.stop is not None:
         shown = [
@@ -378,7 +378,7 @@ def _dimmer(field: PsfField, grid: Grid) -> float:
     )
     plane = plane_images(some, maps)[0]
     whole, image = (
-        float(part.square().mean().sqrt()) for part in (plane, returned(plane, grid))
+        float(part.square().mean().sqrt()) for part in (plane, crop_image(plane, grid))
     )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
@@ -438,7 +438,7 @@ def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
     return torch.einsum("na,nb,abchw->nchw", rows, columns, light)
 
 
-def returned(whole: Tensor, grid: Grid) -> Tensor:
+def crop_image(whole: Tensor, grid: Grid) -> Tensor:
     """(…, y, x) samples of an image of the whole frame, without margin and spare."""
     edge = grid.margin + grid.spare
     y, x = (slice(edge, edge + n) for n in grid.samples)

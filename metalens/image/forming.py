@@ -18,7 +18,7 @@ from metalens.image.low_rank import (
     principal_kernels,
 )
 from metalens.image.plan import SHARES, Grid, Plan
-from metalens.image.scene import Frames, fixed
+from metalens.image.scene import Frames, has_no_gradient
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import Stray, add_stray
 
@@ -229,7 +229,7 @@ def _far_alone(frames: Frames) -> bool:
     coverage has derivatives.
     """
     cover, light = frames.coverage, frames.radiance
-    if not (fixed(cover) and fixed(light)):
+    if not (has_no_gradient(cover) and has_no_gradient(light)):
         return False
     return (
         not bool(cover[:, 0].any())

@@ -24,7 +24,7 @@ MOST = 256  # of their samples along an axis; of a wider window the middle is lo
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedPsfs:
     """PSFs by which errors are judged: of the first wavelength, at (field points,
     depths).
     """
@@ -39,9 +39,9 @@ class Judged:
         """(field points, depths, h, w) as the window shows them, with their light;
         computed once.
         """
-        return self.lit()
+        return self.compute_psfs()
 
-    def lit(
+    def compute_psfs(
         self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any
     ) -> Tensor:
         """The same through a window with other settings, its rays seen from beside."""
@@ -59,28 +59,30 @@ class Judged:
             )
 
 
-def neglected(judged: Judged) -> float:
+def transform_error(judged: JudgedPsfs) -> float:
     """What the transform neglects: PSFs with the rays seen from their own width beside
     the field point, against
     themselves."""
     light = judged.shown.sum((-1, -2))
-    wide = width(judged.shown / light[..., None, None]) * judged.window.step_um
+    wide = psf_width(judged.shown / light[..., None, None]) * judged.window.step_um
     return weigh_by_light(
-        texture_error(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown),
+        texture_error(
+            judged.compute_psfs(shift_um=(wide * 0.6, wide * 0.8)), judged.shown
+        ),
         light,
     )
 
 
-def folded(judged: Judged) -> float:
+def folding_error(judged: JudgedPsfs) -> float:
     """What the transform folds back from beyond the period of the nodes: PSFs, with
     their light, against those of twice
     the period."""
-    want = judged.lit(period=2 * judged.window.period)
+    want = judged.compute_psfs(period=2 * judged.window.period)
     return weigh_by_light(texture_error(judged.shown, want), want.sum((-1, -2)))
 
 
-def polarised(
-    judged: Judged, polarisation: Polarisation, *, within: tuple[float, float]
+def choose_polarisation(
+    judged: JudgedPsfs, polarisation: Polarisation, *, within: tuple[float, float]
 ) -> Window:
     """The window with one scalar where that images within the first tolerance
     (``auto``), else with as few components
@@ -90,26 +92,26 @@ def polarised(
     )
     window = judged.window
     if polarisation == "scalar" or (
-        polarisation == "auto" and unpolarised(judged) <= within[0]
+        polarisation == "auto" and polarisation_error(judged) <= within[0]
     ):
         return window
-    whole = judged.lit(components=window.whole)
+    whole = judged.compute_psfs(components=window.whole)
     tried = (replace(window, components=count) for count in range(1, window.whole + 1))
     return next(
         one
         for one in tried
-        if unpolarised(replace(judged, window=one), whole) <= within[1]
+        if polarisation_error(replace(judged, window=one), whole) <= within[1]
     )
 
 
-def unpolarised(judged: Judged, whole: Tensor | None = None) -> float:
+def polarisation_error(judged: JudgedPsfs, whole: Tensor | None = None) -> float:
     """What the components of the field that a window leaves out change: PSFs of sum 1
     against those of all components
     (``whole``, where they are known)."""
     window = judged.window
     if window.components == window.whole:
         return 0.0
-    whole = judged.lit(components=window.whole) if whole is None else whole
+    whole = judged.compute_psfs(components=window.whole) if whole is None else whole
     few, light = judged.shown, whole.sum((-1, -2))
     return weigh_by_light(
         texture_error(
@@ -119,7 +121,7 @@ def unpolarised(judged: Judged, whole: Tensor | None = None) -> float:
     )
 
 
-def width(psfs: Tensor) -> float:
+def psf_width(psfs: Tensor) -> float:
     """Root mean square distance of the light from its centroid, samples, mean over the
     PSFs.
     """
@@ -134,7 +136,7 @@ def width(psfs: Tensor) -> float:
     return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
 
 
-def missing(
+def gathering_error(
     optics: Optics, wavelength_um: float, window: Window, at: tuple[Tensor, Tensor]
 ) -> float:
     """What gathering pillars over cells changes: PSFs of sum 1 at (field points,

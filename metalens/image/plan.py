@@ -12,9 +12,14 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
-from metalens.image.left_out import Judged, folded, neglected, polarised
+from metalens.image.left_out import (
+    JudgedPsfs,
+    choose_polarisation,
+    folding_error,
+    transform_error,
+)
 from metalens.image.points import Optics, Window, psfs
-from metalens.image.scene import plain
+from metalens.image.scene import is_compilable
 from metalens.image.splines import TAPS, spline_matrix
 from metalens.image.texture import scene_error, texture_error
 from metalens.image.waves import PillarWave
@@ -127,7 +132,7 @@ class Plan:
     folds: bool
 
 
-def planned(
+def plan_nodes(
     optics: Optics,
     grid: Grid,
     source: Source | spectra.MeasuredSpectrum | SpectralNodes,
@@ -170,13 +175,13 @@ def planned(
         x = (2 * unit - 1) * half[1]
         at = torch.stack([x, torch.full_like(x, 0.6 * half[0])], -1)
         at = at + torch.tensor(middle_um, dtype=torch.float64)
-        return spectral(optics, at, ends, coarse, window)
+        return sum_over_spectrum(optics, at, ends, coarse, window)
 
     def deep(unit: Tensor) -> Tensor:
         at = _places(((0.0, 0.0), (0.7, -0.4)), middle_um, half)
         near, far = (1 / d for d in grid.depths_um)
         depths = 1 / (near + (far - near) * unit)
-        return spectral(optics, at, depths, coarse, window).transpose(0, 1)
+        return sum_over_spectrum(optics, at, depths, coarse, window).transpose(0, 1)
 
     count = _field_nodes(
         across, grid.frame[1], min(tolerance * SHARES["field"], NODES_MOST)
@@ -186,14 +191,14 @@ def planned(
     depths = 1 if one else _depth_count(deep, most)
     aside = _places(OFF_AXIS, middle_um, half), ends
     if (
-        neglected(Judged(optics, coarse, window, aside))
+        transform_error(JudgedPsfs(optics, coarse, window, aside))
         > tolerance * SHARES["transform"]
     ):
         window = replace(window, curved=True)
     some = _places((*OFF_AXIS, (0.0, 0.0)), middle_um, half), ends
     most = tolerance * SHARES["polarisation"]
-    window = polarised(
-        Judged(optics, coarse, window, some), polarisation, within=(tolerance, most)
+    window = choose_polarisation(
+        JudgedPsfs(optics, coarse, window, some), polarisation, within=(tolerance, most)
     )
     y, x = (
         m + h * torch.linspace(-1, 1, _along(count, h / half[1]), dtype=torch.float64)
@@ -210,7 +215,7 @@ def depth_nodes(grid: Grid, count: int) -> Tensor:
     return 1 / torch.linspace(1 / near, 1 / far, count, dtype=torch.float64)
 
 
-def spectral(
+def sum_over_spectrum(
     optics: Optics,
     at_um: Tensor,
     depths_um: Tensor,
@@ -242,7 +247,7 @@ def spectral(
         for i in range(start, stop):
             found[i + 1] = of(others[i])
 
-    if plain(found[0]):
+    if is_compilable(found[0]):
         run_split_torch(len(others), torch.no_grad()(some))
     else:  # derivatives, or another device
         some(0, len(others))
@@ -261,7 +266,7 @@ def _unfolded(
     """
     while (
         window.period < LONGEST
-        and folded(Judged(optics, waves, window, at)) > tolerance
+        and folding_error(JudgedPsfs(optics, waves, window, at)) > tolerance
     ):
         window = replace(window, period=LONGER * window.period)
     return window
@@ -297,11 +302,11 @@ def waves_of(
         [half_um[1], half_um[0]], dtype=torch.float64
     ) + torch.tensor(middle_um, dtype=torch.float64)
     ends, window = depth_nodes(grid, 2), Window(grid.window, grid.step_um)
-    last = spectral(optics, at, ends, _coarse(optics, source, 1), window)
+    last = sum_over_spectrum(optics, at, ends, _coarse(optics, source, 1), window)
     beside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):
         made = _coarse(optics, source, count)
-        found = spectral(optics, at, ends, made, window)
+        found = sum_over_spectrum(optics, at, ends, made, window)
         light = found.sum((-1, -2))
         error = float(
             (texture_error(last, found) * light / light.amax(0)).max()

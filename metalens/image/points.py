@@ -14,8 +14,15 @@ from torch import Tensor
 
 from metalens.core.errors import PropagationError
 from metalens.image import compiled, polarised
-from metalens.image.rays import Paths, Rays, landing, rays, source_paths, through_stop
-from metalens.image.scene import plain
+from metalens.image.rays import (
+    Paths,
+    Rays,
+    landing_offset,
+    rays,
+    source_paths,
+    through_stop,
+)
+from metalens.image.scene import is_compilable
 from metalens.image.waves import Wave
 from metalens.optics import Layers, media
 from metalens.psf import VectorPupil, dominant_components
@@ -239,7 +246,7 @@ def view_um(
     after = optics.layers.after(optics.distance_um, wavelength_um)
     x, y = place.tolist()
     wave = optics.wave
-    return landing(
+    return landing_offset(
         optics.layers,
         wave.carrier_rad,
         wave.radius_um,
@@ -282,21 +289,25 @@ def _one(
 ) -> Tensor:
     """(depths, h, w) PSFs of one field point."""
     ends = view.ends
-    found, pupil = seen(optics, place, grid, wavelength_um, view.beside_um)
+    found, pupil = node_rays(optics, place, grid, wavelength_um, view.beside_um)
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place / after.reduced_um
     paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
-    light = leaving(pupil, paths, wavelength_um)
+    light = node_fields(pupil, paths, wavelength_um)
     tilt = math.atan(math.hypot(*tangents.tolist()))
     factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
     total: float | Tensor = pupil.given * grid.size**2 * (1 - grid.dimmed)
     if optics.layers.stop is not None:
-        shade, taken = stopped(optics, tangents, found, depths_um, wavelength_um)
+        shade, taken = stop_amplitudes(
+            optics, tangents, found, depths_um, wavelength_um
+        )
         light, total = light * shade, total * taken
     mixed = None
     if grid.components:
-        fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
+        fields = polarised.polarisation_factors(
+            found, tangents, after.order, flux=grid.flux
+        )
         mixed = dominant_components(fields, pupil.weight, grid.components)
     few = (
         1 if light.device.type == "cpu" else len(light)
@@ -318,7 +329,7 @@ def _one(
     )
 
 
-def stopped(
+def stop_amplitudes(
     optics: Optics,
     tangents: Tensor,
     found: Rays,
@@ -367,7 +378,7 @@ def _fluxes(
     for sign, pupil in pupils:
         part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
-        if plain(spectrum):
+        if is_compilable(spectrum):
             found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
         else:
             found = [
@@ -424,7 +435,7 @@ def _moved(
     return plain, plain * move[2] + move[0] * across + move[1] * down
 
 
-def seen(
+def node_rays(
     optics: Optics,
     place: Tensor,
     grid: Sampling,
@@ -450,7 +461,7 @@ def seen(
     )
 
 
-def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
+def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
     """(depths, *shape) complex64 light on the nodes, the factor of the wave left out;
     compiled on the processor.
     """

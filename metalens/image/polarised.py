@@ -12,7 +12,7 @@ STEEPEST = (
 )
 
 
-def factors(
+def polarisation_factors(
     seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool
 ) -> VectorPupil:
     """Both polarisations on the nodes, float64: of the flux through the sensor's plane

@@ -66,7 +66,7 @@ class Field:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class PupilView:
     """The pupil as seen from the window's centre, on (nodes, nodes) direction cosines;
     float64.
 
@@ -85,7 +85,7 @@ class Seen:
     lens_rad: Tensor
 
 
-def axis(pupil: Pupil) -> Tensor:
+def node_cosines(pupil: Pupil) -> Tensor:
     """(nodes,) direction cosines of the nodes from their middle."""
     return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (
         2 * pupil.edge / pupil.nodes
@@ -101,12 +101,14 @@ def kernel(pupil: Pupil, sample_um: float, samples: int) -> Tensor:
         torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
     ) * sample_um
     k = 2 * math.pi / pupil.wavelength_um
-    return torch.exp(-1j * k * position[:, None] * axis(pupil)).to(torch.complex64)
+    return torch.exp(-1j * k * position[:, None] * node_cosines(pupil)).to(
+        torch.complex64
+    )
 
 
 def coordinates(pupil: Pupil) -> tuple[Tensor, Tensor]:
     """(x, y) on the lens, um, of the pupil's nodes: two (nodes, nodes) arrays."""
-    q = axis(pupil)
+    q = node_cosines(pupil)
     qy, qx = torch.meshgrid(q, q, indexing="ij")
     stretch = pupil.sensor_distance_um / torch.sqrt((1 - qx**2 - qy**2).clamp_min(1e-3))
     return qx * stretch, qy * stretch
@@ -122,7 +124,7 @@ def amplitude(pupil: Pupil) -> Tensor:
     """(nodes, nodes) weight of the nodes: the share of the rim cells inside the
     aperture, and the solid angle.
     """
-    q = axis(pupil)
+    q = node_cosines(pupil)
     q2 = q[:, None] ** 2 + q**2
     step = 2 * pupil.edge / pupil.nodes
     inside = ((pupil.edge - torch.sqrt(q2)) / step + 0.5).clamp(0, 1)
@@ -180,14 +182,14 @@ def psf(
             "raise Pupil.nodes or take a smaller window"
         )
     to_window = kernel(pupil, sample_um, samples)
-    k, added = 2 * math.pi / pupil.wavelength_um, wrapped(phase_rad).float()
+    k, added = 2 * math.pi / pupil.wavelength_um, wrap_phase(phase_rad).float()
     angles, weights = [], []
     for depth, field in zip(
         depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True
     ):
-        seen = view(pupil, field, float(focus_um))
+        seen = view_pupil(pupil, field, float(focus_um))
         path = source_path(seen.x_um, seen.y_um, field.tangents, 1 / depth)
-        known = wrapped(seen.lens_rad + k * path).float()
+        known = wrap_phase(seen.lens_rad + k * path).float()
         angles.append(
             known + (added if seen.node is None else added.reshape(-1)[seen.node])
         )
@@ -202,17 +204,19 @@ def psf(
 
 
 @functools.lru_cache(maxsize=64)
-def view(pupil: Pupil, field: Field, focus_um: float) -> Seen:
+def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
     """The pupil from the place where the chief ray of a field meets the sensor."""
     d, k = pupil.sensor_distance_um, 2 * math.pi / pupil.wavelength_um
     if not field.angle_rad:
         x, y = coordinates(pupil)
-        return Seen(
+        return PupilView(
             x, y, amplitude(pupil), None, -k * path_difference(x**2 + y**2, focus_um)
         )
     cx, cy = (d * t for t in field.tangents)
     mx, my = _middle(pupil.radius_um, cx, cy, d)
-    qy, qx = torch.meshgrid(axis(pupil) + my, axis(pupil) + mx, indexing="ij")
+    qy, qx = torch.meshgrid(
+        node_cosines(pupil) + my, node_cosines(pupil) + mx, indexing="ij"
+    )
     rest = (1 - qx**2 - qy**2).clamp_min(1e-3)
     x, y = cx + qx * d / torch.sqrt(rest), cy + qy * d / torch.sqrt(rest)
     r2, n = x**2 + y**2, pupil.nodes
@@ -228,12 +232,12 @@ def view(pupil: Pupil, field: Field, focus_um: float) -> Seen:
         for a in (y, x)
     )
     focus = path_difference(r2, d) + path_difference(r2, focus_um)
-    return Seen(
+    return PupilView(
         x, y, weight, row * n + column, k * (sensor_path(x, y, (cx, cy), d) - focus)
     )
 
 
-def wrapped(phase_rad: Tensor) -> Tensor:
+def wrap_phase(phase_rad: Tensor) -> Tensor:
     """The phase less whole turns, so that single precision holds it; the gradient is
     that of the phase.
     """

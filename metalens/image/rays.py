@@ -28,7 +28,7 @@ class Rays:
     root of the power that faces let
     through; away_um: path to the window's centre less that along the normal. aside:
     (nodes,) p - p0 along x and along
-    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`bending`
+    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`path_derivatives`
     there.
     """
 
@@ -99,7 +99,7 @@ def rays(
         media.relative_path(after, p),
         axis,
         middle,
-        *bending(after, middle),
+        *path_derivatives(after, middle),
     )
 
 
@@ -124,7 +124,7 @@ def through_stop(
     return torch.from_numpy(out).to(seen.x_um.device)
 
 
-def landing(
+def landing_offset(
     layers: Layers,
     carrier_rad: Callable[[Tensor, Tensor], Tensor],
     radius: float,
@@ -165,7 +165,7 @@ def landing(
     )
     sums = torch.zeros(3, dtype=torch.float64)
     for depth, path in zip(depths_um.tolist(), paths, strict=True):
-        light = found.whole**2 * layers.lit(
+        light = found.whole**2 * layers.stop_share(
             tangents, depth, wavelength_um, (found.x_um, found.y_um), found.width_um
         )
         y, x = torch.gradient(path, spacing=step)
@@ -174,7 +174,7 @@ def landing(
     return (x_um / given, y_um / given) if given > 0 else (0.0, 0.0)
 
 
-def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
+def path_derivatives(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
     """(j, a, b) ∂H/∂p_j and (i, j, a, b) ∂²H/∂p_i∂p_j at a direction, 1/um.
 
     H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of

@@ -343,7 +343,7 @@ def _mean(frames: Frames) -> Tensor:
     return light / cover.clamp_min(1e-30)
 
 
-def spectra(frames: Frames, optics: UniformImager) -> Tensor:
+def layer_spectra(frames: Frames, optics: UniformImager) -> Tensor:
     """(rank, frames, light and coverage, sheets, Y, X // 2 + 1) spectra of the frames,
     weighted for every kernel.
 
@@ -368,37 +368,39 @@ def _sources(frames: Frames, optics: UniformImager) -> Tensor:
     """
     psf, given = optics.psf, (frames.radiance, frames.coverage, frames.depth_um)
     single = psf.weights.shape[:2] == (1, 1)
-    if single and all(plain(a) for a in (*given, psf.weights)):
-        from metalens.image.sources import weighted
+    if single and all(is_compilable(a) for a in (*given, psf.weights)):
+        from metalens.image.sources import weigh_sources
 
         ends = float(psf.depths_um[0]), float(psf.depths_um[-1])
         light, cover, depth, table = (
             a.numpy() for a in (*given, optics.table[0, 0].contiguous())
         )
         return torch.from_numpy(
-            weighted(light, cover, depth, table, ends_um=ends, shape=optics.shape)
+            weigh_sources(light, cover, depth, table, ends_um=ends, shape=optics.shape)
         )
     pair = torch.stack([frames.radiance, frames.coverage], 1)
     if single:  # weights of the depth alone: pad once, not once a kernel
-        return weight_maps(psf, padded(frames.depth_um, optics.shape))[
+        return weight_maps(psf, pad_borders(frames.depth_um, optics.shape))[
             :, :, None
-        ] * padded(pair, optics.shape)
-    return padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
+        ] * pad_borders(pair, optics.shape)
+    return pad_borders(
+        weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape
+    )
 
 
-def plain(a: Tensor) -> bool:
+def is_compilable(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory,
     without derivatives.
     """
-    return a.dtype in (torch.float32, torch.complex64) and values(a)
+    return a.dtype in (torch.float32, torch.complex64) and is_plain_value(a)
 
 
-def values(a: Tensor) -> bool:
+def is_plain_value(a: Tensor) -> bool:
     """Whether it lies in main memory and carries no derivatives, backward or forward."""
-    return a.device.type == "cpu" and fixed(a)
+    return a.device.type == "cpu" and has_no_gradient(a)
 
 
-def fixed(a: Tensor) -> bool:
+def has_no_gradient(a: Tensor) -> bool:
     """Whether it carries no derivatives, backward or forward."""
     return not a.requires_grad and forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
@@ -412,7 +414,7 @@ def with_kernels(optics: UniformImager, kernels: Tensor) -> UniformImager:
 def image_spectra(
     source: Tensor, optics: UniformImager, size: tuple[int, int]
 ) -> Tensor:
-    """(frames, y, x) the image that :func:`image` gives, from :func:`spectra` of frames
+    """(frames, y, x) the image that :func:`image` gives, from :func:`layer_spectra` of frames
     of ``size`` = (y, x) pixels.
     """
     blurred = torch.fft.irfft2(_mixed(source, optics), s=optics.shape)[
@@ -421,7 +423,7 @@ def image_spectra(
     return _over(blurred[:, 0], blurred[:, 1])
 
 
-def cut(frames: Frames, depths_um: Tensor) -> Layers:
+def cut_layers(frames: Frames, depths_um: Tensor) -> Layers:
     """Cut frames into layers at these depths (ascending), leaving out the empty ones.
 
     A source between two layers is shared by both, linearly in 1/z.
@@ -480,7 +482,7 @@ def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
     return transfer
 
 
-def padded(sources: Tensor, shape: tuple[int, int]) -> Tensor:
+def pad_borders(sources: Tensor, shape: tuple[int, int]) -> Tensor:
     """Continue the border pixels into the spare columns and rows: half of them belong
     to the far border.
     """

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from metalens.image.low_rank import PsfField, fast_shape, frame_maps
-from metalens.image.plan import Plan, spectral
+from metalens.image.plan import Plan, sum_over_spectrum
 from metalens.image.points import Optics, psfs
 from metalens.image.splines import TAPS, spline_coefficients, spline_taps
 
@@ -104,13 +104,15 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
     gathers the gradient.
     """
     with torch.no_grad():
-        light = spectral(optics, _places(plan), plan.depths_um, plan.waves, plan.window)
+        light = sum_over_spectrum(
+            optics, _places(plan), plan.depths_um, plan.waves, plan.window
+        )
     return light.reshape(
         len(plan.y_um), len(plan.x_um), *light.shape[1:]
     ).requires_grad_()
 
 
-def surrogate(
+def surrogate_loss(
     optics: Optics, plan: Plan, gradient: Tensor, pairs: tuple[Tensor, Tensor]
 ) -> Tensor:
     """A scalar whose gradient to the phase is, in the mean over the draws, that of the
@@ -120,21 +122,21 @@ def surrogate(
         gradient: (rows, columns, depths, h, w) of the loss with respect to
             :func:`node_light`, of the field points that
             were drawn.
-        pairs: a field point and a wavelength each, of :func:`drawn`.
+        pairs: a field point and a wavelength each, of :func:`draw_nodes`.
     """
     return torch.stack(
         [
-            term(optics, plan, gradient, int(p), int(w))
+            gradient_term(optics, plan, gradient, int(p), int(w))
             for p, w in zip(*pairs, strict=True)
         ]
     ).mean()
 
 
-def drawn(
+def draw_nodes(
     plan: Plan, draws: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
     """(draws,) numbers of field points, evenly, and of wavelengths, by their weights:
-    what :func:`surrogate` takes.
+    what :func:`surrogate_loss` takes.
     """
     points = torch.randint(
         len(plan.y_um) * len(plan.x_um), (draws,), generator=generator
@@ -147,7 +149,9 @@ def drawn(
     )
 
 
-def term(optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int) -> Tensor:
+def gradient_term(
+    optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int
+) -> Tensor:
     """What one draw adds: number of points · <G_point, light_point,wave>."""
     places = _places(plan)
     light = psfs(

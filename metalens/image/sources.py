@@ -11,7 +11,7 @@ from metalens.core import threads
 from metalens.core.arrays import Array
 
 
-def weighted(
+def weigh_sources(
     light: Array,
     cover: Array,
     depth_um: Array,

@@ -168,7 +168,7 @@ def _behind_stop(
     there = np.hypot(x, y) <= wave.radius_um
     cell = float(place[1] - place[0])
     shown = [
-        layers.lit((a, b), depth_um, colour, (x, y), cell) * there
+        layers.stop_share((a, b), depth_um, colour, (x, y), cell) * there
         for a, b in tangents.reshape(-1, 2).tolist()
     ]
     light = np.stack(shown).reshape(NODES, NODES, -1)

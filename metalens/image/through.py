@@ -7,12 +7,12 @@ import math
 import torch
 from torch import Tensor
 
-from metalens.image.points import Optics, Window, sampling, seen
+from metalens.image.points import Optics, Window, node_rays, sampling
 from metalens.image.rays import Rays
 from metalens.image.waves import PillarWave
 
 
-def through(
+def aperture_transmission(
     optics: Optics,
     at_um: Tensor,
     *,
@@ -33,7 +33,7 @@ def through(
     reduced, out = optics.layers.after(optics.distance_um, wavelength_um).reduced_um, []
     with torch.no_grad():
         for place in at_um:
-            rays, pupil = seen(optics, place, grid, wavelength_um)
+            rays, pupil = node_rays(optics, place, grid, wavelength_um)
             tangents = place / reduced
             tilt = math.atan(math.hypot(*tangents.tolist()))
             light = (pupil.weight * rays.passed * rays.width_um / grid.step).expand(
@@ -72,5 +72,7 @@ def _passed(
     slopes, each = (float(tangents[0]), float(tangents[1])), []
     for depth in depths_um.tolist():
         share = (layers.footprint_um(depth, wavelength_um) / radius) ** 2
-        each.append(layers.lit(slopes, depth, wavelength_um, (x, y), width) / share)
+        each.append(
+            layers.stop_share(slopes, depth, wavelength_um, (x, y), width) / share
+        )
     return torch.stack(each).to(found.x_um.device)

@@ -15,7 +15,7 @@ from torch import Tensor
 from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.image import compiled
-from metalens.image.scene import values
+from metalens.image.scene import is_plain_value
 from metalens.lens import Lens, answers
 from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import among
@@ -74,7 +74,7 @@ class SmoothWave:
 
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
         """The hyperbolic phase of the focus."""
-        return focusing(self.focus, x_um, y_um)
+        return focusing_phase(self.focus, x_um, y_um)
 
     def factor(
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
@@ -146,7 +146,7 @@ class PillarWave:
 
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
         """The hyperbolic phase that the design aims at."""
-        return focusing(self.focus, x_um, y_um)
+        return focusing_phase(self.focus, x_um, y_um)
 
     def factor(
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
@@ -255,7 +255,7 @@ class PillarWave:
         """
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
-        if values(d):
+        if is_plain_value(d):
             phases, levels = torch.empty(2, *d.shape)
             answers.fill_response_of(
                 proxy,
@@ -280,7 +280,7 @@ class PillarWave:
         """
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
-        if self.lens.neighbours is None and values(d):
+        if self.lens.neighbours is None and is_plain_value(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
             known = answers.response_polynomials(self.lens.proxy, sizes, at)
@@ -333,7 +333,7 @@ def _over(cells: Tensor, width: float) -> Tensor:
     return mean
 
 
-def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
+def focusing_phase(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
     """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d
     (paper Eq. 1, exp(-iωt)).
 

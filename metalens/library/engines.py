@@ -3,8 +3,9 @@ diameter.
 """
 
 import functools
+import importlib
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,8 +55,8 @@ def solve_to_tolerance(
         engine: auto, rcwa or modal.
     """
     if engine == "modal":
-        return functools.partial(_modal, cell, light, tolerance)
-    return functools.partial(_rcwa, cell, light, tolerance, None)
+        return functools.partial(_solve, "modal", cell, light, {"tolerance": tolerance})
+    return functools.partial(_solve, "rcwa", cell, light, {"tolerance": tolerance})
 
 
 def solver_at_fixed_discretization(
@@ -222,43 +223,29 @@ def _rcwa_levels(
             cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
         )
         reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
+    settings = {"tolerance": tolerance}
     return [
-        functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches
+        functools.partial(_solve, "rcwa", cell, light, settings | {"harmonics": reach})
+        for reach in reaches
     ]
 
 
-def _modal(
-    cell: Cell, light: Incidence, tolerance: float, diameter_um: float
-) -> Response:
-    from metalens import modal
-
-    return modal.solve(
-        cell,
-        diameter_um,
-        light.wavelength_um,
-        angle_rad=light.angle_rad,
-        azimuth_rad=light.azimuth_rad,
-        polarization=light.polarization,
-        tolerance=tolerance,
-    )
-
-
-def _rcwa(
+def _solve(
+    engine: str,
     cell: Cell,
     light: Incidence,
-    tolerance: float,
-    harmonics: int | None,
+    settings: dict[str, Any],
     diameter_um: float,
 ) -> Response:
-    from metalens import rcwa
-
-    return rcwa.solve(
+    """One meta-atom by ``modal`` or ``rcwa``, imported where it is used."""
+    solver = importlib.import_module(f"metalens.{engine}")
+    response: Response = solver.solve(
         cell,
         diameter_um,
         light.wavelength_um,
         angle_rad=light.angle_rad,
         azimuth_rad=light.azimuth_rad,
         polarization=light.polarization,
-        tolerance=tolerance,
-        harmonics=harmonics,
+        **settings,
     )
+    return response

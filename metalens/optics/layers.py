@@ -131,7 +131,7 @@ class Layers:
         w = media.solve_direction_square(outer, (away**2).sum(-1, keepdims=True))
         return np.asarray(away / media.reach_per_direction(outer, w) / np.sqrt(1 - w))
 
-    def lit(
+    def stop_share(
         self,
         tangents: tuple[float, float],
         depth_um: float,
@@ -168,7 +168,7 @@ class Layers:
     ) -> Array:
         """Complex amplitude of a source's light behind the stop over that without it,
         at places of the pillars: as
-        :meth:`lit` with the ripples of the edge (:mod:`metalens.optics.aperture_stop`); numpy
+        :meth:`stop_share` with the ripples of the edge (:mod:`metalens.optics.aperture_stop`); numpy
         arrays.
         """
         if self.stop is None:

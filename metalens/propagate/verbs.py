@@ -105,7 +105,7 @@ def _films(
     """What films add to a case."""
     if layers is not None and layers.stop is not None:
         raise PropagationError(
-            "layers: a stop is no part of a propagation from the pillars on; put Layers.lit onto their transmission "
+            "layers: a stop is no part of a propagation from the pillars on; put Layers.stop_share onto their transmission "
             "and give Layers.open (psf_stack does both)"
         )
     if layers is None or layers.plain or not sensor_distance_um > 0:

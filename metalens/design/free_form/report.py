@@ -90,43 +90,6 @@ def report_values(
     }
 
 
-def report_text(
-    lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings
-) -> str:
-    """A table: information (mean over the depths) at every angle, and the least energy
-    over the depths.
-    """
-    low, high = settings.depths_mm
-    lines = [
-        f"I(z) per mm², mean over {low:g}-{high:g} mm (least energy in {settings.radius_um:g} um); pixels of "
-        f"{settings.pixel_um:g} um, {settings.normalisation} normalisation, smooth phases",
-        f"  {'lens':<36}"
-        + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
-    ]
-    for lens in lenses:
-        pairs = zip(
-            lens.score.information.mean(1), lens.score.encircled.amin(1), strict=True
-        )
-        lines.append(
-            f"  {lens.name:<36}"
-            + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs)
-        )
-    energy = ", ".join(
-        f"{depth:g} mm {share:.2f}"
-        for depth, share in zip(
-            _depths(lenses, settings)[::2],
-            lenses[0].score.encircled.amin(0)[::2],
-            strict=True,
-        )
-    )
-    return "\n".join(
-        [
-            *lines,
-            f"  {information_gain(lenses):.2f} x the better baseline; energy of the free form: {energy}",
-        ]
-    )
-
-
 def report_picture(
     lenses: tuple[JudgedLens, ...], pupil: Pupil, settings: ResolvedFisherSettings
 ) -> bytes:

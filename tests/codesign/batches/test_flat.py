@@ -117,10 +117,8 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
     )  # what the kept kernels do not show
 
 
-def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_path):
-    made = pool.render_pool(SCENES, 12)
-    pool.save_pool(tmp_path / "pool.h5", made)
-    again = pool.load_pool(tmp_path / "pool.h5")
+def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass():
+    made, again = (pool.render_pool(SCENES, 12) for _ in range(2))
     draws = PoolScenes(made, 8, 0.2, seed=1)
     same = PoolScenes(again, 8, 0.2, seed=1).batch(1, 4)
     batch = draws.batch(1, 4)

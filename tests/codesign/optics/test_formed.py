@@ -15,10 +15,16 @@ from codesign.optics.lens_errors import LensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig
 from metalens.cell import Film, Index
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.image import Frames, Imager, UniformImager, normalised, textured_frames
+from metalens.image import (
+    Frames,
+    Imager,
+    UniformImager,
+    normalise_psfs,
+    textured_frames,
+)
 from metalens.image.forming import with_psfs
-from metalens.image.plan import spectral
-from metalens.image.slopes import drawn, term
+from metalens.image.plan import sum_over_spectrum
+from metalens.image.slopes import draw_nodes, gradient_term
 from metalens.optics import Layers, Stop
 
 SMALL = OpticsConfig(
@@ -71,14 +77,14 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     def image(coefficients):
         optics = formed.optics_of(SMALL, coefficients)
         y, x = torch.meshgrid(whole.plan.y_um, whole.plan.x_um, indexing="ij")
-        light = spectral(
+        light = sum_over_spectrum(
             optics,
             torch.stack([x.flatten(), y.flatten()], -1),
             whole.plan.depths_um,
             whole.plan.waves,
             whole.plan.window,
         )
-        psfs, _ = normalised(light.reshape(whole.stack.shape), optics, whole.plan)
+        psfs, _ = normalise_psfs(light.reshape(whole.stack.shape), optics, whole.plan)
         return (with_psfs(whole, psfs, whole.energy)(frames) * weight).sum()
 
     ready = formed.make_differentiable_imager(SMALL, whole)
@@ -88,7 +94,9 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     moving = BENT.clone().requires_grad_()
     optics = formed.optics_of(SMALL, moving)
     points = len(whole.plan.y_um) * len(whole.plan.x_um)
-    terms = [term(optics, whole.plan, ready.light.grad, p, 0) for p in range(points)]
+    terms = [
+        gradient_term(optics, whole.plan, ready.light.grad, p, 0) for p in range(points)
+    ]
     torch.stack(terms).mean().backward()
     way = torch.tensor(
         [0.3, 0.5, -0.2, 0.4, 0.1, -0.6, 0.2, 0.1, -0.3], dtype=torch.float64
@@ -102,7 +110,7 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     few = BENT.clone().requires_grad_()
     with pytest.raises(ValueError, match="no field points were drawn"):
         ready.pass_on(SMALL, few)
-    pairs = drawn(whole.plan, 240, torch.Generator().manual_seed(1))
+    pairs = draw_nodes(whole.plan, 240, torch.Generator().manual_seed(1))
     replace(ready, pairs=pairs).pass_on(SMALL, few)
     assert float((few.grad - moving.grad).norm()) < 0.6 * float(
         moving.grad.norm()
@@ -112,7 +120,7 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
 def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_were_drawn(
     whole,
 ):
-    pairs = drawn(whole.plan, 3, torch.Generator().manual_seed(4))
+    pairs = draw_nodes(whole.plan, 3, torch.Generator().manual_seed(4))
     ready = formed.make_differentiable_imager(SMALL, whole, pairs)
     assert ready.ready.asked == set(pairs[0].tolist())
     frames = _frames(whole)

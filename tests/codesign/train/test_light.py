@@ -121,7 +121,7 @@ def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
         return torch.zeros((), requires_grad=True)
 
     monkeypatch.setattr(formed, "make_differentiable_imager", live)
-    monkeypatch.setattr(formed, "surrogate", surrogate)
+    monkeypatch.setattr(formed, "surrogate_loss", surrogate)
     for step in steps:
         light.at(step, place, 30, 5, live=True)
         light.pass_on(place)

@@ -12,15 +12,15 @@ from metalens.image import (
     Grid,
     Optics,
     SmoothWave,
-    drawn,
+    draw_nodes,
     imager,
     node_light,
     node_psfs,
-    normalised,
-    surrogate,
+    normalise_psfs,
+    surrogate_loss,
     with_psfs,
 )
-from metalens.image.slopes import term
+from metalens.image.slopes import gradient_term
 from metalens.optics import Layers
 from metalens.psf import SpectralNodes
 
@@ -64,7 +64,7 @@ def _pulled(made, frames):
     optics = _optics(strength)
     light = node_light(optics, made.plan)
     (
-        with_psfs(made, *normalised(light, optics, made.plan))(frames) ** 2
+        with_psfs(made, *normalise_psfs(light, optics, made.plan))(frames) ** 2
     ).sum().backward()
     return strength, optics, light.grad
 
@@ -75,7 +75,7 @@ def test_the_mean_over_all_draws_is_the_gradient_of_the_loss(case):
     points = len(made.plan.y_um) * len(made.plan.x_um)
     share = WAVES.weights / WAVES.weights.sum()
     mean = sum(
-        term(optics, made.plan, gradient, p, w) * (float(share[w]) / points)
+        gradient_term(optics, made.plan, gradient, p, w) * (float(share[w]) / points)
         for p in range(points)
         for w in range(2)
     )
@@ -95,11 +95,13 @@ def test_a_draw_is_one_of_the_terms(case):
     _, optics, gradient = _pulled(made, frames)
     draw = torch.Generator().manual_seed(5)
     got = float(
-        surrogate(optics, made.plan, gradient, drawn(made.plan, 1, draw)).detach()
+        surrogate_loss(
+            optics, made.plan, gradient, draw_nodes(made.plan, 1, draw)
+        ).detach()
     )
     points = len(made.plan.y_um) * len(made.plan.x_um)
     every = [
-        float(term(optics, made.plan, gradient, p, w).detach())
+        float(gradient_term(optics, made.plan, gradient, p, w).detach())
         for p in range(points)
         for w in range(2)
     ]

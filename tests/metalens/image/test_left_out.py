@@ -10,7 +10,12 @@ import torch
 
 from metalens.design import Focus
 from metalens.image import Optics, SmoothWave, Window, psfs
-from metalens.image.left_out import Judged, folded, polarised, unpolarised
+from metalens.image.left_out import (
+    JudgedPsfs,
+    choose_polarisation,
+    folding_error,
+    polarisation_error,
+)
 from metalens.image.texture import texture_error
 from metalens.optics import Layers
 from metalens.psf import SpectralNodes
@@ -55,32 +60,43 @@ def test_components_that_are_left_out_are_judged_by_shapes_of_all_of_them():
         whole / whole.sum((-1, -2), keepdim=True),
         whole.sum((-1, -2)),
     )
-    judged = Judged(FAST, WAVES, replace(WINDOW, components=1), AT)
-    assert unpolarised(judged) == pytest.approx(want, rel=1e-5)  # float32
-    assert unpolarised(judged, seen(components=4)) == pytest.approx(want, rel=1e-5)
-    assert unpolarised(Judged(FAST, WAVES, replace(WINDOW, components=4), AT)) == 0.0
+    judged = JudgedPsfs(FAST, WAVES, replace(WINDOW, components=1), AT)
+    assert polarisation_error(judged) == pytest.approx(want, rel=1e-5)  # float32
+    assert polarisation_error(judged, seen(components=4)) == pytest.approx(
+        want, rel=1e-5
+    )
+    assert (
+        polarisation_error(JudgedPsfs(FAST, WAVES, replace(WINDOW, components=4), AT))
+        == 0.0
+    )
 
 
 def test_light_that_folds_back_is_judged_by_twice_the_period():
     whole = seen(period=2 * WINDOW.period)
     want = image_error(seen(), whole, whole.sum((-1, -2)))
     assert want > 1e-4
-    assert folded(Judged(FAST, WAVES, WINDOW, AT)) == pytest.approx(want, rel=1e-4)
+    assert folding_error(JudgedPsfs(FAST, WAVES, WINDOW, AT)) == pytest.approx(
+        want, rel=1e-4
+    )
 
 
 def test_the_scalar_stays_where_its_error_is_below_the_tolerance_and_the_image_says_it():
     at = torch.tensor([[3.0, -4.0]], dtype=torch.float64), torch.tensor([4000.0])
-    judged = Judged(FAST, WAVES, WINDOW, at)
-    said = unpolarised(judged)
+    judged = JudgedPsfs(FAST, WAVES, WINDOW, at)
+    said = polarisation_error(judged)
     for tolerance, components in (
         (1.01 * said, 0),
         (0.99 * said, 4),
     ):  # three leave more than a fifth of that
         assert (
-            polarised(judged, "auto", within=(tolerance, 0.2 * tolerance)).components
+            choose_polarisation(
+                judged, "auto", within=(tolerance, 0.2 * tolerance)
+            ).components
             == components
         )
-    assert polarised(judged, "scalar", within=(1e-9, 1e-9)).components == 0
-    energy = polarised(judged, "vector", within=(1.01 * said, 0.2 * 1.01 * said))
+    assert choose_polarisation(judged, "scalar", within=(1e-9, 1e-9)).components == 0
+    energy = choose_polarisation(
+        judged, "vector", within=(1.01 * said, 0.2 * 1.01 * said)
+    )
     assert (energy.flux, energy.whole) == (False, 6)
     assert energy.components > 0

@@ -13,10 +13,10 @@ from metalens import design
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
 from metalens.image import Grid, Optics, SmoothWave, Window, imager
-from metalens.image.engine import normalised
+from metalens.image.engine import normalise_psfs
 from metalens.image.plan import Plan
 from metalens.image.points import psfs
-from metalens.image.through import through
+from metalens.image.through import aperture_transmission
 from metalens.library import Proxy
 from metalens.optics import Layers, Stop
 from metalens.psf import SpectralNodes, View, from_lens
@@ -61,18 +61,24 @@ def test_nothing_of_a_smooth_wave_is_lost_but_at_faces_and_the_stop():
     faces = 4 * 1.7 / 2.7**2
     wave = SmoothWave(Focus(0.85, 400.0, 2e3, GLASS), 45.0)
     window = Window(31, 2.0)
-    found = through(Optics(wave, GLASS, 400.0), at, window=window, **about)
+    found = aperture_transmission(
+        Optics(wave, GLASS, 400.0), at, window=window, **about
+    )
     # of oblique rays, sin 0.11: 1e-5
     assert found.numpy() == pytest.approx(np.full((1, 2), faces), rel=1e-4)
     hole = Layers(front=(Film(Index(1.5), 400.0),), stop=Stop(60.0, 400.0))
     smooth = SmoothWave(Focus(0.85, 400.0, 2e3, hole), 140.0)
     lost = 0.18 / (60.0**2 / (0.85 * 400 / 1.5))
-    found = through(Optics(smooth, hole, 400.0), at, window=window, **about)
+    found = aperture_transmission(
+        Optics(smooth, hole, 400.0), at, window=window, **about
+    )
     assert found.numpy() == pytest.approx(np.ones((1, 2)), abs=0.005)  # of nodes, 6 um
     slope = math.tan(math.asin(1.5 * math.sin(math.atan(140 / 400))))
     aside = torch.tensor([[400 * slope, 0.0]], dtype=torch.float64)
     beside = float(
-        through(Optics(smooth, hole, 400.0), aside, window=window, **about)[0, 1]
+        aperture_transmission(
+            Optics(smooth, hole, 400.0), aside, window=window, **about
+        )[0, 1]
     )
     assert beside == pytest.approx(
         _common(60.0, 140.0) / (math.pi * 60.0**2), abs=2 * lost
@@ -160,7 +166,7 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         torch.tensor([depth_um], dtype=torch.float64),
     )
     at = torch.stack([x_um, torch.zeros(2, dtype=torch.float64)], -1)
-    light = through(
+    light = aperture_transmission(
         optics, at, depths_um=depths, wavelength_um=0.85, window=Window(31, 2.0)
     )
     plan = Plan(
@@ -171,7 +177,7 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         Window(31, 2.0),
         folds=False,
     )
-    found = normalised(light[None, :, :, None, None], optics, plan)[1][0, :, 0]
+    found = normalise_psfs(light[None, :, :, None, None], optics, plan)[1][0, :, 0]
     want = [_relative(t, depth_um, thick_um, n) for t in (0.01, slope)]
     assert float(found[1] / found[0]) == pytest.approx(
         want[1] / want[0], rel=6e-3

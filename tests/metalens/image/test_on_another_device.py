@@ -14,10 +14,10 @@ from metalens.image import (
     Grid,
     SmoothWave,
     basis,
-    drawn,
+    draw_nodes,
     image,
     imager,
-    surrogate,
+    surrogate_loss,
     uniform_imager,
 )
 from metalens.image.points import Optics
@@ -122,11 +122,11 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
             .reshape(here.stack.shape)
             .to(device)
         )
-        value = surrogate(
+        value = surrogate_loss(
             optics,
             here.plan,
             weights,
-            drawn(here.plan, 2, torch.Generator().manual_seed(3)),
+            draw_nodes(here.plan, 2, torch.Generator().manual_seed(3)),
         )
         value.backward()
         return float(value.detach()), bends.grad

@@ -15,7 +15,7 @@ from scipy import special
 from metalens.core.errors import PropagationError
 from metalens.design import Focus
 from metalens.image import Frames, Grid, Optics, SmoothWave, Window, imager, psfs
-from metalens.image.polarised import factors
+from metalens.image.polarised import polarisation_factors
 from metalens.image.rays import Rays
 from metalens.image.texture import texture_error
 from metalens.optics import Layers
@@ -364,7 +364,7 @@ def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
         torch.tensor([0.2, -0.1], dtype=torch.float64),
     )
     rays = Rays(none, none, none, none, none, none, aside, middle, none, none)
-    found = factors(
+    found = polarisation_factors(
         rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True
     )
     assert torch.isfinite(found.pupils).all()

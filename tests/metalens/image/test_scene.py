@@ -45,7 +45,7 @@ def test_constant_radiance_stays_constant_at_every_edge():
     psf = scene.basis(STACK, DEPTHS)
     fast = scene.image(flat, scene.uniform_imager(psf, (N, N)))
     assert (fast - 0.37).abs().max() < 1e-12
-    layers = scene.cut(flat, DEPTHS)
+    layers = scene.cut_layers(flat, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
     assert (slow - 0.37).abs().max() < 1e-12
 
@@ -167,7 +167,7 @@ def test_few_kernels_meet_the_tolerance(tolerance):
     frames = _eye()
     psf = scene.basis(STACK, DEPTHS, tolerance=tolerance)
     fast = scene.image(frames, scene.uniform_imager(psf, (N, N)))
-    layers = scene.cut(frames, DEPTHS)
+    layers = scene.cut_layers(frames, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
     assert psf.error <= tolerance
     error = float((fast - slow).norm() / slow.norm())
@@ -176,7 +176,7 @@ def test_few_kernels_meet_the_tolerance(tolerance):
 
 
 def test_only_occupied_layers_are_cut():
-    layers = scene.cut(_eye(), DEPTHS)
+    layers = scene.cut_layers(_eye(), DEPTHS)
     assert len(layers.depth_um) < 2 * len(DEPTHS)
     assert torch.allclose(
         layers.coverage.sum(1), torch.ones(2, N, N, dtype=torch.float64)

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from metalens.image.sources import weighted
+from metalens.image.sources import weigh_sources
 
 NEAR, FAR = 18.0, 150.0
 
@@ -16,7 +16,7 @@ def test_light_and_coverage_take_the_weight_of_their_depth():
     light, cover = rng.uniform(0.1, 2.0, (2, 3, 2, 5, 7)).astype(np.float32)
     depth = rng.uniform(12.0, 260.0, light.shape).astype(np.float32)
     table = rng.normal(size=(4, 23)).astype(np.float32)
-    out = weighted(light, cover, depth, table, ends_um=(NEAR, FAR), shape=(9, 12))
+    out = weigh_sources(light, cover, depth, table, ends_um=(NEAR, FAR), shape=(9, 12))
     place = (
         np.clip((1 / NEAR - 1 / depth.astype(float)) / (1 / NEAR - 1 / FAR), 0, 1) * 22
     )
@@ -36,7 +36,7 @@ def test_spare_rows_and_columns_continue_the_nearer_border():
     """
     light = np.arange(1.0, 36.0, dtype=np.float32).reshape(1, 1, 5, 7).repeat(2, 1)
     depth = np.full(light.shape, 40.0, np.float32)
-    out = weighted(
+    out = weigh_sources(
         light,
         light,
         depth,

@@ -410,7 +410,7 @@ def test_rays_cross_the_stop_where_snell_has_them() -> None:
     hole = replace(
         layers, stop=Stop(float(u[1]), 150.0)
     )  # its edge where the second ray crosses
-    share = hole.lit(tangents, depth, WAVE, (x, np.zeros(2)), 1e-3)
+    share = hole.stop_share(tangents, depth, WAVE, (x, np.zeros(2)), 1e-3)
     assert share[0] == 1.0
     assert share[1] == pytest.approx(0.5, abs=1e-3)  # 1e-6 um of 1e-3
 
@@ -596,7 +596,7 @@ def test_stops_that_cannot_be_are_refused_by_name() -> None:
     }
     with pytest.raises(PropagationError, match="behind the stop"):
         psf_stack(PHASE, LEVEL, depths_um=[80.0], layers=LAYERS, **about)
-    with pytest.raises(PropagationError, match=r"put Layers\.lit onto"):
+    with pytest.raises(PropagationError, match=r"put Layers\.stop_share onto"):
         propagate.make_case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
     moving = torch.tensor(400.0, requires_grad=True)
     with pytest.raises(PropagationError, match="no derivatives in the geometry"):
