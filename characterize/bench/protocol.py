@@ -144,7 +144,8 @@ class CapturePlan:
 def plan_captures(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity
 ) -> CapturePlan:
-    """The best frames for a lens and what they will tell.
+    """D-optimal capture plan of a lens: the frames of most Fisher information, with the
+    expected intervals.
 
     Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change
     the weights in second order.

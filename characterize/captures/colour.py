@@ -21,7 +21,7 @@ def red_first(image: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class ColourChannels:
-    """Which colour is lit, and how a raw mosaic holds it.
+    """Illuminated colour channel of the frames, and the layout of a raw Bayer mosaic.
 
     channel: one of ``CHANNELS``, or None. mosaic: letters of the 2 x 2 pixels that
     repeat, row by row from the first

@@ -69,7 +69,7 @@ def _score(off: Array, noise: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DarkStatistics:
-    """What repeated frames without light tell, in counts.
+    """Mean and variance of repeated dark frames, in counts.
 
     level: (y, x) of every pixel before rounding. error: (y, x) standard deviation of
     it, one in all frames.

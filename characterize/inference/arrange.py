@@ -81,8 +81,8 @@ class FrameArrangement:
 
 
 def few_frames(setting: FrameSetting) -> Array:
-    """Frames that tell the starts apart: the ends and the middle of the depths at every
-    angle.
+    """Frames that distinguish the starts: both ends and the middle of the depths at
+    each angle.
 
     Args:
         setting: depths, angles and window of the frames.
@@ -477,8 +477,8 @@ def rearrange_frames(values: Array, arrangement: FrameArrangement) -> Array:
 
 
 def laid_words(found: FrameArrangement) -> list[str]:
-    """What to say of how the frames lie: turned or reordered, and what of that cannot
-    be seen.
+    """Sentences on the orientation and order of the frames, and on what of it is
+    ambiguous.
 
     Args:
         found: how the frames lie.

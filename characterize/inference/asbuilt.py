@@ -30,8 +30,8 @@ from metalens.lens import DiameterMap, Lens
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WithinModel:
-    """What holds where the bench has nothing but what is fitted and stated; all empty
-    where it is not told apart.
+    """Statistical (conditional) covariance, intervals and draws: all that is not fitted
+    is as stated; empty where not computed.
 
     covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by
     profile over all valleys.
@@ -121,12 +121,12 @@ class AsBuilt:
 
     @property
     def sigma(self) -> Array:
-        """(p,) standard errors, with what the captures cannot tell."""
+        """(p,) total (Type A and B) standard errors."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def within_covariance(self) -> Array:
-        """(p, p) within the model; the whole where it is not told apart."""
+        """(p, p) statistical covariance; the total one where it was not computed."""
         return (
             self.within.covariance if len(self.within.covariance) else self.covariance
         )
@@ -138,8 +138,8 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval on a bench that is not known: the profile and what the captures
-        cannot tell, in quadrature.
+        """Total 95 % interval: the profile interval and the unstated effects, in
+        quadrature.
         """
         return _ends(
             self.names.index(name), self.value, self.covariance, self.low, self.high

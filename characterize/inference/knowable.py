@@ -11,8 +11,8 @@ from metalens.core.arrays import Array
 def correlated_pairs(
     names: tuple[str, ...], covariance: Array, sigma_prior: Array
 ) -> list[str]:
-    """Pairs that are correlated beyond 0.9, and parameters that the frames tell little
-    about.
+    """Pairs of parameters correlated beyond 0.9, and parameters of little information
+    in the frames.
 
     Args:
         names: (p,) names of the fitted parameters.

@@ -123,8 +123,8 @@ class ScoreTests:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UnmodelledShifts:
-    """What the captures cannot tell: causes, (c, p) root mean square shift of every
-    parameter by each.
+    """Root mean square shift of each parameter by each effect that nobody stated:
+    causes, (c, p) shifts.
 
     covariance: (p, p) second moment of the shifts by all of them. bench: the same by
     those that the lens leaves behind
@@ -306,8 +306,8 @@ def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:
 
 
 def undetectable_effects(found: list[ScoreTest]) -> list[str]:
-    """Causes that are not fitted and cannot be told from what is, with what they would
-    be taken for.
+    """Unfitted effects that the frames cannot distinguish from fitted parameters, with
+    those parameters.
 
     Args:
         found: score tests.

@@ -220,13 +220,12 @@ def search_modes(
 
 
 def add_mirrored_starts(task: SearchTask, ends: list[FitSolution]) -> list[FitSolution]:
-    """The ends, and where their biases reversed lead: frames near focus look much alike
-    with a gradient of either sign.
-
-    Again from a new best.
+    """The modes, and fits started from their reversed bias gradients: near focus both
+    signs give similar frames.
 
     Args:
         task: model, frames, priors and arrangement of the search.
+        ends: fits of the modes so far.
     """
     for _ in range(_AGAIN):
         best = ends[0]

@@ -251,8 +251,8 @@ class LeftOut:
 def lit_part(
     model: ForwardModel, data: FitImages, x: Array, image: Array
 ) -> tuple[slice, slice]:
-    """Rows and columns beside which there is next to nothing of what the light of all
-    frames tells over its noise.
+    """Illuminated region of interest: rows and columns outside which all frames hold
+    little signal above noise.
 
     Args:
         model: the forward model.

@@ -392,9 +392,8 @@ def predicted_aside(
 
 
 def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
-    """(x, y) half-way between the two neighbours that lie farthest apart among field
-    angles (n, 2), and as far beyond
-    the outermost as half of its step from its neighbour; None where all are one.
+    """(x, y) middle of the widest gap between neighbouring field angles (n, 2), and
+    half a step beyond the outermost; None for one angle.
 
     Args:
         angle_rad: (n, 2) field angles, rad.

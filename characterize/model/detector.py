@@ -265,8 +265,8 @@ def gaussian_transfer(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Arr
 
 
 def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
-    """Transfer 2 J1(u) / u, u = pi f D, of an evenly lit disc, and its derivative by D:
-    -2 J2(u) / D.
+    """Transfer function 2 J1(u) / u, u = pi f D, of a uniform disc, and its derivative
+    by D: -2 J2(u) / D.
 
     Args:
         fy: cycles/um along y.
@@ -282,8 +282,8 @@ def disc_transfer(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Arra
 
 
 def ball_transfer(fy: Array, fx: Array, diameter_um: float) -> Array:
-    """Transfer 3 (sin u - u cos u) / u³, u = pi f D, of an evenly glowing ball seen in
-    projection.
+    """Transfer function 3 (sin u - u cos u) / u³, u = pi f D, of a uniformly
+    fluorescent bead in projection.
 
     Args:
         fy: cycles/um along y.

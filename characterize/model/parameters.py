@@ -62,14 +62,14 @@ class FitParameter:
 
     @property
     def unstated(self) -> float:
-        """Standard deviation that is reckoned with where nobody states it."""
+        """Prior standard deviation where nobody states the effect."""
         return self.plausible or self.sigma
 
 
 @dataclass(frozen=True, slots=True)
 class UnfittedEffect:
-    """What bench or mask may add that no parameter describes: never fitted, reckoned
-    with in the intervals.
+    """Effect of bench or mask without a fitted parameter; its prior widens the total
+    intervals.
 
     sigma: its size (standard deviation) where nobody states it; ``[[known]]`` with
     value 0 and a sigma states it.
@@ -415,8 +415,7 @@ def usual_parameters(names: Sequence[str], lens: Lens) -> list[FitParameter]:
 
 
 def type_b_sigma(name: str, lens: Lens) -> float:
-    """Standard deviation of a parameter, or of what none describes, that is reckoned
-    with where nobody states it.
+    """Type B standard deviation of a parameter or effect where nobody states it.
 
     Args:
         name: of a parameter, or of an unfitted effect.

@@ -44,8 +44,8 @@ def order_score(data: FitImages) -> float:
 
 
 def unexplained_share(nrmse: float, data: FitImages, background: float) -> float:
-    """Share of the light that a prediction misses beyond the noise of single pixels,
-    which is seen at dark places.
+    """Share of the light that a prediction misses beyond pixel noise, which dark places
+    estimate.
 
     Args:
         nrmse: normalised error of the prediction.

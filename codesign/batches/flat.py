@@ -88,8 +88,8 @@ def depth_um(
     margin: int = 0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """(n, y, x) depth of what is seen at every sample without the margin: of the sheet
-    that covers more of it.
+    """(n, y, x) depth of the visible surface at each sample without the margin: that of
+    the layer with more coverage.
 
     Args:
         frames: rendered frames of two layers or of one.

@@ -429,8 +429,8 @@ def run_calibrator(
     config: ExperimentConfig,
     sensor: Sensor,
 ) -> PersonCalibrator:
-    """How people are calibrated whom a run's network reads: by what people have in
-    common, if it tells the axis.
+    """Calibrator of gaze for a run: mixed-effects model where the network reads the
+    optic axis, else sphere and regressor.
 
     That is learned from ``config.people`` whom neither training nor the experiment
     shows, before the same stimuli, on

@@ -337,7 +337,7 @@ def lens_imager(
 
 
 def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
-    """Nearest and farthest surface that is seen, um.
+    """Depth of the nearest and the farthest visible surface, um.
 
     Args:
         views: rendered views of the scenes.

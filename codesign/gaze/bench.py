@@ -153,7 +153,8 @@ def looked_deg(test: PeopleFrames) -> Array:
 def learn_from_people(
     before: PeopleFrames, read: NetworkReadings
 ) -> shared.PopulationPrior:
-    """What the frames of other people tell of gaze, by which a person is calibrated.
+    """Population prior of gaze from the frames of other people, by which a person is
+    calibrated.
 
     Args:
         before: people who calibrated before.

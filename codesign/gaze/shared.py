@@ -110,7 +110,7 @@ def _again(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PopulationPrior:
-    """What a network's readings tell of gaze, over people.
+    """Mixed-effects prior of the map from network readings to gaze, over people.
 
     model: of the terms. middle, spread: (7,) of the readings over people, the unit of
     every term.
@@ -163,7 +163,7 @@ class MixedModelPerson:
 def learn_population(
     read: NetworkReadings, gaze_deg: Array, person: Array
 ) -> PopulationPrior:
-    """What readings of many people tell of gaze.
+    """Fit the mixed-effects prior of gaze to the readings of many people.
 
     Args:
         read: of n frames. gaze_deg: (n, 2) where was looked, across and down. person:

@@ -111,9 +111,7 @@ def depth_mm(vergence: Tensor) -> Tensor:
 
 
 class NeighbourMixer(nn.Module):
-    """What its neighbours tell of a window, added to what it tells itself: x +
-    mix(hardswish(depthwise(x))).
-    """
+    """Residual mixing of neighbouring windows: x + mix(hardswish(depthwise(x)))."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -128,8 +126,8 @@ class NeighbourMixer(nn.Module):
 
 
 class GlobalContext(nn.Module):
-    """What all windows together tell, added to each: x + give(hardswish(take(mean and
-    spread over the windows))).
+    """Residual global context: x + give(hardswish(take(mean and spread over the
+    windows))).
     """
 
     def __init__(self, channels: int) -> None:
@@ -222,8 +220,8 @@ class BlurBranch(nn.Module):
 
 
 class InformedBranch(BlurBranch):
-    """The branch that is told what a window shows: ``forward(frames, content) ->
-    (depth, features, axial)``.
+    """Blur branch conditioned on content: ``forward(frames, content) -> (depth,
+    features, axial)``.
 
     content: (batch, channels, y, x) of the whole frame, as the pupil's mask is decoded
     from. A power spectrum is that

@@ -73,8 +73,8 @@ def depth_loss(told: Tensor, vergence: Tensor) -> Tensor:
 
 
 def uncertainty_loss(found: Prediction, truth: Tensor) -> Tensor:
-    """The same of the slippage's errors as they are: trains the uncertainty alone; 0
-    for a network that tells none.
+    """Gaussian negative log likelihood with detached errors: trains the uncertainty
+    alone; 0 for a network without one.
 
     Args:
         truth: (batch, 3) slippage in units of its scale.
@@ -145,8 +145,8 @@ def pose_loss(
     axis_weight: float,
     point_weight: float,
 ) -> Tensor:
-    """Landmarks that lie in the image, and the optic axis; 0 for a network that tells
-    neither.
+    """Loss of the landmarks inside the image and of the optic axis; 0 for a network
+    without them.
 
     Args:
         axis: (batch, 3) unit vectors. points: (batch, points, 2) as a fraction of the

@@ -361,8 +361,8 @@ def fit_resolution(
 
 
 def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
-    """Networks alike in all stages, large to smallest: width, then depth, then kernel
-    and expansion are reduced.
+    """Architectures equal in all stages, from large to small: width, then depth, then
+    kernel and expansion.
 
     Args:
         space: architectures to choose from.

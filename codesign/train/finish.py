@@ -230,8 +230,8 @@ def _wide(answers: Predictions, reach: float | None) -> Tensor | None:
 def uncertainty_summary(
     name: str, answers: Predictions, seen: SensorFrames, reach: float | None
 ) -> dict[str, float]:
-    """What the network tells beside the slippage: coverage of its 90 % intervals, their
-    width, depth of windows.
+    """Coverage and width of the 90 % intervals of the slippage, and depth error of the
+    windows.
 
     Args:
         name: prefix of the keys. answers: of the network.

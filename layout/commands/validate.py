@@ -37,8 +37,8 @@ class FormatFinding:
 def validate_mask(
     path: str | Path, content: MaskLibrary | None = None
 ) -> list[FormatFinding]:
-    """All findings about a GDSII or OASIS file, told apart by its first bytes; an empty
-    list is a clean file.
+    """All findings about a GDSII or OASIS file, whose format its first bytes show; an
+    empty list is a clean file.
 
     content: what was read of it, where it was read already.
 

@@ -50,8 +50,8 @@ class OneSize:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TwoSizes:
-    """t by a table over both sizes, and the answers of a solver; a bias moves all
-    edges, so both sizes alike.
+    """t from a table over both sizes with solved sensitivities; a bias moves all edges,
+    and so both sizes.
 
     width_um, length_um: (kinds,). rates: (causes, kinds) of ln t.
     """

@@ -276,8 +276,8 @@ class Cell:
         return min(bare), max(coated)
 
     def widest_um(self, gap_um: float) -> float:
-        """The size at which neighbours are this far apart (0 where even the thinnest
-        are nearer).
+        """Largest size that leaves this gap between neighbours (0 where even the
+        thinnest leave less).
 
         Where a foot, a pedestal or a coat is wider than the size, it is less where that
         comes within a fiftieth of the

@@ -25,8 +25,8 @@ def estimate_neighbour_coupling(
     harmonics: int = 3,
     diagonal: bool = True,
 ) -> NeighbourRows:
-    """How far unlike neighbours change the pillars of this lens: blazed rows of its own
-    pillars, both polarisations.
+    """Coupling of non-identical neighbours in this lens: supercell RCWA of blazed rows
+    of its own pillars, both polarisations.
 
     A row of N pillars whose phases rise by 2 pi / N turns light by s = wavelength / (N
     pitch), as the lens does where

@@ -65,8 +65,8 @@ def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourCouplingLoss:
-    """What unlike neighbours leave of the light that pillars, taken one by one, bring
-    to the focus.
+    """Focus power lost to coupling between non-identical neighbours, against the
+    locally periodic approximation.
 
     share: of that power. error: estimate of its error. pillars: in the rows along the
     lattice that were solved; none:

@@ -44,7 +44,7 @@ class JudgedPsfs:
     def compute_psfs(
         self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any
     ) -> Tensor:
-        """The same through a window with other settings, its rays seen from beside."""
+        """The same PSFs through a window with other settings."""
         about: dict[str, Any] = {
             "wavelength_um": float(self.waves.wavelengths_um[0]),
             "shift_um": shift_um,
@@ -60,9 +60,9 @@ class JudgedPsfs:
 
 
 def transform_error(judged: JudgedPsfs) -> float:
-    """What the transform neglects: PSFs with the rays seen from their own width beside
-    the field point, against
-    themselves."""
+    """Error of the second-order transform: PSFs with rays recomputed at their own width
+    from the field point, against themselves.
+    """
     light = judged.shown.sum((-1, -2))
     wide = psf_width(judged.shown / light[..., None, None]) * judged.window.step_um
     return weigh_by_light(

@@ -257,7 +257,8 @@ def frame_maps(
 def correct_planes(
     field: PsfField, maps: list[Tensor], kernels: Tensor, weights: Tensor
 ) -> Tensor:
-    """(y, x, depths) factor of the light that images evenly lit planes rightly.
+    """(y, x, depths) flat-field factor by which uniformly illuminated planes stay
+    uniform.
 
     E ← E · (1 + h* · (wanted / found - 1)) at every depth node, where h is the mean PSF
     of the depth: as Landweber's iteration it does not amplify frequencies whose
@@ -287,7 +288,7 @@ def correct_planes(
 
 
 def plane_images(field: PsfField, maps: list[Tensor]) -> Tensor:
-    """(depths, y, x) images of evenly lit planes at the depth nodes, dark beyond.
+    """(depths, y, x) images of uniformly illuminated planes at the depth nodes.
 
     I(X) = Σ_ab Σ_x down(y, a) across(x, b) E_ab P_ab(X - x): both sums over x are
     products of matrices.

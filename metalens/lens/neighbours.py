@@ -19,7 +19,7 @@ _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NeighbourRows:
-    """Rows of a lens's own unlike pillars, each solved as one cell.
+    """Supercell responses of rows of non-identical pillars of a lens.
 
     sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
         diagonal of the lattice.
@@ -121,8 +121,8 @@ class NeighbourRows:
         return np.asarray(self.at(sine, math.pi / 8).mean(0))  # where sin² 2α is 1/2
 
     def share(self, sine: Array, weight: Array) -> float:
-        """Share of the power in the focus of pillars taken one by one that unlike
-        neighbours leave there.
+        """Share of the focus power that remains with coupled neighbours, over that of
+        the locally periodic approximation.
 
         Args:
             sine, weight: (m,) turned by, and share of the lens, of sum 1.

@@ -89,8 +89,8 @@ def window_um(
 
 
 def disc_um(lens: Lens | ApertureSummary) -> float:
-    """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2
-    digits.
+    """Radius of a defocused spot at which its depth can be resolved: 5.3 wavelength /
+    NA, 2 digits.
 
     Args:
         lens: the lens.
@@ -99,7 +99,8 @@ def disc_um(lens: Lens | ApertureSummary) -> float:
 
 
 def pixel_um(lens: Lens | ApertureSummary) -> float:
-    """Pixels that show most of what a spot tells: 0.88 wavelength / NA, 2 digits.
+    """Pixel pitch that samples most of the information of a spot: 0.88 wavelength / NA,
+    2 digits.
 
     Args:
         lens: the lens.

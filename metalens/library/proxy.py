@@ -36,8 +36,8 @@ def height_hint(height_um: float, turns: float) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proxy:
-    """Phase and |T| as polynomials of diameter, wavelength and angle, with the error
-    seen on held-out entries.
+    """Surrogate of t (Eq. 2): phase and |T| as polynomials of diameter, wavelength and
+    angle, with the error on held-out entries.
 
     phase_coefficients: ([angle degree + 1,] wavelength degree + 1, diameter degree + 1)
         Chebyshev coefficients of the phase in rad.

@@ -83,8 +83,8 @@ class QuadraticFit:
 def wide_axes(
     case: PropagationCase, tolerance: float
 ) -> tuple[WideAxis, WideAxis] | None:
-    """(y, x) grids for a window; None where its rays are too steep, or too unlike a
-    quadratic, for the method.
+    """(y, x) grids for a window; None where its rays are too steep or too far from
+    quadratic for the method.
 
     Args:
         case: geometry of the propagation.

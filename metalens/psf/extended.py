@@ -241,7 +241,7 @@ def shift_invariance_error(
     extent: Extent,
     probe: Callable[[PropagationCase], torch.Tensor],
 ) -> float:
-    """Relative L2 error of taking the PSF as alike over the source, at the nearest and
+    """Relative L2 error of a shift-invariant PSF over the source, at the nearest and
     the farthest depth.
 
     Args:

@@ -87,8 +87,8 @@ def _within(light: Array, distance_um: Array, radii_um: Array, step_um: float) -
 
 
 def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
-    """(…,) radius of the even disc whose light lies as far apart as that of (…, y, x):
-    by quarters along x and y.
+    """(…,) radius of the uniform disc with the spread of (…, y, x), by quartiles along
+    x and y.
 
     The middle half of a disc of radius b lies within 0.404 b of its middle along an
     axis.

@@ -22,7 +22,8 @@ LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of i
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A light-emitting diode seen by a silicon sensor.
+    """Light-emitting diode as a silicon sensor detects it: spectrum, filter and sensor
+    response.
 
     peak_nm, fwhm_nm: of the diode, a Gaussian line.
     silicon_um: thickness of silicon that collects charge; the response is 1 -
