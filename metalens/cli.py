@@ -149,7 +149,11 @@ _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit status."""
+    """Run one verb; returns the exit status.
+
+    Args:
+        arguments: words of the command line.
+    """
     _open_streams()
     try:
         status = _main(arguments)

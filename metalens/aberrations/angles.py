@@ -241,6 +241,10 @@ def vignetted_share(
     as even there, as PSFs take it.
 
     Accuracy: 1e-4, and that of sites at the rim of the lens.
+
+    Args:
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
     """
     if lens.layers.stop is None:
         return 0.0

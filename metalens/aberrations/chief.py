@@ -126,6 +126,11 @@ def _lost(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
 def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Array:
     """(2,) where the source of a field angle lies from the axis, in um; the tangents of
     collimated light.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
     """
     tangents: Array = np.tan(np.asarray(angle_rad, float))
     slope = float(np.hypot(*tangents))
@@ -155,6 +160,11 @@ def _arriving(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
 def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
     """(2,) where the ray through the middle of the stop meets the pillars; the middle
     of these without a stop.
+
+    Args:
+        lens: the lens.
+        source: place of the source, um.
+        depth_um: source depth from the lens, um.
     """
     stop, between = lens.layers.stop, lens.layers.from_stop(lens.wavelength_um)
     if stop is None:

@@ -212,7 +212,12 @@ def _rows(
 def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, float]:
     """Line image along x (0) or y (1) of waves on a plane (:meth:`Waves.at`), of sum 1
     where all light is in it, and
-    the step of its samples in um; it repeats beyond its ends."""
+    the step of its samples in um; it repeats beyond its ends.
+
+    Args:
+        field: sampled field or PSFs.
+        axis: 0: lines along y; 1: along x.
+    """
     along = field if axis == 0 else field.T
     count = scipy.fft.next_fast_len(2 * along.shape[1])
     line = (np.abs(scipy.fft.ifft(along, count, axis=1)) ** 2).sum(0) * (
@@ -224,6 +229,10 @@ def line_image(waves: FieldPlaneWaves, field: Array, axis: int) -> tuple[Array, 
 def sharpness_per_um(waves: FieldPlaneWaves, field: Array, axis: int) -> float:
     """∫ L² over (∫ L)² of the line image along an axis: one over how wide it is; a bar
     of width b gives 1 / b.
+
+    Args:
+        waves: plane waves behind the lens.
+        field: sampled field or PSFs.
     """
     line, step = line_image(waves, field, axis)
     return float((line**2).sum() / line.sum() ** 2 / step)
@@ -234,7 +243,13 @@ def line_mtf(
 ) -> Array:
     """(frequencies,) modulation transfer along an axis, of all light through the lens:
     its value just above frequency 0
-    is :attr:`Waves.held`."""
+    is :attr:`Waves.held`.
+
+    Args:
+        waves: plane waves behind the lens.
+        field: sampled field or PSFs.
+        frequencies_per_um: spatial frequencies, cycles per um.
+    """
     line, step = line_image(waves, field, axis)
     shifted = np.roll(line, len(line) // 2 - int(np.argmax(line)))
     x = (np.arange(len(line)) - len(line) // 2) * step

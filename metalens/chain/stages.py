@@ -114,6 +114,9 @@ def shipped_settings() -> ChainFiles:
 def load_chain(path: Path) -> ChainFiles:
     """Read CHAIN.toml.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         ConfigError: see :func:`metalens.core.config.load`; a settings file that is
             not there.
@@ -212,7 +215,11 @@ def _given(files: ChainFiles) -> Iterator[tuple[str, Path]]:
 
 
 def chain_stages(files: ChainFiles) -> Iterator[ChainStage]:
-    """The chain, in order."""
+    """The chain, in order.
+
+    Args:
+        files: settings files of the stages.
+    """
     yield from _making(files)
     if files.run:
         yield _codesign()

@@ -28,6 +28,11 @@ def run(
 ) -> int:
     """Sweep and write; exit 1 where most bars miss the tolerance, or a pair held out
     lies above its bar.
+
+    Args:
+        options: of the command line.
+        target: output file.
+        cell: unit cell of the lens.
     """
     from metalens.library import plots
 
@@ -47,7 +52,11 @@ def run(
 
 
 def library_failures(made: AxesLibrary) -> list[str]:
-    """What is wrong with a library, in words; nothing where it serves."""
+    """What is wrong with a library, in words; nothing where it serves.
+
+    Args:
+        made: what was designed or computed.
+    """
     found, share = [], float(made.usable.mean())
     if share < LEAST_USABLE:
         found.append(

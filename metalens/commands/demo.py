@@ -55,6 +55,9 @@ class Options(CommonOptions):
 def run(options: Options) -> int:
     """Run the chain; exit 0 when every stage passed its own check, else the status of
     the first that did not.
+
+    Args:
+        options: of the command line.
     """
     if options.aperture_mm is not None and not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")

@@ -229,6 +229,9 @@ class Options(CommonOptions):
 def run(options: Options) -> int:
     """Design the lens, check its focus, write it; exit 1 where light does not focus as
     it should or the pillars' own errors are large.
+
+    Args:
+        options: of the command line.
     """
     wanted = config.load(options.config, DesignSettings, empty=False)
     folder, target = options.config.parent, options.output

@@ -33,7 +33,11 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Write the file; exit 0."""
+    """Write the file; exit 0.
+
+    Args:
+        options: of the command line.
+    """
     export.check_export_format(options.output)
     if (
         options.samples != Options.samples

@@ -60,6 +60,9 @@ class FarFieldRequest:
 def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
     """Of the options of ``metalens psf``.
 
+    Args:
+        made: what was designed or computed.
+
     Raises:
         ConfigError: an option that says nothing of a far field, or more than one depth
             or wavelength.
@@ -105,6 +108,11 @@ def compute_far_fields(
 ) -> list["FarField"]:
     """One far field a direction of incidence; of pillars of two sizes the light along x
     that the lens is for.
+
+    Args:
+        made: what was designed or computed.
+        wanted: what the command asks for.
+        console: of the command.
     """
     directions = console.track(
         wanted.angles_deg, total=len(wanted.angles_deg), label="directions"
@@ -131,6 +139,12 @@ def save_far_fields(
 ) -> None:
     """The file of kind ``far-field``, its picture beside it, and with ``page`` its
     report.
+
+    Args:
+        path: file to read or write.
+        wanted: what the command asks for.
+        found: what was computed.
+        inputs: SHA-256 of each input file.
     """
     arrays = {
         "share": np.stack([one.share for one in found]).astype(np.float32),
@@ -170,7 +184,12 @@ def save_far_fields(
 def far_field_values(
     wanted: FarFieldRequest, found: list["FarField"]
 ) -> dict[str, Any]:
-    """Numbers for programs."""
+    """Numbers for programs.
+
+    Args:
+        wanted: what the command asks for.
+        found: what was computed.
+    """
     fields = []
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
         beams = [
@@ -201,7 +220,13 @@ def far_field_values(
 def far_field_text(
     target: Path, wanted: FarFieldRequest, found: list["FarField"]
 ) -> str:
-    """Lines for people."""
+    """Lines for people.
+
+    Args:
+        target: output file.
+        wanted: what the command asks for.
+        found: what was computed.
+    """
     source = (
         "plane waves"
         if math.isinf(wanted.source_mm)
@@ -258,6 +283,10 @@ def _cone(one: "FarField", part: float) -> float | None:
 def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes:
     """Light over direction cosines on a logarithmic scale (above), and within cones
     about the axis (below).
+
+    Args:
+        wanted: what the command asks for.
+        found: what was computed.
     """
     from matplotlib.colors import LogNorm
 

@@ -166,6 +166,9 @@ def near_field_request(options: Options) -> NearFieldRequest:
 def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where an error estimate stays above the tolerance
     that is stated, or above 0.5.
+
+    Args:
+        options: of the command line.
     """
     wanted = near_field_request(options)
     with options.claim(options.output, beside=(".png",)) as draft:
@@ -220,7 +223,11 @@ def _largest(one: NearField) -> float:
 
 
 def field_magnitude(field: Array) -> Array:
-    """(…) |E| = sqrt(|Ex|² + |Ey|² + |Ez|²) of (3, …)."""
+    """(…) |E| = sqrt(|Ex|² + |Ey|² + |Ez|²) of (3, …).
+
+    Args:
+        field: sampled field or PSFs.
+    """
     return np.asarray(np.sqrt((np.abs(field) ** 2).sum(axis=0)))
 
 
@@ -229,6 +236,12 @@ def save_near_field(
 ) -> None:
     """The file of kind ``near-field``: E and H (3, rows, columns) of the cuts, (3,
     height, y, x) of the maps.
+
+    Args:
+        path: file to read or write.
+        wanted: what the command asks for.
+        found: what was computed.
+        inputs: SHA-256 of each input file.
     """
     xz, yz, xy = found
     arrays: dict[str, Array] = {
@@ -257,6 +270,10 @@ def save_near_field(
 def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> bytes:
     """|E| on both cuts (light goes upwards) and on the maps, with the boundaries of the
     materials.
+
+    Args:
+        wanted: what the command asks for.
+        found: what was computed.
     """
     cuts, maps = found[:2], found[2]
     columns = max(2, len(wanted.heights_um))

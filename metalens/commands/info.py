@@ -41,7 +41,11 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Print what the file holds; exit 0."""
+    """Print what the file holds; exit 0.
+
+    Args:
+        options: of the command line.
+    """
     if options.file.is_dir():
         told = folder_manifest(options.file)
         options.console.result(told, _folder_text(told))
@@ -90,6 +94,9 @@ def manifest_entry(path: Path) -> dict[str, Any] | None:
     """A file that is no HDF5, as the manifest of its folder lists it: command and
     versions; None where none does.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         StoreError: it is not as it was written.
     """
@@ -120,6 +127,9 @@ def _member_text(told: dict[str, Any]) -> str:
 
 def folder_manifest(path: Path) -> dict[str, Any]:
     """The manifest of a folder, after its files were compared with it.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: no manifest, unfinished, or a file that is missing or differs.
@@ -153,6 +163,9 @@ def _folder_text(told: dict[str, Any]) -> str:
 def safetensors_head(path: Path) -> dict[str, Any]:
     """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of
     its length, then JSON).
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: missing, cut short, or no such file.
@@ -249,6 +262,9 @@ def _short(value: object) -> str:
 def text_sketch(array: Array, *, columns: int = 48) -> list[str]:
     """Lines of characters that show a (…, y, x) array, its first image, darkest for the
     largest value.
+
+    Args:
+        columns: panels or characters along a row.
     """
     image = np.asarray(array.reshape(-1, *array.shape[-2:])[0], float)
     rows = max(1, round(columns * image.shape[0] / image.shape[1] / 2))

@@ -80,6 +80,9 @@ class Options(DistributedOptions):
 def run(options: Options) -> int:
     """Sweep, fit, write; exit 1 where an error bar misses the tolerance that is stated
     or no full turn is covered.
+
+    Args:
+        options: of the command line.
     """
     if options.cell is not None:
         return _import_table(options, options.cell)

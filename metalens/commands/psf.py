@@ -132,6 +132,9 @@ class Options(CommonOptions):
 def run(options: Options) -> int:
     """Compute, write, draw; exit 1 where the error estimate stays above the tolerance,
     pillars are hardly known, or a window holds hardly any of the light.
+
+    Args:
+        options: of the command line.
     """
     if options.far_field:
         return _far(options)

@@ -310,6 +310,9 @@ def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
     """Settings of a file (None: those of the record) with what was given on the command
     line in their place.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         ConfigError: as :func:`metalens.core.config.load`.
     """

@@ -47,7 +47,11 @@ class Computed:
 
 
 def tolerance_excess(stack: psf.PsfStack) -> str:
-    """That the computed error is above the tolerance, and its cure; else empty."""
+    """That the computed error is above the tolerance, and its cure; else empty.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     if stack.converged:
         return ""
     error = _budget(stack).computed
@@ -55,7 +59,11 @@ def tolerance_excess(stack: psf.PsfStack) -> str:
 
 
 def dark_window(found: Computed) -> str:
-    """That windows hold hardly any light, and where the rays meet; else empty."""
+    """That windows hold hardly any light, and where the rays meet; else empty.
+
+    Args:
+        found: what was computed.
+    """
     missed = [one for one in found.figures if not one.window_share >= DARK]
     if not missed:
         return ""
@@ -71,7 +79,12 @@ def dark_window(found: Computed) -> str:
 
 
 def psf_text(target: Path, found: Computed) -> str:
-    """Lines for people."""
+    """Lines for people.
+
+    Args:
+        target: output file.
+        found: what was computed.
+    """
     stack = found.stack
     counts = (
         ("angle", stack.angles_rad),
@@ -124,7 +137,11 @@ def _depth(depth_um: float) -> str:
 
 
 def psf_numbers(found: Computed) -> dict[str, Any]:
-    """Numbers for programs; None for what JSON does not know."""
+    """Numbers for programs; None for what JSON does not know.
+
+    Args:
+        found: what was computed.
+    """
     stack = found.stack
     values: dict[str, Any] = {
         "error": stack.error,
@@ -163,7 +180,11 @@ def _budget(stack: psf.PsfStack) -> psf.Budget:
 
 
 def key_figures(found: Computed) -> list[KeyFigure]:
-    """What was computed, how well, and what the focus is worth."""
+    """What was computed, how well, and what the focus is worth.
+
+    Args:
+        found: what was computed.
+    """
     stack, budget, best = found.stack, _budget(found.stack), found.figures[0]
     shape = len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)
     figures = [
@@ -184,7 +205,11 @@ def key_figures(found: Computed) -> list[KeyFigure]:
 
 
 def psf_sections(found: Computed, pictures: dict[str, bytes]) -> list[Section]:
-    """Of the report; pictures by their captions."""
+    """Of the report; pictures by their captions.
+
+    Args:
+        found: what was computed.
+    """
     stack = found.stack
     figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]
     focus = Table(

@@ -42,7 +42,11 @@ class Options(DistributedOptions):
 
 
 def run(options: Options) -> int:
-    """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
+    """Compare the cells; exit 1 where none covers a full turn at all wavelengths.
+
+    Args:
+        options: of the command line.
+    """
     study = (
         CellStudy()
         if options.config is None

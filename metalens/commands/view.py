@@ -57,7 +57,11 @@ class Options(CommonOptions):
 
 
 def run(options: Options) -> int:
-    """Write the page; exit 0."""
+    """Write the page; exit 0.
+
+    Args:
+        options: of the command line.
+    """
     target = options.output or _beside(options.file)
     with options.claim(target) as draft:
         title, panels = _shown(options.file)
@@ -91,6 +95,9 @@ def _shown(path: Path) -> tuple[str, list[Panel]]:
 
 def kind_of(path: Path) -> str:
     """What an artefact is: a kind of HDF5 file, ``mask``, ``run`` or ``capture``.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         ConfigError: a folder of none of these kinds; what can be shown of it is named.

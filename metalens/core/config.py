@@ -43,6 +43,7 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
     tables).
 
     Args:
+        path: file to read or write.
         empty: whether a file without a word stands for the defaults; long work refuses
             it.
 
@@ -62,6 +63,9 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
 
 def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str, Any]:
     """The tables of a TOML file that is to become ``record``.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         ConfigError: missing file, not text, or not TOML; empty where that is no answer.
@@ -100,14 +104,23 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
 
 
 def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
-    """As :func:`load`, from TOML text; ``where`` names it in errors."""
+    """As :func:`load`, from TOML text; ``where`` names it in errors.
+
+    Args:
+        record: dataclass that is filled.
+    """
     return from_table(_parsed(text, where), record, where=where)
 
 
 def from_table(
     table: dict[str, Any], record: type[Record], *, where: str = "config"
 ) -> Record:
-    """As :func:`load`, from a table that is already parsed (or merged from several)."""
+    """As :func:`load`, from a table that is already parsed (or merged from several).
+
+    Args:
+        record: dataclass that is filled.
+        where: file or place that errors name.
+    """
     return typing.cast(Record, _build(table, record, where, ""))
 
 

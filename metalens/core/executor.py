@@ -77,6 +77,7 @@ def run_parallel(
     """(index, result) of every task as it is done.
 
     Args:
+        tasks: what is computed in parallel.
         work: a function of a module (workers import it by name).
         processes: where :func:`run_on` says nothing; by default one a core.
 

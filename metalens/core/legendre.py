@@ -46,6 +46,9 @@ def interpolation_matrix(count: int, t: Array) -> Array:
 def to_nodes(count: int) -> Array:
     """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in
     the modes.
+
+    Args:
+        count: how many.
     """
     t, w = gauss_legendre_nodes(count)
     return legendre_values(count, t).T * w

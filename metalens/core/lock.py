@@ -79,7 +79,11 @@ def exchange_names(one: Path, other: Path) -> bool:
 
 
 def is_free(path: Path) -> bool:
-    """Whether no living process holds a lock on a file."""
+    """Whether no living process holds a lock on a file.
+
+    Args:
+        path: file to read or write.
+    """
     try:
         handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except OSError:

@@ -168,6 +168,9 @@ def foreign_reason(path: Path) -> str:
 
     A folder is ours with a manifest and no file beyond those that it lists; a file by
     its kind or mark.
+
+    Args:
+        path: file to read or write.
     """
     if path.is_dir():
         return _foreign_folder(path)
@@ -190,6 +193,9 @@ def open_journal(path: Path, title: str) -> list[str]:
     work's is begun afresh.
 
     title: one line of JSON, a text or a list, that begins with the version.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: a file that is no journal stands there.

@@ -40,6 +40,9 @@ def remember_inputs() -> Iterator[None]:
 def decode_text(content: bytes) -> str:
     """Text of UTF-8, or of UTF-16 with its byte-order mark (as spreadsheets save it).
 
+    Args:
+        content: bytes of the file.
+
     Raises:
         UnicodeDecodeError: neither of them.
     """
@@ -52,7 +55,11 @@ def decode_text(content: bytes) -> str:
 
 
 def read_text(path: str | Path) -> str:
-    """Text of a file, by :func:`decode_text`."""
+    """Text of a file, by :func:`decode_text`.
+
+    Args:
+        path: file to read or write.
+    """
     return decode_text(Path(path).read_bytes())
 
 
@@ -85,6 +92,9 @@ def file_stamp(path: str | Path) -> Stamp:
     all that lies in it.
 
     () where there is none.
+
+    Args:
+        path: file to read or write.
     """
     try:
         inside = (
@@ -104,6 +114,10 @@ def file_stamp(path: str | Path) -> Stamp:
 def check_same(path: str | Path, before: Stamp) -> None:
     """Refuse an input that is no longer what it was.
 
+    Args:
+        path: file to read or write.
+        before: size and time of the file when it was opened.
+
     Raises:
         StoreError: naming it.
     """
@@ -116,6 +130,9 @@ def check_same(path: str | Path, before: Stamp) -> None:
 @contextlib.contextmanager
 def refuse_changes(path: str | Path) -> Iterator[None]:
     """Refuse an input that another program writes to while the block reads it.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: see :func:`check_same`, in place of what the block made of such an
@@ -134,6 +151,10 @@ def refuse_changes(path: str | Path) -> Iterator[None]:
 def note_input(path: str | Path, before: Stamp, content: bytes | None = None) -> None:
     """Note what an input was when this command first read it; with its content, its
     hash too.
+
+    Args:
+        path: file to read or write.
+        before: size and time of the file when it was opened.
     """
     if (noted := _noted.get()) is not None:
         noted.setdefault(
@@ -144,6 +165,9 @@ def note_input(path: str | Path, before: Stamp, content: bytes | None = None) ->
 
 def sha256(path: str | Path) -> str:
     """Hexadecimal SHA-256 of an input as this command has read it.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: it was replaced since; OSError: it cannot be read.
@@ -250,6 +274,9 @@ def _check_types(record: Any) -> None:
 def read_hdf5(path: str | Path, read: Callable[[Any], Made]) -> Made:
     """What ``read`` makes of an open HDF5 file.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         StoreError: no plain file, or it was replaced meanwhile. What ``read`` raises.
     """
@@ -301,7 +328,11 @@ _FOREIGN = {  # first bytes of what is often given in place of an artefact, in w
 
 
 def foreign_format(path: str | Path) -> str:
-    """What a file is that begins as another program's, in words; empty for any other."""
+    """What a file is that begins as another program's, in words; empty for any other.
+
+    Args:
+        path: file to read or write.
+    """
     start = b""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         start = file.read(8)

@@ -206,6 +206,9 @@ def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
 
     Two pixels of the file stand for one of the page: sharp on dense screens and on
     paper.
+
+    Args:
+        dpi: dots per inch.
     """
     from matplotlib import pyplot
 
@@ -228,7 +231,13 @@ def make_figure(
     size: tuple[float, float] = (8.0, 3.4),
     **options: Any,
 ) -> Any:
-    """(figure, axes) of matplotlib in the look of the reports, drawn without a display."""
+    """(figure, axes) of matplotlib in the look of the reports, drawn without a display.
+
+    Args:
+        rows: panels along a column.
+        columns: panels or characters along a row.
+        size: width and height, inches.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -265,6 +274,9 @@ def write_report(
 ) -> None:
     """Write the page: title, one lead paragraph, key figures, then the sections with a
     contents list.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         OSError: the target cannot be written.
@@ -343,6 +355,9 @@ def _list_text(value: Any) -> str:
 def flush_output(text: str = "") -> None:
     """Write to standard output and flush it; a reader that went away (``| head``) is no
     failure of the work.
+
+    Args:
+        text: what is printed.
 
     Raises:
         OutputError: it cannot be written otherwise, as to a full disk.

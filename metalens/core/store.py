@@ -75,7 +75,11 @@ def package_versions() -> Iterator[tuple[str, str]]:
 
 
 def sha256(path: str | Path) -> str:
-    """Hexadecimal SHA-256 of a file's bytes."""
+    """Hexadecimal SHA-256 of a file's bytes.
+
+    Args:
+        path: file to read or write.
+    """
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -119,7 +123,11 @@ def _part(path: Path) -> tuple[int, Path]:
 
 
 def clear_scratch(path: Path) -> None:
-    """Remove scratch files of writers that are gone."""
+    """Remove scratch files of writers that are gone.
+
+    Args:
+        path: file to read or write.
+    """
     start, end = f".{path.name}.", ".part"
     for entry in os.scandir(path.parent):
         if (
@@ -138,12 +146,21 @@ def _umask() -> int:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) whole or not at all."""
+    """Write a text file (UTF-8) whole or not at all.
+
+    Args:
+        path: file to read or write.
+    """
     write_bytes(path, reading.to_valid_utf8(text).encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a file whole or not at all.
+
+    Args:
+        path: file to read or write.
+        content: bytes of the file.
+    """
     with replace_atomically(path) as part, open(part, "wb") as file:
         file.write(content)
 
@@ -154,6 +171,9 @@ def append_line(path: Path, line: str) -> None:
 
     Writers at the same time wait for each other: what one of them has half written is
     no line that was cut short.
+
+    Args:
+        path: file to read or write.
     """
     with open(path, "ab+") as file:
         with contextlib.suppress(OSError):  # a file system without locks
@@ -169,6 +189,9 @@ def append_line(path: Path, line: str) -> None:
 def whole_lines(path: Path) -> list[str]:
     """Lines of a journal; the last one is left out where it was cut short. None without
     a file.
+
+    Args:
+        path: file to read or write.
     """
     if not path.is_file():
         return []
@@ -189,6 +212,7 @@ def save(
     gives the same bytes.
 
     Args:
+        attributes: of the file.
         path: target, replaced atomically.
         arrays: by name; ``a/b`` makes group ``a``.
         compress: gzip level 1 with byte shuffle for arrays above 64 KiB.
@@ -219,6 +243,7 @@ def load(
     """Read an artefact and check its header.
 
     Args:
+        path: file to read or write.
         kind: the kind that is needed; None takes any (``metalens info``).
         without: arrays that are left in the file.
 
@@ -253,7 +278,11 @@ def load(
 
 
 def kind_of(path: str | Path) -> str:
-    """The kind that an artefact file says it is; '' for any other file."""
+    """The kind that an artefact file says it is; '' for any other file.
+
+    Args:
+        path: file to read or write.
+    """
     try:
         found, units = reading.read_hdf5(
             path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")]
@@ -325,6 +354,10 @@ def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
     """Refuse a data set of no values, of more than its bytes in the file can hold, or
     that lies in other files.
+
+    Args:
+        path: file to read or write.
+        name: of the item.
 
     Raises:
         StoreError: naming what it claims and what is there.

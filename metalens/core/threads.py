@@ -37,6 +37,9 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     interrupt or the first failure stops the others at their next :func:`run_split`, and
     is
     raised when they have ended.
+
+    Args:
+        items: what is computed one by one.
     """
     items = list(items)
     count = min(thread_count(), len(items), _MOST)
@@ -93,6 +96,9 @@ def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:
     Together they would wait for each other at every call. ``work`` may carry no
     derivatives: what torch knows of them
     is of the calling thread.
+
+    Args:
+        count: how many.
     """
     torch = sys.modules["torch"]
     own = int(torch.get_num_threads())

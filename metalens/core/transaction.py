@@ -165,7 +165,11 @@ def claim_long_work(
 
 
 def unfinished_path(target: Path) -> Path:
-    """Where the work on a folder is done until it is finished."""
+    """Where the work on a folder is done until it is finished.
+
+    Args:
+        target: output file.
+    """
     target = _followed(target)
     return target.with_name(target.name + UNFINISHED)
 

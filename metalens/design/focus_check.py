@@ -149,6 +149,9 @@ def focus_figures(lens: Lens) -> FocusMetrics:
     meet: films, stop, losses of the pillars and solved neighbours are in it. Spots
     wider
     than the window of 8 wavelength / NA get one of four times the width.
+
+    Args:
+        lens: the lens.
     """
     meets = lens_meeting_um(lens)
     offset = (0.0, 0.0) if meets is None else (meets[0], meets[1])

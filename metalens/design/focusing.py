@@ -33,6 +33,11 @@ def has_focus(
 
     An axicon, a hologram and a plain vortex scatter their rays, a vortex in a focus
     leaves the middle of its ring dark.
+
+    Args:
+        phase: function of x and y, um, to phase, rad.
+        radius_um: radius of the aperture, um.
+        pitch_um: lattice constant, um.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
     if inside.sum() < RAYS:
@@ -109,6 +114,12 @@ def meeting_um(
     their means. Behind films: their middle on the sensor. None where they
     spread there as widely as on the lens (:data:`SPREAD`), or never meet in front of
     the lens.
+
+    Args:
+        phase: function of x and y, um, to phase, rad.
+        focus: source and sensor distances of the design.
+        radius_um: radius of the aperture, um.
+        pitch_um: lattice constant, um.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
     if inside.sum() < RAYS:
@@ -171,6 +182,10 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
     taken out: at most 60 degrees. Behind a stop it ends where the light of less than
     half the pillars of angle 0 is
     left, whatever the rest does.
+
+    Args:
+        focus: source and sensor distances of the design.
+        radius_um: radius of the aperture, um.
     """
     low, high = 0.0, np.pi / 3
     for _ in range(40):

@@ -56,6 +56,9 @@ def read_arrays_in_subprocess(
 ) -> dict[str, Array]:
     """Numeric arrays of a MATLAB file (4 to 7.3), or of an NPZ file of NumPy, by name.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         StoreError: no such file, damaged, or more than the child may take.
     """

@@ -82,6 +82,9 @@ def solve_coupling_rows(lens: Lens, *, radius_um: float) -> NeighbourRows:
     """Rows of the lens's own pillars with the zones of its rim and longer ones, for the
     lens to hold.
 
+    Args:
+        radius_um: radius of the aperture, um.
+
     Raises:
         CellError: the cell has films or tilted walls, or no round pillars on a square
             lattice.
@@ -98,6 +101,9 @@ def neighbour_coupling_loss(lens: Lens, *, radius_um: float) -> NeighbourCouplin
     Accuracy: the error is what another truncation, and leaving out any one row, change,
     and a fifth of the loss for
         zones that get shorter from one to the next, which no row has.
+
+    Args:
+        radius_um: radius of the aperture, um.
 
     Raises:
         CellError: as :func:`solve_coupling_rows`.
@@ -124,6 +130,10 @@ def estimate_neighbour_coupling_loss(
     (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
 
     Where that cell gains a little, these pillars may lose as much.
+
+    Args:
+        lens: the lens.
+        radius_um: radius of the aperture, um.
     """
     sine, weight = _rings(lens, radius_um)
     a, b = NEIGHBOURS
@@ -134,6 +144,9 @@ def estimate_neighbour_coupling_loss(
 def power_error(lens: Lens) -> float:
     """Relative error of the power behind the pillars: that of |T|² by their curve, and
     what neighbours take beyond the solved rows (rough where none is solved).
+
+    Args:
+        lens: the lens.
     """
     pillars = (
         lens.proxy.error(lens.wavelength_um)
@@ -173,6 +186,10 @@ def angle_change(lens: Lens, incidence_rad: float) -> float:
     polarisations.
 
     A factor that all pillars share is taken out: it changes no PSF of sum 1.
+
+    Args:
+        lens: the lens.
+        incidence_rad: angle of incidence in air, rad.
     """
     low, high = drawn_diameter_range(lens)
     diameters = np.linspace(low, high, DIAMETERS)

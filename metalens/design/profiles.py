@@ -171,6 +171,7 @@ def hyperbolic_phase(x_um: Array, y_um: Array, focus: Focus) -> Array:
     sides).
 
     Args:
+        focus: source and sensor distances of the design.
         x_um, y_um: positions that broadcast to (y, x).
 
     Returns:
@@ -186,6 +187,13 @@ def double_helix_phase(
 ) -> Array:
     """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes
     that turn with depth.
+
+    Args:
+        x_um: places along x, um.
+        y_um: places along y, um.
+        focus: source and sensor distances of the design.
+        shape: (y, x) samples.
+        radius_um: radius of the aperture, um.
     """
     fraction = np.hypot(x_um, y_um) / radius_um
     ring = np.clip(
@@ -199,7 +207,15 @@ def double_helix_phase(
 def cubic_phase(
     x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float
 ) -> Array:
-    """Hyperbolic phase plus :class:`Cubic`."""
+    """Hyperbolic phase plus :class:`Cubic`.
+
+    Args:
+        x_um: places along x, um.
+        y_um: places along y, um.
+        focus: source and sensor distances of the design.
+        shape: (y, x) samples.
+        radius_um: radius of the aperture, um.
+    """
     x, y = x_um / radius_um, y_um / radius_um
     return np.asarray(
         hyperbolic_phase(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)

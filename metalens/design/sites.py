@@ -107,6 +107,9 @@ def lattice_sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> LatticeS
     grid_nm: of the mask: rows of a hexagonal lattice are sqrt(3)/2 pitches apart,
     rounded to it.
 
+    Args:
+        aperture_um: diameter of the aperture, um.
+
     Raises:
         LensError: the aperture holds no pillar.
     """
@@ -139,5 +142,8 @@ def least_period_um(cell: Cell) -> float:
 
     The shortest reciprocal vector is 2 pi / this: the pitch on a square lattice,
     sqrt(3)/2 of it on a hexagonal one.
+
+    Args:
+        cell: unit cell of the lens.
     """
     return cell.pitch_um / cell.lattice.least_order

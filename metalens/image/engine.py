@@ -55,6 +55,7 @@ def imager(
     """Prepare a lens for frames of a grid.
 
     Args:
+        scene_grid: samples, step, depths and margin of the image.
         lens: a lens file's content, or a wave (:class:`SmoothWave`,
             :class:`PillarWave`).
         spectrum: a diode, curves as measured
@@ -187,6 +188,11 @@ def node_psfs(
 ) -> tuple[Tensor, Tensor]:
     """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in
     the wave's factor.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        plan: field nodes, depths and wavelengths.
+        device: torch device.
     """
     if plan.folds:
         light = _folded(optics, plan, device)
@@ -201,6 +207,10 @@ def node_psfs(
 def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes'
     windows.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        plan: field nodes, depths and wavelengths.
     """
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
     y, x = torch.meshgrid(plan.y_um.to(plan.x_um), plan.x_um, indexing="ij")
@@ -249,6 +259,9 @@ def kernel_errors(made: Imager) -> dict[str, float]:
 
     Of a textured scene, at places drawn at random, and of planes that are evenly lit,
     root mean square at the worst depth; depths are the nodes and those half-way.
+
+    Args:
+        made: what was designed or computed.
     """
     near, far = made.light.vergence
     count = 2 * len(made.plan.depths_um) - 1
@@ -282,6 +295,9 @@ def _pixels(made: Imager, count: int) -> Tensor:
 def textured_frames(grid: Grid) -> Frames:
     """One frame of two sheets over all depths, of mean 1 with a 1/f texture of standard
     deviation 0.3.
+
+    Args:
+        grid: samples, step, depths and margin of the image.
     """
     draw = torch.Generator().manual_seed(11)
     y, x = (n + 2 * grid.margin for n in grid.samples)
@@ -413,7 +429,13 @@ def _ripples(
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) light that the kernels give sources at (n, [row, column])."""
+    """(n, depths, h, w) light that the kernels give sources at (n, [row, column]).
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        pixels: places of the samples.
+        depths_um: source depths from the lens, um.
+    """
     high, wide = optics.grid.frame
     where = (pixels[:, 0] * wide + pixels[:, 1]).to(optics.stack.device)
     out = []
@@ -425,7 +447,13 @@ def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
 
 
 def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) light that the splines through the nodes' PSFs give there."""
+    """(n, depths, h, w) light that the splines through the nodes' PSFs give there.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        pixels: places of the samples.
+        depths_um: source depths from the lens, um.
+    """
     field = optics.field
     maps = frame_maps(optics.grid.frame, psf_nodes(field), field.psf)
     rows, columns = (
@@ -439,7 +467,11 @@ def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
 
 
 def crop_image(whole: Tensor, grid: Grid) -> Tensor:
-    """(…, y, x) samples of an image of the whole frame, without margin and spare."""
+    """(…, y, x) samples of an image of the whole frame, without margin and spare.
+
+    Args:
+        grid: samples, step, depths and margin of the image.
+    """
     edge = grid.margin + grid.spare
     y, x = (slice(edge, edge + n) for n in grid.samples)
     return whole[..., y, x]

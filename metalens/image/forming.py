@@ -176,6 +176,8 @@ def build_imager(
     """Factor the PSFs of a plan's nodes for frames of a grid.
 
     Args:
+        stack: PSFs over angle, depth and wavelength.
+        energy: light on each field node.
         tolerance: of the whole image; kernels take their share of it.
     """
     found = PsfField(stack, energy, plan.depths_um)
@@ -191,6 +193,10 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     need an imager of their own. The gradient does not: it is that of the image through
     the PSFs of all nodes (:func:`metalens.image.slopes.by_nodes`), whatever the kernels
     lack.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        energy: light on each field node.
     """
     found = PsfField(stack, energy, optics.plan.depths_um)
     made = _assembled(optics.grid, optics.plan, found, optics.basis, optics.parts)

@@ -35,6 +35,9 @@ def span_angle(fisher: Tensor) -> Tensor:
     [0, pi].
 
     From atan2, so that it is exact near 0 and pi; 0 where a field vanishes.
+
+    Args:
+        fisher: (..., n, n) Fisher matrix.
     """
     f11, f22, f12 = fisher[..., 0, 0], fisher[..., 1, 1], fisher[..., 0, 1]
     across = torch.sqrt((f11 * f22 - f12**2).clamp_min(torch.finfo(fisher.dtype).tiny))
@@ -104,6 +107,9 @@ def encircled_energy(
     Samples cut by the circle count in part. Give intensities as shares of the light
     through the aperture to get
     the absolute encircled energy; dividing by the window's own sum flatters a wide PSF.
+
+    Args:
+        sample_um: step of the samples, um.
     """
     y, x = (
         torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in intensity.shape[-2:]
@@ -126,6 +132,8 @@ def pixel_information(
     - P(z)) / dz)², per mm².
 
     Args:
+        pixel_um: pixel pitch, um.
+        shift_um: displacement along x and y, um.
         near, far: (..., y, x) intensities at z and at z + ``step_um``, sampled every
             ``sample_um``.
         normalisation: of every depth's pixels: by their sum, by their Euclidean norm,
@@ -163,6 +171,8 @@ def axial_information(
     count.
 
     Args:
+        sample_um: step of the samples, um.
+        pixel_um: pixel pitch, um.
         near, far: (..., y, x) intensities at z and z + ``step_um``, sampled at least
             three times a pixel.
 
@@ -229,6 +239,9 @@ def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
 
     Nuisance directions that the image does not show at all are left out
     (pseudo-inverse).
+
+    Args:
+        fisher: (..., n, n) Fisher matrix.
     """
     a, b, c = (
         fisher[:wanted, :wanted],

@@ -62,6 +62,9 @@ class JudgedPsfs:
 def transform_error(judged: JudgedPsfs) -> float:
     """Error of the second-order transform: PSFs with rays recomputed at their own width
     from the field point, against themselves.
+
+    Args:
+        judged: PSFs by which the error is judged.
     """
     light = judged.shown.sum((-1, -2))
     wide = psf_width(judged.shown / light[..., None, None]) * judged.window.step_um
@@ -76,7 +79,11 @@ def transform_error(judged: JudgedPsfs) -> float:
 def folding_error(judged: JudgedPsfs) -> float:
     """What the transform folds back from beyond the period of the nodes: PSFs, with
     their light, against those of twice
-    the period."""
+    the period.
+
+    Args:
+        judged: PSFs by which the error is judged.
+    """
     want = judged.compute_psfs(period=2 * judged.window.period)
     return weigh_by_light(texture_error(judged.shown, want), want.sum((-1, -2)))
 
@@ -86,7 +93,11 @@ def choose_polarisation(
 ) -> Window:
     """The window with one scalar where that images within the first tolerance
     (``auto``), else with as few components
-    of the fields of both polarisations as image within the second."""
+    of the fields of both polarisations as image within the second.
+
+    Args:
+        judged: PSFs by which the error is judged.
+    """
     judged = replace(
         judged, window=replace(judged.window, flux=polarisation != "vector")
     )
@@ -107,7 +118,11 @@ def choose_polarisation(
 def polarisation_error(judged: JudgedPsfs, whole: Tensor | None = None) -> float:
     """What the components of the field that a window leaves out change: PSFs of sum 1
     against those of all components
-    (``whole``, where they are known)."""
+    (``whole``, where they are known).
+
+    Args:
+        judged: PSFs by which the error is judged.
+    """
     window = judged.window
     if window.components == window.whole:
         return 0.0
@@ -142,7 +157,12 @@ def gathering_error(
     """What gathering pillars over cells changes: PSFs of sum 1 at (field points,
     depths) against those of every pillar,
     to the same samples; 0 of a wave that is no lens of pillars. Light of other orders
-    in the window is in it."""
+    in the window is in it.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        wavelength_um: vacuum wavelength, um.
+    """
     wave = optics.wave
     if not isinstance(wave, Pillars):
         return 0.0

@@ -70,6 +70,7 @@ def principal_kernels(
     since PSFs between nodes are mixtures of theirs.
 
     Args:
+        field: sampled field or PSFs.
         frame: (y, x) samples over which the nodes reach.
         tolerance: relative L2 error of the image of the scene, at the worst depth; a
             plane errs by no more, and by :data:`EVEN` at most.
@@ -108,7 +109,11 @@ def principal_kernels(
 
 
 def psf_nodes(field: PsfField) -> tuple[int, int]:
-    """(rows, columns) of nodes."""
+    """(rows, columns) of nodes.
+
+    Args:
+        field: sampled field or PSFs.
+    """
     return field.psf.shape[0], field.psf.shape[1]
 
 
@@ -247,7 +252,11 @@ def fast_shape(frame: tuple[int, int]) -> tuple[int, int]:
 def frame_maps(
     frame: tuple[int, int], nodes: tuple[int, ...], like: Tensor
 ) -> list[Tensor]:
-    """(y, node rows) and (x, node columns) spline interpolation to a frame's samples."""
+    """(y, node rows) and (x, node columns) spline interpolation to a frame's samples.
+
+    Args:
+        nodes: wavelengths with their weights.
+    """
     return [
         spline_matrix(torch.linspace(0, 1, n, dtype=torch.float64), count).to(like)
         for n, count in zip(frame, nodes, strict=True)
@@ -265,6 +274,7 @@ def correct_planes(
     contrast defocus inverts, as van Cittert's would.
 
     Args:
+        kernels: (rank, h, w) low-rank kernels.
         maps: :func:`frame_maps`. weights: (y, x, depths, rank), with their light.
     """
     factor = torch.ones_like(weights[..., 0])
@@ -292,6 +302,9 @@ def plane_images(field: PsfField, maps: list[Tensor]) -> Tensor:
 
     I(X) = Σ_ab Σ_x down(y, a) across(x, b) E_ab P_ab(X - x): both sums over x are
     products of matrices.
+
+    Args:
+        field: sampled field or PSFs.
     """
     light = field.light.detach()
     spread = []
@@ -306,7 +319,11 @@ def plane_images(field: PsfField, maps: list[Tensor]) -> Tensor:
 
 
 def moments(psf: Tensor) -> Tensor:
-    """(n, 3) sum and first moments of PSFs (n, h, w), lengths in half windows."""
+    """(n, 3) sum and first moments of PSFs (n, h, w), lengths in half windows.
+
+    Args:
+        psf: (..., h, w) PSFs.
+    """
     sides = (torch.linspace(-1, 1, n, dtype=psf.dtype) for n in psf.shape[-2:])
     y, x = torch.meshgrid(*sides, indexing="ij")
     terms = torch.stack([torch.ones_like(x), x, y]).to(psf.device)
@@ -318,6 +335,10 @@ def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
 
     An evenly lit plane images as 1 - ∇·centroid + ½ ∇∇:(second moments) - …: its first
     two terms are then exact.
+
+    Args:
+        kernels: (rank, h, w) low-rank kernels.
+        psf: (..., h, w) PSFs.
     """
     own = moments(kernels.double())
     lack = moments(psf.double()) - weights.double() @ own
@@ -326,7 +347,11 @@ def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
 
 
 def transfer_functions(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
-    """(rank, Y, X // 2 + 1) transforms of kernels (rank, h, w) about their middle."""
+    """(rank, Y, X // 2 + 1) transforms of kernels (rank, h, w) about their middle.
+
+    Args:
+        shape: (y, x) samples.
+    """
     h, w = kernels.shape[-2:]
     whole = pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
     found: Tensor = torch.fft.rfft2(whole.roll((-(h // 2), -(w // 2)), (-2, -1)))

@@ -152,6 +152,12 @@ def plan_nodes(
     tolerance, else as many components of
     both polarisations as their share asks for, as ``polarisation`` says.
 
+    Args:
+        optics: lens, light and distances at the nodes.
+        grid: samples, step, depths and margin of the image.
+        source: spectrum of the source.
+        middle_um: (x, y) field point in the middle, um on the sensor.
+
     Raises:
         SceneError: tolerance not above 0, or not met with ``MOST`` nodes along an axis.
     """
@@ -210,7 +216,11 @@ def plan_nodes(
 
 
 def depth_nodes(grid: Grid, count: int) -> Tensor:
-    """(count,) depths ascending, at equal steps of 1/z."""
+    """(count,) depths ascending, at equal steps of 1/z.
+
+    Args:
+        grid: samples, step, depths and margin of the image.
+    """
     near, far = grid.depths_um
     return 1 / torch.linspace(1 / near, 1 / far, count, dtype=torch.float64)
 
@@ -224,6 +234,12 @@ def sum_over_spectrum(
 ) -> Tensor:
     """(points, depths, h, w) PSFs summed over the spectrum; light of each wavelength
     with its weight.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        at_um: (points, 2) field points on the sensor, um.
+        depths_um: source depths from the lens, um.
+        waves: plane waves behind the lens.
     """
     pairs = list(
         zip(waves.wavelengths_um.tolist(), waves.weights.tolist(), strict=True)
@@ -294,6 +310,11 @@ def waves_of(
 ) -> SpectralNodes:
     """As few wavelengths of a source as image within the tolerance at three places; a
     given rule is kept as it is.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        grid: samples, step, depths and margin of the image.
+        middle_um: (x, y) field point in the middle, um on the sensor.
     """
     if isinstance(source, SpectralNodes):
         return source

@@ -140,6 +140,10 @@ def sampling(
 ) -> Sampling:
     """Nodes that fill the aperture for a window on the axis, where it is widest in p;
     of the shorter wave.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        wavelength_um: vacuum wavelength, um.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     edge = float(
@@ -199,6 +203,7 @@ def psfs(
     and nothing rings.
 
     Args:
+        optics: lens, light and distances at the nodes.
         at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with
             tangents at_um / reduced
             distance through the middle of the lens comes from. Without films that is
@@ -242,6 +247,11 @@ def view_um(
 ) -> tuple[float, float]:
     """(x, y) beside a field point from where its rays are seen: where the light lands
     that a stop lets through.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     x, y = place.tolist()
@@ -338,7 +348,15 @@ def stop_amplitudes(
 ) -> tuple[Tensor, Tensor]:
     """Of each source, (depths, nodes, nodes) amplitude behind the stop over that
     without, and (depths, 1, 1) light on
-    the stop over that on the whole lens, of sources on the axis."""
+    the stop over that on the whole lens, of sources on the axis.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        tangents: tangents of the field angles along x and y.
+        found: what was computed.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
+    """
     depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
     shade = through_stop(
         optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um
@@ -444,6 +462,11 @@ def node_rays(
 ) -> tuple[Rays, Pupil]:
     """The rays of the nodes to a place beside the field point, and the lens' carrier
     with the path to there.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        grid: samples, step, depths and margin of the image.
+        wavelength_um: vacuum wavelength, um.
     """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     at = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
@@ -464,6 +487,10 @@ def node_rays(
 def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
     """(depths, *shape) complex64 light on the nodes, the factor of the wave left out;
     compiled on the processor.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        wavelength_um: vacuum wavelength, um.
     """
     turns = pupil.phase_rad / (2 * math.pi)
     if turns.device.type == "cpu":

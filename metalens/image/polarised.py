@@ -22,6 +22,7 @@ def polarisation_factors(
     θ.
 
     Args:
+        seen: rays of the nodes.
         tangents: slopes (x, y) of the chief ray in air. order: indices of the media
             from the pillars to the sensor.
     """

@@ -86,7 +86,11 @@ class PupilView:
 
 
 def node_cosines(pupil: Pupil) -> Tensor:
-    """(nodes,) direction cosines of the nodes from their middle."""
+    """(nodes,) direction cosines of the nodes from their middle.
+
+    Args:
+        pupil: sampled pupil of the lens.
+    """
     return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (
         2 * pupil.edge / pupil.nodes
     )
@@ -96,6 +100,10 @@ def node_cosines(pupil: Pupil) -> Tensor:
 def kernel(pupil: Pupil, sample_um: float, samples: int) -> Tensor:
     """(samples, nodes) Fourier transform from direction cosines to the samples of a
     window.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        sample_um: step of the samples, um.
     """
     position = (
         torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
@@ -116,13 +124,20 @@ def coordinates(pupil: Pupil) -> tuple[Tensor, Tensor]:
 
 @functools.lru_cache(maxsize=16)
 def radius(pupil: Pupil) -> Tensor:
-    """(nodes, nodes) distance of the nodes from the axis on the lens, um."""
+    """(nodes, nodes) distance of the nodes from the axis on the lens, um.
+
+    Args:
+        pupil: sampled pupil of the lens.
+    """
     return torch.hypot(*coordinates(pupil))
 
 
 def amplitude(pupil: Pupil) -> Tensor:
     """(nodes, nodes) weight of the nodes: the share of the rim cells inside the
     aperture, and the solid angle.
+
+    Args:
+        pupil: sampled pupil of the lens.
     """
     q = node_cosines(pupil)
     q2 = q[:, None] ** 2 + q**2
@@ -141,6 +156,10 @@ def aperture_light(pupil: Pupil, window_um: float) -> float:
     a rim at p, which sends
     4√2 / (π² k p X) of the light beyond ±X, the window lacks ∫ (1 - sinc²) of that, to
     second order.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        window_um: side of the window, um.
     """
     step, k = 2 * pupil.edge / pupil.nodes, 2 * math.pi / pupil.wavelength_um
     given = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
@@ -205,7 +224,11 @@ def psf(
 
 @functools.lru_cache(maxsize=64)
 def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
-    """The pupil from the place where the chief ray of a field meets the sensor."""
+    """The pupil from the place where the chief ray of a field meets the sensor.
+
+    Args:
+        focus_um: source distance in focus, um.
+    """
     d, k = pupil.sensor_distance_um, 2 * math.pi / pupil.wavelength_um
     if not field.angle_rad:
         x, y = coordinates(pupil)
@@ -240,6 +263,9 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
 def wrap_phase(phase_rad: Tensor) -> Tensor:
     """The phase less whole turns, so that single precision holds it; the gradient is
     that of the phase.
+
+    Args:
+        phase_rad: phase, rad.
     """
     return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))
 

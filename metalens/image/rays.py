@@ -69,6 +69,11 @@ def rays(
 ) -> Rays:
     """Rays to a place (x, y) of the sensor from a lens of this radius; nodes: their
     number and their step of p.
+
+    Args:
+        after: media behind the pillars.
+        at_um: (points, 2) field points on the sensor, um.
+        device: torch device.
     """
     count, width = nodes
     centre = torch.tensor(at_um, dtype=torch.float64, device=device)
@@ -113,7 +118,15 @@ def through_stop(
 ) -> Tensor:
     """(depths, *shape) complex64 amplitude of each source's light behind the stop at
     (x, y), over that without; 0
-    beyond the rim of the lens."""
+    beyond the rim of the lens.
+
+    Args:
+        layers: films and stop of the lens.
+        tangents: tangents of the field angles along x and y.
+        seen: rays of the nodes.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
+    """
     lit = seen.whole.cpu().numpy() > 0
     x, y, width = (
         part.cpu().numpy()[lit] for part in (seen.x_um, seen.y_um, seen.width_um)
@@ -140,6 +153,10 @@ def landing_offset(
     it alone, by which it lands beside the ray through the middle.
 
     Args:
+        layers: films and stop of the lens.
+        radius: radius of the aperture or circle, um.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
         carrier_rad: phase of the lens at places (x, y). seen_from: the field point, and
             the media behind the lens.
     """
@@ -179,6 +196,9 @@ def path_derivatives(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
 
     H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of
     1e-3, exact to 1e-5 of them.
+
+    Args:
+        after: media behind the pillars.
     """
     step = 1e-3
     unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
@@ -221,6 +241,13 @@ def source_paths(
     of 1/z: the path is smooth there
     (singular only where a source touches the lens), and the points cost what the
     sources would.
+
+    Args:
+        layers: films and stop of the lens.
+        tangents: tangents of the field angles along x and y.
+        seen: rays of the nodes.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
     """
     wave = (
         wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None

@@ -207,6 +207,10 @@ def weight_maps(psf: PsfBasis, depth_um: Tensor) -> Tensor:
     1/z between the nodes.
 
     Depths outside the nodes take the outermost one.
+
+    Args:
+        psf: (..., h, w) PSFs.
+        depth_um: source depth from the lens, um.
     """
     code = _codes(psf.depths_um, depth_um)
     table = _table(psf)
@@ -293,6 +297,9 @@ def uniform_imager(
 ) -> UniformImager:
     """Prepare a basis for frames of ``frame`` = (y, x) pixels that were rendered with
     ``margin`` pixels to spare.
+
+    Args:
+        psf: (..., h, w) PSFs.
     """
     reach = max(psf.kernels.shape[-2:]) // 2
     spare = 2 * max(reach - margin, 0)
@@ -312,6 +319,7 @@ def image(
     unit transmission.
 
     Args:
+        optics: lens, light and distances at the nodes.
         margin: pixels around the frame that are blurred in but not returned.
         chunk: frames at a time; a few stay in the processor's cache.
     """
@@ -349,6 +357,9 @@ def layer_spectra(frames: Frames, optics: UniformImager) -> Tensor:
 
     They do not change with the kernels: for many images of the same frames, as in a
     design, see :func:`with_kernels`.
+
+    Args:
+        optics: lens, light and distances at the nodes.
     """
     spectrum: Tensor = torch.fft.rfft2(_sources(frames, optics))
     return spectrum
@@ -391,22 +402,37 @@ def _sources(frames: Frames, optics: UniformImager) -> Tensor:
 def is_compilable(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory,
     without derivatives.
+
+    Args:
+        a: a tensor.
     """
     return a.dtype in (torch.float32, torch.complex64) and is_plain_value(a)
 
 
 def is_plain_value(a: Tensor) -> bool:
-    """Whether it lies in main memory and carries no derivatives, backward or forward."""
+    """Whether it lies in main memory and carries no derivatives, backward or forward.
+
+    Args:
+        a: a tensor.
+    """
     return a.device.type == "cpu" and has_no_gradient(a)
 
 
 def has_no_gradient(a: Tensor) -> bool:
-    """Whether it carries no derivatives, backward or forward."""
+    """Whether it carries no derivatives, backward or forward.
+
+    Args:
+        a: a tensor.
+    """
     return not a.requires_grad and forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 def with_kernels(optics: UniformImager, kernels: Tensor) -> UniformImager:
-    """The same imager with other kernels (rank, h, w), differentiable in them."""
+    """The same imager with other kernels (rank, h, w), differentiable in them.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+    """
     transfer = _transfer(kernels, optics.shape)
     return replace(optics, psf=replace(optics.psf, kernels=kernels), transfer=transfer)
 
@@ -416,6 +442,10 @@ def image_spectra(
 ) -> Tensor:
     """(frames, y, x) the image that :func:`image` gives, from :func:`layer_spectra` of frames
     of ``size`` = (y, x) pixels.
+
+    Args:
+        source: spectrum of the source.
+        optics: lens, light and distances at the nodes.
     """
     blurred = torch.fft.irfft2(_mixed(source, optics), s=optics.shape)[
         ..., : size[0], : size[1]
@@ -427,6 +457,9 @@ def cut_layers(frames: Frames, depths_um: Tensor) -> Layers:
     """Cut frames into layers at these depths (ascending), leaving out the empty ones.
 
     A source between two layers is shared by both, linearly in 1/z.
+
+    Args:
+        depths_um: source depths from the lens, um.
     """
     vergence = 1 / depths_um.to(frames.depth_um)
     position = 1 / frames.depth_um.clamp(float(depths_um[0]), float(depths_um[-1]))
@@ -485,6 +518,9 @@ def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
 def pad_borders(sources: Tensor, shape: tuple[int, int]) -> Tensor:
     """Continue the border pixels into the spare columns and rows: half of them belong
     to the far border.
+
+    Args:
+        shape: (y, x) samples.
     """
     for axis in (-1, -2):
         spare = shape[axis] - sources.shape[axis]

@@ -49,6 +49,9 @@ class Sensor:
 def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
     """Light of a pixel relative to a base pixel: (pitch / base pitch)², the paper's
     energy-preserving factor.
+
+    Args:
+        pitch_um: lattice constant, um.
     """
     return (pitch_um / base_pitch_um) ** 2
 
@@ -65,6 +68,7 @@ def mean_electrons(
     """Expected electrons of every pixel, before noise and saturation.
 
     Args:
+        sample_um: step of the samples, um.
         irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e``
             electrons.
         pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
@@ -100,6 +104,9 @@ def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     distribution for every m > 0;
     for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong
     skewness, and negative counts.
+
+    Args:
+        generator: of the random draws; the global one without it.
     """
     where = mean.device if generator is None else generator.device
     count = torch.poisson(mean.detach().to(where), generator=generator).to(mean.device)
@@ -119,6 +126,10 @@ def expose(
     noise of ``reads`` reads each.
 
     Saturated pixels have gradient 0.
+
+    Args:
+        sensor: pixels, gain and noise of the sensor.
+        generator: of the random draws; the global one without it.
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = photons(mean, generator).clamp(max=well)
@@ -134,7 +145,11 @@ def normal(
 ) -> Tensor:
     """Standard normal numbers of the kind of ``like``, where it lies: drawn where the
     generator is, so that the same
-    seed gives the same noise on every device."""
+    seed gives the same noise on every device.
+
+    Args:
+        shape: (y, x) samples.
+    """
     where = like.device if generator is None else generator.device
     return torch.randn(shape, generator=generator, dtype=like.dtype, device=where).to(
         like.device
@@ -144,6 +159,9 @@ def normal(
 def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
     """Numbers 0 .. 2^bits - 1, full scale at the full well; the gradient is that of the
     straight line.
+
+    Args:
+        sensor: pixels, gain and noise of the sensor.
     """
     top = 2**sensor.bits - 1
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
@@ -155,6 +173,9 @@ def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
 def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
     """Noise variance of a pixel that expects ``mean`` electrons: photon, read and
     rounding noise, electrons².
+
+    Args:
+        sensor: pixels, gain and noise of the sensor.
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     total: Tensor = (

@@ -25,6 +25,7 @@ def by_nodes(
     the image through all nodes.
 
     Args:
+        field: sampled field or PSFs.
         content, depth_um: (frames, *sheets, y, x) light or coverage, and depth.
         lit: whether the content is light, which the illumination weighs.
         asked: numbers of the nodes whose derivatives are wanted, the others' being 0;
@@ -86,7 +87,12 @@ class _ByNodes(torch.autograd.Function):
 
 
 def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
-    """(coefficients, …) B-spline of every depth coefficient at these depths."""
+    """(coefficients, …) B-spline of every depth coefficient at these depths.
+
+    Args:
+        depth_um: source depth from the lens, um.
+        depths_um: source depths from the lens, um.
+    """
     near, far = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
     unit = ((near - 1 / depth_um) / max(near - far, 1e-30)).clamp(0, 1)
     nodes = len(depths_um)
@@ -102,6 +108,10 @@ def depth_shares(depth_um: Tensor, depths_um: Tensor) -> Tensor:
 def node_light(optics: Optics, plan: Plan) -> Tensor:
     """(rows, columns, depths, h, w) light of all nodes, without a graph: a leaf that
     gathers the gradient.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        plan: field nodes, depths and wavelengths.
     """
     with torch.no_grad():
         light = sum_over_spectrum(
@@ -119,6 +129,8 @@ def surrogate_loss(
     loss.
 
     Args:
+        optics: lens, light and distances at the nodes.
+        plan: field nodes, depths and wavelengths.
         gradient: (rows, columns, depths, h, w) of the loss with respect to
             :func:`node_light`, of the field points that
             were drawn.
@@ -137,6 +149,10 @@ def draw_nodes(
 ) -> tuple[Tensor, Tensor]:
     """(draws,) numbers of field points, evenly, and of wavelengths, by their weights:
     what :func:`surrogate_loss` takes.
+
+    Args:
+        plan: field nodes, depths and wavelengths.
+        generator: of the random draws; the global one without it.
     """
     points = torch.randint(
         len(plan.y_um) * len(plan.x_um), (draws,), generator=generator
@@ -152,7 +168,12 @@ def draw_nodes(
 def gradient_term(
     optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int
 ) -> Tensor:
-    """What one draw adds: number of points · <G_point, light_point,wave>."""
+    """What one draw adds: number of points · <G_point, light_point,wave>.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        plan: field nodes, depths and wavelengths.
+    """
     places = _places(plan)
     light = psfs(
         optics,

@@ -14,6 +14,9 @@ def spline_taps(unit: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
     """First coefficient and the values (…, 4) of the B-splines at positions 0 … 1.
 
     The nodes lie at equal steps from 0 to 1, with one coefficient more at each end.
+
+    Args:
+        unit: places between the nodes, in steps.
     """
     place = unit * (nodes - 1)
     first = place.detach().floor().clamp(0, max(nodes - 2, 0))
@@ -40,7 +43,11 @@ def spline_coefficients(nodes: int) -> Tensor:
 
 
 def spline_matrix(unit: Tensor, nodes: int) -> Tensor:
-    """(positions, nodes) interpolation at positions 0 … 1 of an axis, float64."""
+    """(positions, nodes) interpolation at positions 0 … 1 of an axis, float64.
+
+    Args:
+        unit: places between the nodes, in steps.
+    """
     first, taps = spline_taps(unit.double(), nodes)
     coefficients = spline_coefficients(nodes)
     basis = torch.zeros(len(unit), len(coefficients), dtype=torch.float64)

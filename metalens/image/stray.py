@@ -83,6 +83,12 @@ def stray_of(
 ) -> Stray | None:
     """Discs of the orders beside the image; None for a smooth phase, which has one
     order alone.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        grid: samples, step, depths and margin of the image.
+        depth_um: source depth from the lens, um.
+        middle_um: (x, y) field point in the middle, um on the sensor.
     """
     wave = optics.wave
     if not isinstance(wave, PillarWave):
@@ -221,6 +227,9 @@ def _reduced(optics: Optics, depth_um: float) -> float:
 def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
     """The image with the discs of all sources added; ``light`` (frames, y, x) of all
     sheets.
+
+    Args:
+        grid: samples, step, depths and margin of the image.
     """
     light = light * stray.illumination.to(light)
     spectrum = torch.stack(

@@ -11,6 +11,9 @@ def texture_spectrum(psf: Tensor) -> Tensor:
 
     Its L2 norm is that of the image of the texture. Frequencies below one period in
     eight windows count as that one.
+
+    Args:
+        psf: (..., h, w) PSFs.
     """
     power, both, _ = _powers(psf)
     return _weighed(psf, power * both)
@@ -22,6 +25,9 @@ def scene_spectrum(psf: Tensor, plane: float, band: float) -> Tensor:
     That is a 1/f texture of standard deviation :data:`CONTRAST` and an evenly lit
     plane, whose errors have spatial frequencies of about ``band`` (cycles a sample) and
     count ``plane`` times as much.
+
+    Args:
+        psf: (..., h, w) PSFs.
     """
     power, both, frequency2 = _powers(psf)
     seen = CONTRAST**2 * power / (power * both).sum()
@@ -48,7 +54,11 @@ def _weighed(psf: Tensor, power: Tensor) -> Tensor:
 
 
 def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
-    """(…) relative L2 error of the image of a texture through PSFs (…, h, w)."""
+    """(…) relative L2 error of the image of a texture through PSFs (…, h, w).
+
+    Args:
+        psf: (..., h, w) PSFs.
+    """
     a, b = texture_spectrum(psf.double()), texture_spectrum(reference.double())
     error: Tensor = (a - b).norm(dim=-1) / b.norm(dim=-1)
     return error

@@ -28,6 +28,12 @@ def aperture_transmission(
 
     Of pillars |T|² is the mean of all of them: what single ones scatter is in it,
     whether it lands in a window or not.
+
+    Args:
+        optics: lens, light and distances at the nodes.
+        at_um: (points, 2) field points on the sensor, um.
+        depths_um: source depths from the lens, um.
+        wavelength_um: vacuum wavelength, um.
     """
     grid, wave = sampling(optics, window, wavelength_um), optics.wave
     reduced, out = optics.layers.after(optics.distance_um, wavelength_um).reduced_um, []

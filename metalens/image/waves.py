@@ -339,6 +339,10 @@ def focusing_phase(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
 
     Through the films of the focus the paths are those of
     :meth:`metalens.design.Focus.path_um`.
+
+    Args:
+        x_um: places along x, um.
+        y_um: places along y, um.
     """
     r2 = x_um * x_um + y_um * y_um
     d, s, films = focus.sensor_distance_um, focus.source_distance_um, focus.layers
@@ -364,6 +368,11 @@ def cell_um(
 ) -> float:
     """Width of the cells that leave a window of this width, so far behind the lens,
     what pillars scatter into it.
+
+    Args:
+        layers: films and stop of the lens.
+        wavelength_um: vacuum wavelength, um.
+        window_um: side of the window, um.
     """
     node_um = (
         wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
@@ -379,7 +388,12 @@ def wave_of(
 ) -> Wave:
     """The lens plane of a lens file, in cells that leave a window of this width what
     pillars scatter into it; or the
-    one that was given."""
+    one that was given.
+
+    Args:
+        layers: films and stop of the lens.
+        window_um: side of the window, um.
+    """
     if isinstance(lens, Lens):
         distance = lens.sensor_distance_um if distance_um is None else distance_um
         return PillarWave(

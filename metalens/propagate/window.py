@@ -411,6 +411,9 @@ def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
 def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
     """Light on the lens nodes, a field for every tile and basis function (tile, b, e,
     x), to (tile, X, Y, b).
+
+    Args:
+        light: (..., y, x) irradiance.
     """
     count, b, e, _ = light.shape
     p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]

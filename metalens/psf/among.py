@@ -30,6 +30,10 @@ def phase_slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     of pillars around each.
 
     Slopes up to π / pitch. 0 where no pair stands. Differentiable.
+
+    Args:
+        light: (..., y, x) irradiance.
+        pitch_um: lattice constant, um.
     """
     found = []
     for axis in (-1, -2):
@@ -66,6 +70,11 @@ def _around(pairs: Tensor, *, along: int) -> Tensor:
 def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> Tensor:
     """(…, y, x) complex: mean of C over both polarisations at every pillar of complex
     t.
+
+    Args:
+        light: (..., y, x) irradiance.
+        neighbours: solved rows of non-identical pillars.
+        pitch_um: lattice constant, um.
     """
     parts = []
     for inner, some in _shares(light):
@@ -77,7 +86,13 @@ def mean_coupling(light: Tensor, neighbours: NeighbourRows, pitch_um: float) -> 
 def apply_scalar_coupling(
     phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
 ) -> tuple[Tensor, Tensor]:
-    """(phase, transmission) of (…, y, x) maps times that mean."""
+    """(phase, transmission) of (…, y, x) maps times that mean.
+
+    Args:
+        level: transmission amplitude.
+        neighbours: solved rows of non-identical pillars.
+        pitch_um: lattice constant, um.
+    """
     factor = mean_coupling(torch.polar(level, phase), neighbours, pitch_um)
     return phase + torch.angle(factor), level * factor.abs()
 
@@ -85,7 +100,14 @@ def apply_scalar_coupling(
 def apply_jones_coupling(
     phase: Tensor, level: Tensor, neighbours: NeighbourRows, pitch_um: float
 ) -> NeighbourJonesFactors:
-    """J of (…, y, x) maps, complex."""
+    """J of (…, y, x) maps, complex.
+
+    Args:
+        phase: function of x and y, um, to phase, rad.
+        level: transmission amplitude.
+        neighbours: solved rows of non-identical pillars.
+        pitch_um: lattice constant, um.
+    """
     parts = []
     for inner, some in _shares(torch.polar(level, phase)):
         s, aside, (cosine2, both) = _turned(*phase_slopes(some, pitch_um), neighbours)

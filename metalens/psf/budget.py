@@ -188,6 +188,7 @@ def with_model(
     """The budget with what the model of a lens leaves out.
 
     Args:
+        incidence_rad: angle of incidence in air, rad.
         aperture: half the spread in sin θ of the rays to the sensor. uneven: as in
             :func:`scalar_error`.
         polarisation: that was computed. has_angles: whether the pillars answer at the
@@ -235,6 +236,9 @@ def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
 def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Half the spread in sin θ of the rays from the lens to the chief ray's place on
     the sensor.
+
+    Args:
+        angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
@@ -249,6 +253,9 @@ def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
 def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Standard deviation over its mean of 1/cos θ of the rays from the lens to the
     chief ray's place on the sensor.
+
+    Args:
+        angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     centre = float(

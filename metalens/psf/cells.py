@@ -30,7 +30,11 @@ class PixelCells:
 
 
 def nyquist_um(case: PropagationCase) -> float:
-    """Largest step at which samples of |U|² on the window fold nothing."""
+    """Largest step at which samples of |U|² on the window fold nothing.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+    """
     (hy, hx), (cx, cy) = case.half_size_um, case.centre_um
     band = 0.0
     for half, centre, beside, away in ((hx, cx, hy, cy), (hy, cy, hx, cx)):
@@ -42,6 +46,9 @@ def nyquist_um(case: PropagationCase) -> float:
 
 def plan_pixel_cells(case: PropagationCase, finer: int = FINER[0]) -> PixelCells:
     """How a window is sampled: as it is, or ``finer`` points in Nyquist's step.
+
+    Args:
+        case: maps, geometry and window of the propagation.
 
     Raises:
         PropagationError: a step so coarse that its cells would take more than ``MOST``
@@ -79,6 +86,9 @@ def integrate_cells(
     Within cells the differences add up to those of slopes at their borders, which may
     meet at 0 in the fourth order
     and not in the sixth: the second vouches for it.
+
+    Args:
+        light: (..., y, x) irradiance.
     """
     points, whole = fine.points, slice(BORDER, -BORDER)
     across, down = _second(light, -1), _second(light, -2)

@@ -132,6 +132,9 @@ def compute_direction(
     maps: (…, wavelength, y, x); cases, weights: of the wavelengths. layers: whose stop
     shades the pillars, alike for
     all depths of the cases.
+
+    Args:
+        wanted: what the command asks for.
     """
     if wanted.source is not None and moving is not None:
         raise PropagationError(

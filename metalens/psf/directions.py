@@ -96,6 +96,8 @@ def far_field(
     field angle, as for a PSF.
 
     Args:
+        lens: the lens.
+        wavelength_um: vacuum wavelength, um.
         angle_rad: (x, y) arctangents of the light's slope; a plane wave at +x leaves
             flat pillars at +x.
         samples: odd number of squares across all directions that the lattice tells, at

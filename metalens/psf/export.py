@@ -23,6 +23,9 @@ _NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 def check_psf_format(path: str | Path) -> None:
     """Refuse a file name that says no known format.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         PropagationError: naming the formats there are.
     """
@@ -46,6 +49,9 @@ def export_psf(path: str | Path, stack: PsfStack) -> None:
     viewers draw from below), and an image extension of float64 for every axis and for
     the energies.
 
+    Args:
+        path: file to read or write.
+
     Raises:
         PropagationError: another ending.
     """
@@ -61,7 +67,11 @@ def export_psf(path: str | Path, stack: PsfStack) -> None:
 
 
 def write_tiff(stack: PsfStack) -> bytes:
-    """TIFF file of all PSFs."""
+    """TIFF file of all PSFs.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     import tifffile
 
     plain = stack.numpy()
@@ -96,7 +106,11 @@ def write_tiff(stack: PsfStack) -> bytes:
 
 
 def write_matlab(stack: PsfStack) -> bytes:
-    """MATLAB 5 file; the header holds no date."""
+    """MATLAB 5 file; the header holds no date.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     from scipy.io import savemat
 
     plain = stack.numpy()
@@ -113,7 +127,11 @@ def write_matlab(stack: PsfStack) -> bytes:
 
 
 def write_fits(stack: PsfStack) -> bytes:
-    """FITS file of all PSFs; needs astropy (extra ``fits``)."""
+    """FITS file of all PSFs; needs astropy (extra ``fits``).
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     from astropy.io import fits as library
 
     plain = stack.numpy()

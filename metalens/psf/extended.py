@@ -91,6 +91,10 @@ def source_to_image_matrices(case: PropagationCase, extent: Extent) -> Array:
     """(depth, 2, 2) M of the module's heading times the size: sizes of the source to um
     on the sensor, [x, y].
 
+    Args:
+        case: maps, geometry and window of the propagation.
+        extent: size and shape of the source.
+
     Raises:
         PropagationError: a size in um at infinity.
     """
@@ -154,6 +158,9 @@ def widen_case(
     """The case with the samples around its window that the source blurs into it, and
     how many (y, x) on each side.
 
+    Args:
+        extent: size and shape of the source.
+
     Raises:
         PropagationError: samples farther apart than Nyquist's step, a size in um at
             infinity, or too many samples.
@@ -181,6 +188,10 @@ def blur_by_source(
 ) -> tuple[torch.Tensor, float]:
     """(depth, y, x) light on the window from that on the widened one, and what is wrong
     at its edges, relative L2.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+        extent: size and shape of the source.
     """
     whole = _filtered(light, case, extent, 0)
     with torch.no_grad():
@@ -198,6 +209,10 @@ def blur_by_source(
 def source_image_reach(case: PropagationCase, extent: Extent) -> tuple[int, int]:
     """(y, x) samples that the image of the source reaches from its middle, at the depth
     where that is most.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+        extent: size and shape of the source.
     """
     x, y = np.ceil(
         np.abs(source_to_image_matrices(case, extent)).sum(2).max(0)
@@ -245,6 +260,7 @@ def shift_invariance_error(
     the farthest depth.
 
     Args:
+        extent: size and shape of the source.
         light: (depth, y, x) on the widened window of ``case``, from the middle of the
             source.
         probe: the same (1, y, x) for another case.

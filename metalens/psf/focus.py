@@ -133,6 +133,10 @@ def _error_at(stack: PsfStack, angle_rad: Point) -> float:
 def incident_um2(lens: Lens, angle_rad: Point, depth_um: float) -> float:
     """Power on the aperture for unit irradiance of the lens: the area of its cells, or
     of those that the light of an angle and depth reaches through a stop.
+
+    Args:
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
     """
     d = lens.diameters
     there = np.asarray(d.diameter_um) > 0
@@ -141,7 +145,13 @@ def incident_um2(lens: Lens, angle_rad: Point, depth_um: float) -> float:
 
 
 def lens_stop_shadow(lens: Lens, angle_rad: Point, depth_um: float) -> Array:
-    """(y, x) complex factor of the aperture stop at every pillar; 1 without one."""
+    """(y, x) complex factor of the aperture stop at every pillar; 1 without one.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
+    """
     if lens.layers.stop is None:
         return np.ones((1, 1))
     d = lens.diameters
@@ -160,6 +170,11 @@ def in_phase_irradiance(
     the peak of a PSF without aberrations, whose Strehl ratio is 1.
 
     Accuracy: the distance to the focus is taken as one over 8 x 8 pillars: 1e-4.
+
+    Args:
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
+        stack: PSFs over angle, depth and wavelength.
     """
     nodes = SpectralNodes(
         np.asarray(stack.wavelengths_um), np.asarray(stack.weights), 0.0

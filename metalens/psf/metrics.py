@@ -30,6 +30,10 @@ def mtf(stack: PsfStack, *, frequencies_per_um: Array) -> Array:
     |Σ PSF exp(-2πi f x)| of the PSF summed over the other axis (sagittal and tangential
     for a field along x).
     Light outside the window does not count.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+        frequencies_per_um: spatial frequencies, cycles per um.
     """
     psf = stack.numpy().intensity
     along_x, along_y = (
@@ -47,6 +51,7 @@ def encircled_energy(
     radius).
 
     Args:
+        stack: PSFs over angle, depth and wavelength.
         of_window: of the light in the window; else the light in um² for unit irradiance
             at the lens.
 
@@ -94,6 +99,7 @@ def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
     axis.
 
     Args:
+        step_um: step of the samples, um.
         held: (…,) share of the whole light that (…, y, x) is. What lies outside counts
             on either side; the disc is at
             most one as bright as the window on the mean, √(area / π held), and that
@@ -111,7 +117,11 @@ def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
 
 
 def centroid(stack: PsfStack) -> tuple[Array, Array]:
-    """(x, y) centre of the light from the window centre, um; each (…, depth)."""
+    """(x, y) centre of the light from the window centre, um; each (…, depth).
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     psf = stack.numpy().intensity
     return (psf.sum(-2) * stack.x_um).sum(-1), (psf.sum(-1) * stack.y_um).sum(-1)
 
@@ -153,7 +163,11 @@ def axial_information(
 def information_by_name(
     stack: PsfStack, names: Sequence[Normalisation] = ("sum", "l2")
 ) -> dict[str, Array]:
-    """I(z) under several normalisations, by name."""
+    """I(z) under several normalisations, by name.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
     return {name: axial_information(stack, normalisation=name)[1] for name in names}
 
 
@@ -220,7 +234,11 @@ def diffraction_limit(
 
 
 def find_peak(light: Array) -> tuple[float, float, float]:
-    """(row, column, value) of the peak of (y, x) samples, by a quintic spline."""
+    """(row, column, value) of the peak of (y, x) samples, by a quintic spline.
+
+    Args:
+        light: (..., y, x) irradiance.
+    """
     spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
     start = np.array(np.unravel_index(int(light.argmax()), light.shape), float)
     bounds = [
@@ -240,6 +258,10 @@ def fwhm(light: Array, step_um: float) -> float:
 
     Of the mean over all directions about the peak; nan where it does not fall to one
     half within the window.
+
+    Args:
+        light: (..., y, x) irradiance.
+        step_um: step of the samples, um.
     """
     return half_maximum(light, find_peak(light))[0] * step_um
 
@@ -247,6 +269,9 @@ def fwhm(light: Array, step_um: float) -> float:
 def half_maximum(light: Array, peak: tuple[float, float, float]) -> tuple[float, float]:
     """FWHM in samples of the azimuthal mean, and its fall at half maximum: part of the
     peak a sample.
+
+    Args:
+        light: (..., y, x) irradiance.
     """
     row, column, top = peak
     spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
@@ -278,6 +303,10 @@ def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
 
     Samples are even over their cells; those that the rim crosses count by their part
     (16 x 16 points a cell: to 1e-3 of a cell).
+
+    Args:
+        light: (..., y, x) irradiance.
+        radius: radius of the circle, um.
     """
     if not math.isfinite(radius):
         return math.nan
@@ -295,6 +324,9 @@ def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
 def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, float]:
     """Lowest frequency at which a line spread of samples has a modulation of 1/2, and
     its change a unit of modulation; both per um, nan where it stays above.
+
+    Args:
+        step_um: step of the samples, um.
     """
     total = float(line.sum())
     x = np.arange(len(line)) * step_um

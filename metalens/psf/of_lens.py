@@ -222,6 +222,10 @@ def paths_um(
     Rays of some places of the aperture through the films, and the delays of the pillars
     themselves; a window that a
     source of finite size blurs into is as much wider.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
     """
     grid = lens.diameters.grid._asdict()
     given = {
@@ -292,6 +296,9 @@ def _delay_um(
 def light_shares(light: Array, places: tuple[int, ...]) -> Array:
     """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to
     places as in :func:`paths_um`.
+
+    Args:
+        light: (..., y, x) irradiance.
     """
     square = np.asarray(light, float) ** 2
     for axis, count in zip((1, 2), places, strict=True):
@@ -476,6 +483,10 @@ def _decided_polarisation(
 def library_incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Angle in rad at which the pillars are asked for light from a direction: 0 where
     their library has no angles.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
     """
     return (
         float(np.arctan(np.hypot(*np.tan(angle_rad))))
@@ -494,7 +505,13 @@ def all_maps(
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], NeighbourJonesFactors | None]:
     """(wavelength, y, x) phase and transmission of every pillar for light from a
     direction, with the mean factor of
-    unlike neighbours; or that factor on both fields beside them."""
+    unlike neighbours; or that factor on both fields beside them.
+
+    Args:
+        lens: the lens.
+        nodes: wavelengths with their weights.
+        angle_rad: field angles along x and y, rad.
+    """
     shape = len(nodes.weights), *lens.diameters.diameter_um.shape
     phase, level = torch.empty(shape, dtype=dtype), torch.empty(shape, dtype=dtype)
     for wave, one, other in zip(
@@ -521,6 +538,11 @@ def passed_um2(
     irradiance from this direction.
 
     Σ |T S|² a at the design wavelength: S the shadow of a stop, a the area of a site.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
+        depths_um: source depths from the lens, um.
     """
     nodes = SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))

@@ -24,6 +24,7 @@ def on_pixels(
     stays 0, with no energy.
 
     Args:
+        stack: PSFs over angle, depth and wavelength.
         pitch_um: of one pixel, a number or a torch scalar (the result is differentiable
             in it, continuously).
         bins: 1, 2, 3 … pixels along each axis that are added.
@@ -61,6 +62,10 @@ def on_pixels(
 def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
     """Pixels of this pitch that cover ``samples`` samples; one where the pixel is
     larger than the image.
+
+    Args:
+        sample_um: step of the samples, um.
+        pitch_um: lattice constant, um.
     """
     return max(1, math.ceil(samples * sample_um / pitch_um * (1 - 1e-12)))
 
@@ -68,6 +73,10 @@ def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
 def whole_pixels(samples: int, sample_um: float, pitch_um: float) -> int:
     """Pixels of this pitch that lie wholly inside ``samples`` samples, however the
     lengths are rounded.
+
+    Args:
+        sample_um: step of the samples, um.
+        pitch_um: lattice constant, um.
     """
     return math.floor(samples * sample_um / pitch_um * (1 + 1e-12))
 
@@ -92,6 +101,7 @@ def pixel_weights(
     meets a sample edge.
 
     Args:
+        sample_um: step of the samples, um.
         samples: of the image along this axis; the image is centred on the pixel row.
         pitch_um: float, or a tensor that the weights are differentiable in.
         count: of pixels; by default as many as cover the image.
@@ -140,6 +150,8 @@ def integrate_pixels(
     area.
 
     Args:
+        sample_um: step of the samples, um.
+        pitch_um: lattice constant, um.
         image: (..., y, x).
         shape: (rows, columns) of pixels; by default as many as cover the image.
         shift_um: (y, x) of the pixel grid.

@@ -29,6 +29,9 @@ def psf_pictures(
     ``information`` where neighbours of them differ; ``zscan`` of a scan.
 
     limit: of the aperture, for the ideal MTF and its cut-off.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
     """
     plain = stack.numpy()
     found = {"montage": plot_montage(plain), "mtf": plot_mtf(plain, limit=limit)}
@@ -64,6 +67,9 @@ def _depth_name(depth_um: float) -> str:
 def plot_slices(stack: PsfStack) -> bytes:
     """x against depth through the centre row, one panel an angle, brightest value of
     each depth at full scale.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
     """
     light, depths = _by_angle(stack), stack.depths_um
     order = np.argsort(depths)
@@ -94,6 +100,9 @@ def plot_slices(stack: PsfStack) -> bytes:
 def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
     """PSFs over depth (across) and angle (down), square root of intensity, each at its
     own full scale.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
     """
     light = _by_angle(stack)
     picks = np.unique(
@@ -126,6 +135,9 @@ def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
 def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes:
     """MTF along x and y up to its cut-off (where samples show it), and encircled
     energy, of three depths at the first and last angle.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
     """
     depths = np.unique([0, len(stack.depths_um) // 2, len(stack.depths_um) - 1])
     cut = 0.5 / stack.step_um
@@ -210,6 +222,9 @@ def along_z(scan: "FocusScan") -> bytes:
 def plot_information(stack: PsfStack) -> bytes:
     """I(z) of Eq. 11 on pixels of 3 µm, binned 1, 2 and 3 times, under each named
     normalisation.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
     """
     figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     for panel, name in zip(axes, ("sum", "l2"), strict=True):

@@ -117,7 +117,12 @@ _NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 
 
 def save(path: str | Path, stack: PsfStack) -> None:
-    """Write a PSF file (kind ``psf``)."""
+    """Write a PSF file (kind ``psf``).
+
+    Args:
+        path: file to read or write.
+        stack: PSFs over angle, depth and wavelength.
+    """
     plain = stack.numpy()
     arrays = {
         name: np.asarray(getattr(plain, name))
@@ -134,6 +139,9 @@ def save(path: str | Path, stack: PsfStack) -> None:
 @typed_reader
 def load(path: str | Path) -> PsfStack:
     """Read a PSF file.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: missing, truncated, or not a PSF file.

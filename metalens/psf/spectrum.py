@@ -89,6 +89,9 @@ def spectral_weight(source: Source) -> tuple[Array, Array]:
     """(wavelengths in um, weight of sum 1) of diode times silicon over ±2.5 FWHM, every
     0.25 nm or FWHM / 40.
 
+    Args:
+        source: spectrum of the source.
+
     Raises:
         MaterialError: the line leaves the range of the silicon data.
     """
@@ -142,6 +145,9 @@ def read_measured_spectrum(
     next, at two points each and at most 0.25 nm at a time, so that lines narrower than
     that are seen; a constant
     factor of each drops out.
+
+    Args:
+        files: settings files of the stages.
 
     Raises:
         PropagationError: no file, one that is missing or no such table, curves without
@@ -262,6 +268,7 @@ def spectral_nodes(
     """As few wavelengths as meet the tolerance.
 
     Args:
+        source: spectrum of the source.
         path_um: largest difference in optical path between two parts of the lens, for
             light that reaches the window:
             intensities vary with wavelength as exp(2πi·path/λ), and no faster. Or (n,)
@@ -290,6 +297,9 @@ def spectral_nodes(
 def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
     """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up
     to each of these.
+
+    Args:
+        nodes: wavelengths with their weights.
     """
     if nodes.source is None:
         return np.full(len(span_um), nodes.error)
@@ -299,7 +309,11 @@ def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
 
 
 def spectrum_points(source: Source | MeasuredSpectrum) -> tuple[Array, Array]:
-    """(wavelengths in um, shares of sum 1) of a spectrum."""
+    """(wavelengths in um, shares of sum 1) of a spectrum.
+
+    Args:
+        source: spectrum of the source.
+    """
     return (
         (source.wavelengths_um, source.share)
         if isinstance(source, MeasuredSpectrum)
@@ -318,6 +332,10 @@ def share_outside_library(
 
     It is no error of that size: pillars that answer smoothly beyond are off by what the
     quadrature is.
+
+    Args:
+        source: spectrum of the source.
+        within_um: (least, largest) wavelength of the library, um.
     """
     low, high = within_um
     if not high > low or not isinstance(source, Source | MeasuredSpectrum):
@@ -333,6 +351,11 @@ def nodes_inside_library(
 ) -> SpectralNodes:
     """The wavelengths that stand for a spectrum, all of which lie within those that
     pillars are known for.
+
+    Args:
+        nodes: wavelengths with their weights.
+        source: spectrum of the source.
+        within_um: (least, largest) wavelength of the library, um.
 
     Raises:
         PropagationError: one lies beyond; with the share of the light that does, and
@@ -389,6 +412,10 @@ def outside_library_text(
 ) -> str:
     """Words for :func:`share_outside_library` light; empty where that is less than 1e-4
     of it.
+
+    Args:
+        source: spectrum of the source.
+        within_um: (least, largest) wavelength of the library, um.
     """
     share = share_outside_library(source, within_um)
     if share < 1e-4:

@@ -138,12 +138,19 @@ class PolarizationMixing:
 def order_behind(case: PropagationCase) -> tuple[float, ...]:
     """Indices of the media from the pillars to the sensor; 1 for one medium, whose
     wavelength is its own.
+
+    Args:
+        case: maps, geometry and window of the propagation.
     """
     return (1.0,) if case.behind is None else case.behind.order
 
 
 def has_faces(case: PropagationCase) -> bool:
-    """Whether light goes from one medium to another behind the lens."""
+    """Whether light goes from one medium to another behind the lens.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+    """
     return len(set(order_behind(case))) > 1
 
 
@@ -152,7 +159,12 @@ def rays_to(
 ) -> Tensor:
     """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's
     centre, as they reach the sensor, or
-    in a medium of this index."""
+    in a medium of this index.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+        at_um: (points, 2) field points on the sensor, um.
+    """
     across, down = (
         at_um[1][None, :] - case.centre_um[0],
         (at_um[0] - case.centre_um[1])[:, None],
@@ -169,7 +181,11 @@ def s_and_p(case: PropagationCase) -> Pupils:
     """Two components of a scalar's light behind films: light that is s all over, and p,
     whose mean power is the light;
     each over the one amplitude that the scalar takes for both, as they reach the
-    window's middle."""
+    window's middle.
+
+    Args:
+        case: maps, geometry and window of the propagation.
+    """
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
         b = rays_to(case, (y_um, x_um), 1.0).numpy()  # p = n sin θ

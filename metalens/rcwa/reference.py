@@ -46,6 +46,7 @@ def solve_textbook_rcwa(
     by one linear system for all amplitudes.
 
     Args:
+        wavelength_um: vacuum wavelength, um.
         size_um: of the shape (its diameter).
         harmonics: M; orders -M to M along x and y.
         angle_rad: outside, in vacuum. azimuth_rad: of the plane of incidence.

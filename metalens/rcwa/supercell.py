@@ -95,6 +95,7 @@ def solve_row(
     repeated without end.
 
     Args:
+        wavelength_um: vacuum wavelength, um.
         diameters_um: (n,) of the pillars, in order along x.
         polarization: axis of the incident field, x along the row.
         harmonics: h; all orders within the circle that holds (2 h + 1)² orders of one

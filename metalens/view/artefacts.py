@@ -36,6 +36,9 @@ MOST_SAMPLES = (
 def library_panels(path: Path) -> list[Panel]:
     """t, r and their error bars over every parameter, with the stretches that
     resonances take.
+
+    Args:
+        path: file to read or write.
     """
     made = libraries.load(path)
     axes = [
@@ -90,6 +93,9 @@ def library_panels(path: Path) -> list[Panel]:
 def axes_panels(path: Path) -> list[Panel]:
     """Phase, level and error bar over both sizes; what is left out has phase and level
     0.
+
+    Args:
+        path: file to read or write.
     """
     made = axes.load(path)
     names = [
@@ -136,7 +142,11 @@ def axes_panels(path: Path) -> list[Panel]:
 
 
 def lens_panels(path: Path) -> list[Panel]:
-    """Every pillar, and what it does to the light."""
+    """Every pillar, and what it does to the light.
+
+    Args:
+        path: file to read or write.
+    """
     lens = lenses.load(path)
     diameter = lens.diameters.diameter_um
     if not lens.diameters.plain:
@@ -182,7 +192,11 @@ def _section(diameter: Array, lens: lenses.Lens) -> CurvePanel:
 
 
 def psf_panels(path: Path) -> list[Panel]:
-    """PSFs with sliders over all that they depend on, and the error by cause."""
+    """PSFs with sliders over all that they depend on, and the error by cause.
+
+    Args:
+        path: file to read or write.
+    """
     stack = psf.load(path)
     return [*_psfs([stack], [path.stem]), _budgets([stack], ["error"])]
 
@@ -190,6 +204,9 @@ def psf_panels(path: Path) -> list[Panel]:
 def lights_panels(path: Path) -> list[Panel]:
     """The PSF files of a folder, a slider over them: one lens in light of several
     wavelengths or polarisations.
+
+    Args:
+        path: file to read or write.
 
     Raises:
         StoreError: a file that is no PSF stack, or of other depths, angles or samples
@@ -286,7 +303,11 @@ def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
 
 
 def far_field_panels(path: Path) -> list[Panel]:
-    """Light over direction cosines, what cones about the axis hold, and the beams."""
+    """Light over direction cosines, what cones about the axis hold, and the beams.
+
+    Args:
+        path: file to read or write.
+    """
     stored = store.load(path, "far-field")
     held, about = stored.arrays, stored.attributes
     share, sine, angles = (
@@ -342,7 +363,11 @@ def far_field_panels(path: Path) -> list[Panel]:
 
 
 def near_field_panels(path: Path) -> list[Panel]:
-    """Both cuts and the maps of a pillar's field: |E|, |H| and the parts of E, and the refractive index."""
+    """Both cuts and the maps of a pillar's field: |E|, |H| and the parts of E, and the refractive index.
+
+    Args:
+        path: file to read or write.
+    """
     stored = store.load(path, "near-field")
     held, about = stored.arrays, stored.attributes
     step, heights = (
@@ -395,7 +420,11 @@ def _degrees(pair: Array) -> str:
 
 
 def plain_panels(path: Path) -> list[Panel]:
-    """Any artefact: its arrays as images or curves, its attributes as a table."""
+    """Any artefact: its arrays as images or curves, its attributes as a table.
+
+    Args:
+        path: file to read or write.
+    """
     stored = store.load(path)
     out: list[Panel] = []
     for name, array in sorted(stored.arrays.items()):

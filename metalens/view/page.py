@@ -46,6 +46,7 @@ def write_page(
     """Write the page.
 
     Args:
+        path: file to read or write.
         title: file and kind. panels: in order. about: header and provenance, shown at
             the end.
 

@@ -39,6 +39,9 @@ class _Standing:
 def draw_pillars(lens: Lens) -> DrawingPanel:
     """Every pillar's outline where it stands, coloured by its size, or by its turn
     where pillars are turned.
+
+    Args:
+        lens: the lens.
     """
     this, whole = _standing(lens)
     kinds, place = this.kinds
@@ -68,7 +71,11 @@ def draw_pillars(lens: Lens) -> DrawingPanel:
 
 
 def draw_phase(lens: Lens) -> ImagePanel:
-    """Phase over the aperture on square pixels, each that of the site nearest to it."""
+    """Phase over the aperture on square pixels, each that of the site nearest to it.
+
+    Args:
+        lens: the lens.
+    """
     d = lens.diameters
     edge = max(d.x_um[-1] - d.x_um[0], d.y_um[-1] - d.y_um[0], d.pitch_um)
     step = max(edge / _PIXELS, min(d.steps_um))
@@ -91,6 +98,10 @@ def draw_phase(lens: Lens) -> ImagePanel:
 def nearest_site(d: DiameterMap, y_um: Array, x_um: Array) -> tuple[Array, Array]:
     """(row, column) of the site of the lattice nearest to places; a hexagonal one is
     two rectangular ones.
+
+    Args:
+        y_um: places along y, um.
+        x_um: places along x, um.
     """
     step = 2 if d.lattice.centred else 1
     found = [

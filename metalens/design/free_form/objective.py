@@ -198,6 +198,11 @@ def score_phase(
     depths of the range.
 
     Off axis in the directions of +x and +y: mean information, least energy.
+
+    Args:
+        phase_rad: phase, rad.
+        focus_um: source distance in focus, um.
+        settings: resolved settings of the design.
     """
     low, high = (1e3 * d for d in settings.depths_mm)
     where = torch.linspace(low, high, depths, dtype=torch.float64)

@@ -29,6 +29,9 @@ def refine_phase(
 
     Best feasible point of ``settings.refine`` evaluations (Svanberg 2002); the start
     where none is better.
+
+    Args:
+        focus_um: source distance in focus, um.
     """
     start = controls.detach().numpy().ravel()
     known: dict[

@@ -41,6 +41,10 @@ def judge_designs(
 
     Intensities every ``settings.sample_um``, averaged over sub-pixel positions, at 11
     depths.
+
+    Args:
+        made: what was designed or computed.
+        pupil: sampled pupil of the lens.
     """
     lenses = [("free form", phase_on(pupil, made), made.focus_um)]
     for simple in baselines.tune_baselines(pupil, settings):
@@ -63,7 +67,11 @@ def judge_designs(
 
 
 def information_gain(lenses: tuple[JudgedLens, ...]) -> float:
-    """Mean information of the first lens over that of the best of the others."""
+    """Mean information of the first lens over that of the best of the others.
+
+    Args:
+        lenses: judged designs.
+    """
     means = [float(lens.score.information.mean()) for lens in lenses]
     return means[0] / max(means[1:])
 
@@ -71,7 +79,12 @@ def information_gain(lenses: tuple[JudgedLens, ...]) -> float:
 def report_values(
     lenses: tuple[JudgedLens, ...], settings: ResolvedFisherSettings
 ) -> dict[str, Any]:
-    """Every figure, ready for JSON."""
+    """Every figure, ready for JSON.
+
+    Args:
+        lenses: judged designs.
+        settings: resolved settings of the design.
+    """
     return {
         "depths_mm": _depths(lenses, settings).tolist(),
         "angles_deg": list(settings.angles_deg),
@@ -95,6 +108,10 @@ def report_picture(
 ) -> bytes:
     """Information and energy over depth at the first angle, and PSFs of the lenses
     through the range.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
     """
     figure, _ = make_figure(1, 1, size=(10, 7.6))
     figure.clear()

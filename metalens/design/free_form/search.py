@@ -75,6 +75,9 @@ def fisher_profile(
 
     ``focus.source_distance_um`` is used where the settings leave depths and foci to the
     lens.
+
+    Args:
+        radius_um: radius of the aperture, um.
     """
     asked = (settings or FisherSettings()).about(focus, radius_um)
     pupil = design_pupil(focus, radius_um, asked)
@@ -122,7 +125,13 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
 def design_pupil(
     focus: Focus, radius_um: float, settings: ResolvedFisherSettings
 ) -> Pupil:
-    """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
+    """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16.
+
+    Args:
+        focus: source and sensor distances of the design.
+        radius_um: radius of the aperture, um.
+        settings: resolved settings of the design.
+    """
     edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
     nodes = max(
         64,
@@ -140,6 +149,7 @@ def optimize_free_form(
     """Best of several starts; deterministic for a seed.
 
     Args:
+        pupil: sampled pupil of the lens.
         objective: by default the axial information; :mod:`codesign.evaluate.scenes` has
             Eq. 6 on scenes.
 
@@ -180,7 +190,11 @@ def optimize_free_form(
 
 
 def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
-    """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus."""
+    """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus.
+
+    Args:
+        made: what was designed or computed.
+    """
     return _Phase(pupil, 0 if made.cells else len(made.controls), made.zones)(
         made.controls
     )
@@ -189,6 +203,11 @@ def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
 def vortex_phase(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
     """Phase of a double helix without its focus: ring l of equal areas carries the
     charge 2l - 1; 0 for no zones.
+
+    Args:
+        x_um: places along x, um.
+        y_um: places along y, um.
+        radius_um: radius of the aperture, um.
     """
     if zones == 0:
         return np.zeros(np.broadcast_shapes(x_um.shape, y_um.shape))
@@ -199,6 +218,9 @@ def vortex_phase(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> A
 def bspline_weights(position: Array, count: int) -> Array:
     """(n, count) cubic B-spline weights of positions in [-1, 1] (held at the ends),
     uniform knots.
+
+    Args:
+        position: places in units of the control points.
     """
     place = (np.clip(position, -1, 1) + 1) / 2 * (count - 3)
     first = np.clip(np.floor(place).astype(int), 0, count - 4)

@@ -205,6 +205,9 @@ def between_mm(
 ) -> tuple[float, float]:
     """Depths at two shares of the range in 1/z, from its near end: 0 is near, 1 far;
     below 0 nearer. 2 digits.
+
+    Args:
+        depths_um: source depths from the lens, um.
     """
     near, far = (1e3 / z for z in depths_um)
     ends = (1 / max(near + share * (far - near), 0.1 * far) for share in (first, last))

@@ -59,7 +59,12 @@ class BaselineLens:
 def judge_baseline(
     pupil: Pupil, settings: ResolvedFisherSettings, *, zones: int, focus_um: float
 ) -> BaselineLens:
-    """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``."""
+    """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``.
+
+    Args:
+        zones: ring zones of the double helix.
+        focus_um: source distance in focus, um.
+    """
     phase = baseline_phase(pupil, zones)
     found = score_phase(phase, pupil, focus_um=focus_um, settings=settings)
     return BaselineLens(
@@ -68,7 +73,11 @@ def judge_baseline(
 
 
 def baseline_phase(pupil: Pupil, zones: int) -> Tensor:
-    """(nodes, nodes) vortices on the pupil's nodes."""
+    """(nodes, nodes) vortices on the pupil's nodes.
+
+    Args:
+        zones: ring zones of the double helix.
+    """
     x, y = (a.numpy() for a in pupils.coordinates(pupil))
     return torch.from_numpy(vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones))
 
@@ -83,6 +92,11 @@ def tune_baseline(
 ) -> BaselineLens:
     """Most informative lens over zones and focus: a scan at equal steps of 1/z, then
     twice a finer one around the best.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+        count: how many.
 
     Raises:
         ConfigError: no zones, foci that do not ascend, or fewer than 3 foci.
@@ -116,7 +130,12 @@ def tune_baseline(
 def tune_baselines(
     pupil: Pupil, settings: ResolvedFisherSettings
 ) -> tuple[BaselineLens, BaselineLens]:
-    """The best hyperbolic lens and the best double helix."""
+    """The best hyperbolic lens and the best double helix.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+    """
     near, far = (1e3 * z for z in settings.depths_mm)
     plain, wound = (between_mm((near, far), *ends) for ends in (FOCI, HELIX_FOCI))
     helix = tune_baseline(pupil, settings, zones=ZONES, foci_mm=wound, count=6)
