@@ -44,8 +44,10 @@ def main() -> None:
         settings = load_finished_run(folder).settings
         for budget in settings.run.budgets_mmacs:
             errors = " | ".join(f"{e:.3f}" for e in axial_errors_mm(folder, budget))
-            trained = settings.optics.image_tolerance
-            print(f"| {folder.name} | {trained:g} | {budget:g} | {errors} |")
+            print(
+                f"| {folder.name} | {settings.optics.image_tolerance:g} "
+                f"| {budget:g} | {errors} |"
+            )
 
 
 if __name__ == "__main__":

@@ -221,7 +221,7 @@ class DifferentiableImager:
         """
         if self.pairs is None:
             raise ValueError(
-                "no field points were drawn: need live(..., pairs) to pass a gradient on"
+                "no field points were drawn: a gradient needs live(..., pairs)"
             )
         if self.light.grad is None:
             return
@@ -270,7 +270,7 @@ def _in_place(settings: OpticsConfig, wave: SmoothWave) -> Optics:
 
 
 @torch.no_grad()
-def apart(
+def uniform_image_error(
     settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
 ) -> float:
     """Relative L2 difference of the uniform image of a texture in depth from its true
@@ -293,11 +293,11 @@ def apart(
     )
     if not isinstance(true, Imager) or not isinstance(one, UniformImager):
         raise TrainingError("no pair of images to compare")
-    return difference(one, true)
+    return relative_image_difference(one, true)
 
 
 @torch.no_grad()
-def difference(one: UniformImager, true: Imager) -> float:
+def relative_image_difference(one: UniformImager, true: Imager) -> float:
     """Relative L2 difference of the image of a texture in depth through one PSF a depth
     from its true image.
 
@@ -328,7 +328,7 @@ def describe_image(
     """What the images are and how wrong, for a report: kind, error, and the source's
     width and filter.
 
-    error: of the uniform image, :func:`apart`; of the true image, its own estimate;
+    error: of the uniform image, :func:`uniform_image_error`; of the true image, its own estimate;
     None where the true image of this
     lens cannot be formed, for the reason under ``problem``. above: why the true image's
     own estimate is above
@@ -349,7 +349,9 @@ def describe_image(
     try:
         if settings.image == "uniform":
             return found | {
-                "error": apart(settings, coefficients_rad, frame, margin=margin)
+                "error": uniform_image_error(
+                    settings, coefficients_rad, frame, margin=margin
+                )
             }
         made = make_imager(settings, coefficients_rad, frame, margin=margin)
         return found | {
@@ -371,7 +373,7 @@ def describe_image_text(found: dict[str, Any]) -> str:
     if found["kind"] == "uniform":
         return (
             "image: one PSF for the whole field, one wavelength (uniform); it differs from the true image of a texture "
-            f"by {found['error']:.2f} of its contrast; optics.image = 'true' trains on that"
+            f"by {found['error']:.2f} of its contrast; optics.image = 'true' trains on it"
         )
     light = f"{found['fwhm_nm']:g} nm" if found["fwhm_nm"] else "one wavelength"
     return f"image: whole field, {light}, {100 * found['passed']:.0f} % of the light; error {found['error']:.3f}"

@@ -209,9 +209,9 @@ def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole
     what errs of the round lens.
     """
     assert isinstance(whole, Imager)
-    far = formed.apart(SMALL, 3 * BENT, FRAME, margin=MARGIN)
+    far = formed.uniform_image_error(SMALL, 3 * BENT, FRAME, margin=MARGIN)
     still = replace(SMALL, polynomials=0, focus_mm=22.0)
-    near = formed.apart(
+    near = formed.uniform_image_error(
         still, torch.zeros(0), 20, margin=5
     )  # a round lens over half of the field
     assert 0.02 < near < far < 1.0

@@ -101,35 +101,6 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
     other.restore(light.state())
     other.at(8, place + 4.0, 30, 5, live=False)
     assert made == [0.0, 2.0, 4.0, 4.0]
-    _passes_on_what_it_asked_for(monkeypatch, other, place, formed_once)
-
-
-def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
-    """The nodes whose light is asked for are those that the gradient is passed on from;
-    others at every step.
-    """
-    asked, passed, steps = [], [], (9, 10, 11, 9)
-
-    def live(settings, imaged, pairs):
-        made = LIVE(settings, imaged, pairs)
-        asked.append(made.ready.asked)
-        made.light.grad = torch.ones_like(made.light)
-        return made
-
-    def surrogate(optics, plan, gradient, pairs):
-        passed.append((len(pairs[0]), set(pairs[0].tolist())))
-        return torch.zeros((), requires_grad=True)
-
-    monkeypatch.setattr(formed, "make_differentiable_imager", live)
-    monkeypatch.setattr(formed, "surrogate_loss", surrogate)
-    for step in steps:
-        light.at(step, place, 30, 5, live=True)
-        light.pass_on(place)
-        light.pass_on(place)  # nothing is left of it
-    assert passed == [(2, nodes) for nodes in asked]
-    assert asked[0] == asked[3]
-    assert len({frozenset(nodes) for nodes in asked}) == 3
-    assert whole.plan.y_um.numel() * whole.plan.x_um.numel() > 6
 
 
 def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp_path):
