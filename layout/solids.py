@@ -110,6 +110,7 @@ def cut_tile(
         raise ProcessError(
             f"no pillar within {side_um} um around {centre_um}; move or enlarge the square"
         )
+    size_um = np.asarray(part[row, column], float)
     row, column = rows[row], columns[column]
     if lens.cell.shape.hole:
         raise ProcessError(
@@ -118,7 +119,7 @@ def cut_tile(
         )
     is_disc = grid.plain and lens.cell.shape.kind == "circle"
     classify = _discs if is_disc else _shapes
-    sections, kind = classify(lens, process, row, column)
+    sections, kind = classify(lens, process, size_um, (row, column))
     return SolidTile(
         sections,
         grid.x_um[column],
@@ -131,12 +132,11 @@ def cut_tile(
 
 
 def _discs(
-    lens: Lens, process: Process, row: Array, column: Array
+    lens: Lens, process: Process, size_um: Array, _: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of round pillars at sites, and which of them each is."""
     step, height = process.rules.diameter_step_nm, lens.cell.height_um
-    design_nm = lens.diameters.diameter_um[row, column] / nm
-    drawn = np.rint(process.written_diameter_nm(design_nm) / step).astype(np.int64)
+    drawn = np.rint(process.written_diameter_nm(size_um / nm) / step).astype(np.int64)
     sizes, kind = np.unique(drawn, return_inverse=True)
     made_nm = process.made_diameter_nm(sizes * step)
     top, foot = process.top_foot_nm(made_nm, height / nm)
@@ -167,21 +167,21 @@ def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> st
 
 
 def _shapes(
-    lens: Lens, process: Process, row: Array, column: Array
+    lens: Lens, process: Process, size_um: Array, sites: tuple[Array, Array]
 ) -> tuple[tuple[SolidSection, ...], Array]:
     """Sections of pillars of any shape and rotation at sites, and which each is."""
     grid, step = lens.diameters, process.rules.diameter_step_nm
 
     def drawn_steps(size_um: Array) -> Array:
-        drawn = process.bias.drawn_nm(np.asarray(size_um[row, column], float) / nm)
+        drawn = process.bias.drawn_nm(np.asarray(size_um, float) / nm)
         return np.rint(drawn / step).astype(np.int64) * step
 
-    keys = np.zeros((len(row), 3), np.int64)
-    keys[:, 0] = drawn_steps(grid.diameter_um)
+    keys = np.zeros((len(size_um), 3), np.int64)
+    keys[:, 0] = drawn_steps(size_um)
     if grid.length_um is not None:
-        keys[:, 1] = drawn_steps(grid.length_um)
+        keys[:, 1] = drawn_steps(grid.length_um[sites])
     if grid.angle_rad is not None:
-        angle = np.degrees(grid.angle_rad[row, column]) / process.rules.angle_step_deg
+        angle = np.degrees(grid.angle_rad[sites]) / process.rules.angle_step_deg
         turns = round(360 / process.rules.angle_step_deg)
         keys[:, 2] = np.rint(angle).astype(int) % turns
     used, kind = np.unique(keys, axis=0, return_inverse=True)

@@ -87,9 +87,9 @@ def drawn_blocks(
     The bias is looked up in a table of 1/16 nm; isolation is worked out where the
     process knows it.
     """
-    design, pitch = diameters.diameter_um, diameters.pitch_um
+    pitch = diameters.pitch_um
     step = process.rules.diameter_step_nm
-    table = np.arange(round(float(design.max(initial=0)) * _FINE / nm) + 2) / _FINE
+    table = np.arange(round(pitch * _FINE / nm) + 2) / _FINE
     straight = np.rint(process.written_diameter_nm(table) / step)
     straight[0] = 0
     lookup = np.clip(straight, 0, 65535).astype(np.uint16)

@@ -12,7 +12,6 @@ from codesign.optics.stack import OpticsConfig
 from codesign.train import run
 from codesign.train.light import StepImaging
 from metalens.core.errors import TrainingError
-from metalens.image import Imager
 
 FRAMES = """
 [scenes]
@@ -63,44 +62,6 @@ LIVE = formed.make_differentiable_imager
 
 def _never(step):
     return None
-
-
-def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monkeypatch):
-    made = []
-
-    def imaged(
-        settings, coefficients, frame, *, margin, device, error=None, made_of=made
-    ):
-        made_of.append(float(coefficients[0]))
-        return formed_once
-
-    settings = OpticsConfig(
-        aperture_mm=0.3, depths_mm=(16.0, 30.0), focus_mm=30.0, polynomials=5, sample_um=12.0, window_samples=11,
-        image="true", image_tolerance=0.5,
-    )  # fmt: skip
-    place = torch.zeros(5, dtype=torch.float64)
-    formed_once = formed.make_imager(settings, place, 30, margin=5)
-    assert isinstance(formed_once, Imager)
-    monkeypatch.setattr(formed, "make_imager", imaged)
-    monkeypatch.setattr(
-        formed,
-        "make_differentiable_imager",
-        lambda settings, whole, pairs: formed.DifferentiableImager(place, whole, pairs),
-    )
-    light = StepImaging(settings, (), refresh=3, draws=2, seed=0, draw=_never)
-    for step, moved in enumerate((0.0, 0.0, 1.0, 2.0, 3.0, 4.0)):
-        light.at(step, place + moved, 30, 5, live=step > 0)
-    assert made == [
-        0.0,
-        2.0,
-    ]  # at first; then at step 3, as it had waited; at step 4 it is imaged as at step 3
-    light.at(6, place + 4.0, 30, 5, live=False)
-    light.at(7, place + 4.0, 30, 5, live=False)
-    assert made == [0.0, 2.0, 4.0]  # at rest once, as it is
-    other = StepImaging(settings, (), refresh=3, draws=2, seed=0, draw=_never)
-    other.restore(light.state())
-    other.at(8, place + 4.0, 30, 5, live=False)
-    assert made == [0.0, 2.0, 4.0, 4.0]
 
 
 def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp_path):

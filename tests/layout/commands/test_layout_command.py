@@ -26,6 +26,8 @@ from metalens.lens.record import DiameterMap, Lens
 from metalens.library.proxy import Proxy
 from metalens.optics import Layers, Stop
 
+FORMATS = (".oas", ".gds", ".stl")
+
 
 @pytest.fixture(scope="module")
 def lens_file(tmp_path_factory):
@@ -59,6 +61,22 @@ def lens_file(tmp_path_factory):
 
 def run(*words):
     return cli.main(["layout", *map(str, words)])
+
+
+@pytest.mark.parametrize("words", [("--oasis", "--gds"), ("--stl",)])
+def test_a_lens_whose_diameters_stay_in_its_file_gives_the_same_mask(
+    lens_file, tmp_path, monkeypatch, words
+):
+    more = ["--window.size-um", "8"] if "--stl" in words else []
+    for name in ("whole", "rows"):
+        if name == "rows":  # as of a lens of several millimetres
+            monkeypatch.setattr("metalens.lens.record.MOST_HELD_BYTES", 0)
+        out = str(tmp_path / name)
+        assert cli.main(["layout", str(lens_file), "-o", out, *words, *more]) == 0
+    written = [p for p in (tmp_path / "whole").iterdir() if p.suffix in FORMATS]
+    assert len(written) >= len(words)
+    for path in written:
+        assert path.read_bytes() == (tmp_path / "rows" / path.name).read_bytes()
 
 
 def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
