@@ -216,9 +216,7 @@ def symmetry_classes(
     Args:
         cell, size_um: the pillar, whose mirrors count. light: its direction.
     """
-    # a size below rounding has no spatial frequencies to compare
-    resolvable = size_um > np.finfo(float).eps * cell.pitch_um
-    outline = cell.outline(size_um if resolvable else cell.pitch_um / 2)
+    outline = cell.outline(max(size_um, _ROUNDING))
     flip_x = light.kx == 0 and outline.keeps(-1, 1)
     flip_y = light.ky == 0 and outline.keeps(1, -1)
     if flip_x and flip_y:
