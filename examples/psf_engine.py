@@ -30,6 +30,7 @@ sys.path.insert(
 )  # the rivals that this page measures lie beside the folder of examples
 
 from benchmarks.peers import lowrank
+from benchmarks.peers.angular_spectrum import angular_spectrum
 from benchmarks.peers.radial import Radial, field_radial
 from metalens import propagate, psf
 from metalens.psf import metrics as psf_metrics
@@ -93,11 +94,10 @@ points = {"exact sum": [(exact_seconds, 1e-12)]}
 some = DEPTHS[::10]
 for label, options in (
     ("angular spectrum, complex64", dict(single=True)),
-    ("angular spectrum, band-limited", dict(band_limited=True)),
     ("angular spectrum, pad 4", dict(pad=4)),
 ):
     field, seconds = timed(
-        lambda o=options: propagate.angular_spectrum(
+        lambda o=options: angular_spectrum(
             phase, transmission, **on_lattice, depths_um=some, **o
         ),
         1,

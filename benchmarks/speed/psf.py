@@ -14,6 +14,7 @@ import torch
 
 from benchmarks import Row, fastest
 from benchmarks.peers import lowrank
+from benchmarks.peers.angular_spectrum import angular_spectrum, free_space_transfer
 from benchmarks.peers.radial import Radial, field_radial
 from benchmarks.speed._psf_case import (
     DEPTHS,
@@ -35,7 +36,6 @@ from benchmarks.speed._psf_case import (
     textbook,
 )
 from metalens import propagate, psf
-from metalens.propagate.direct import free_space_transfer
 from metalens.propagate.estimate import draw_pixels, sampled_square_error
 
 WIDE = dict(
@@ -94,9 +94,7 @@ def _main_rows() -> list[Row]:
     case = propagate.make_case(
         maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW
     )
-    h = torch.tensor(
-        free_space_transfer(case, (5000, 5000), band_limited=False).astype("c8")
-    )
+    h = torch.tensor(free_space_transfer(case, (5000, 5000)).astype("c8"))
     slow = [
         fastest(lambda g=g: textbook(maps, h, grad=g), repeats=2) * len(DEPTHS)
         for g in (False, True)
@@ -165,7 +163,7 @@ def _lattice_error(maps: Any) -> float:
         offset_um=(PITCH / 2, PITCH / 2),
     )
     arrays = maps[0].numpy(), maps[1].numpy()
-    got = np.abs(propagate.angular_spectrum(*arrays, single=True, **geometry)) ** 2
+    got = np.abs(angular_spectrum(*arrays, single=True, **geometry)) ** 2
     want = np.abs(propagate.exact(*arrays, **geometry)) ** 2
     return float(
         np.linalg.norm(got / got.sum() - want / want.sum())

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 import torch
 
 from benchmarks import Row, fastest
+from benchmarks.peers.angular_spectrum import free_space_transfer
 from benchmarks.speed._psf_case import (
     DEPTHS,
     GEOMETRY,
@@ -27,7 +28,6 @@ from benchmarks.speed._psf_case import (
     textbook,
 )
 from metalens import propagate
-from metalens.propagate.direct import free_space_transfer
 
 FIELDS = 14  # depth fields, about
 WINDOWS = (
@@ -43,9 +43,7 @@ def rows() -> Iterator[Row]:
     case = propagate.make_case(
         maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW
     )
-    h = torch.tensor(
-        free_space_transfer(case, (PADDED, PADDED), band_limited=False).astype("c8")
-    )
+    h = torch.tensor(free_space_transfer(case, (PADDED, PADDED)).astype("c8"))
     slow = fastest(lambda: textbook(maps, h, grad=False), repeats=1) * len(DEPTHS)
     yield Row(
         "1 mm free-form, 21 depths",

@@ -15,9 +15,9 @@ from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.propagate.direct import add_point_waves, point_wave
 from metalens.propagate.geometry import PropagationCase
-from metalens.propagate.operators import depth_factors
+from metalens.propagate.moments import Pupils
 from metalens.propagate.paths import rayleigh_sommerfeld_kernel, to_sensor
-from metalens.propagate.pillars import Pupils
+from metalens.propagate.window import depth_factors
 
 POINTS, EVERY = (
     128,

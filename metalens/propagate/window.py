@@ -4,10 +4,9 @@ the lens.
 
 import dataclasses
 import functools
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,30 +16,512 @@ from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
 from metalens.propagate.geometry import PropagationCase, window_tiles
-from metalens.propagate.nodes import WindowLayout, plan_layout
-from metalens.propagate.operators import (
-    DepthBasis,
-    build_operators,
-    depth_basis,
-    depth_factors,
-    significant_pairs,
-)
-from metalens.propagate.paths import over_blocks, reference_depth, to_sensor
-from metalens.propagate.pillars import (
+from metalens.propagate.moments import (
     PillarMoments,
     Pupils,
     mix_components,
     plan_moments,
     reduce_to_moments,
 )
-from metalens.propagate.wide import WidePlan, wide_plan
+from metalens.propagate.paths import (
+    chief_path,
+    cosine_y,
+    direction_range,
+    from_source,
+    kernel_derivatives,
+    over_blocks,
+    plane_wave_residual,
+    probe_positions,
+    ray_cosines,
+    rayleigh_sommerfeld_kernel,
+    reference_depth,
+    to_sensor,
+)
+
+MOST_NODES = 400
+
+
+MOST_TABLE = 4e6
+
+
+# by which the error of a truncated series at the corner of a tile, where a PSF may lie,
+# exceeds its mean
+EDGE = 8
+
+
+PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCounts:
+    """Counts chosen for a case and tolerance.
+
+    nodes: (y, x) Legendre nodes over the lens; directions: direction cosines p along x.
+    window: (y, x), lens: (row, direction) grids on which the correction is sampled.
+    """
+
+    nodes: tuple[int, int]
+    directions: int
+    window: tuple[int, int]
+    lens: tuple[int, int]
+
+    @property
+    def table(self) -> int:
+        """Size of the table of the correction."""
+        return self.window[0] * self.window[1] * self.lens[0] * self.lens[1]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowLayout:
+    """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
+    sizes: of every tile; work: products for all tiles."""
+
+    nodes: tuple[int, int]
+    parts: int
+    sizes: NodeCounts
+    work: float
+
+
+@functools.lru_cache(maxsize=1024)
+def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
+    """How the window is cut so that it costs least; None where no cut brings the tables
+    down to some 100 MB.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+
+    Raises:
+        PropagationError: more than 400 nodes would be needed; the window is too large
+            for this method.
+    """
+    nodes = lens_nodes(case, tolerance / 4)
+    best = None
+    for parts in PARTS:
+        if parts > max(case.samples):
+            break
+        rows = window_tiles(case, parts)[1]
+        corners = {
+            _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
+        }
+        found = _largest([node_counts(tile, tolerance) for tile in corners])
+        tile, depths = rows[0][0], len(case.inverse_depths_per_um)
+        handing_down = nodes[0] * nodes[1] * (50 + found.nodes[0])
+        work = parts**2 * (_products(tile, found, depths) + handing_down)
+        if found.table <= MOST_TABLE and (best is None or work < best.work):
+            best = WindowLayout(nodes, parts, found, work)
+        elif best is not None:
+            break
+    return best
+
+
+def _alike(tile: PropagationCase) -> PropagationCase:
+    """The tile, or its mirror image, which needs the same counts, where the source is
+    straight ahead along an axis.
+    """
+    x, y = (
+        abs(c) if slope == 0 else c
+        for c, slope in zip(tile.centre_um, tile.tangents, strict=True)
+    )
+    return replace(tile, centre_um=(x, y))
+
+
+def _largest(found: list[NodeCounts]) -> NodeCounts:
+    """Counts that do for all."""
+    pairs = [
+        tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1))
+        for name in ("nodes", "window", "lens")
+    ]
+    return NodeCounts(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
+
+
+def _products(case: PropagationCase, found: NodeCounts, depths: int) -> float:
+    """Complex products of one tile: along y, along x, and of the depth fields; reading
+    a node counts as 25 of them."""
+    (my, mx), (ny, nx), b = case.samples, found.nodes, min(depths, 14)
+    fields = 0.75 * b * max(found.window)
+    along = found.directions * fields * (ny * (25 + my) + mx * my)
+    return 1e5 + along + 30 * b * ny * nx
+
+
+def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
+    """(y, x) nodes over the lens that the kernel needs.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+    """
+    high_y, high_x = case.half_size_um
+    rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
+    return rows, _count(
+        lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns"
+    )
+
+
+def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
+    """The counts that a tile needs.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+
+    Raises:
+        PropagationError: more than 400 nodes would be needed.
+    """
+    share = tolerance / 4
+    high_y = case.half_size_um[0]
+    nodes = lens_nodes(case, share)
+    low, high = direction_range(case, legendre.mapped_nodes(nodes[0], -high_y, high_y))
+    middle, reach = (low + high) / 2, (high - low) / 2
+    directions = _count(
+        lambda t: _over_directions(case, middle + reach * t), share, "directions"
+    )
+    wy, wx = case.half_window_um
+    edge = max(share / EDGE, min(share, 1e-13))  # rounding leaves no smaller tails
+    window_x = _count(
+        lambda t: _over_window(case, (low, high), X=t * wx), edge, "window columns"
+    )
+    window_y = _count(
+        lambda t: _over_window(case, (low, high), Y=t * wy), edge, "window rows"
+    )
+    lens_p = _count(
+        lambda t: _over_window(case, (low, high), p=middle + reach * t),
+        edge,
+        "correction directions",
+    )
+    lens_e = _count(
+        lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows"
+    )
+    return NodeCounts(nodes, directions, (window_y, window_x), (lens_e, lens_p))
+
+
+def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
+    count = 32
+    while count <= 1.5 * MOST_NODES:
+        found = legendre.needed_node_count(
+            lines(legendre.gauss_legendre_nodes(count)[0]), tolerance
+        )
+        if found <= min(count, MOST_NODES):
+            return max(found, 2)
+        count *= 2
+    raise PropagationError(
+        f"windowed propagation needs more than {MOST_NODES} nodes ({what}); "
+        "make the window smaller, or use propagate.exact"
+    )
+
+
+def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array:
+    """(line, node) of the kernel along lens columns (x given) or rows (y given)."""
+    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    inverse = np.array(
+        [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
+    )
+    other = np.array([-0.9, 0.0, 0.9])
+    grid = np.meshgrid(
+        other, probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
+    )
+    o, X, Y, v = (g.reshape(-1, 1) for g in grid)
+    return rayleigh_sommerfeld_kernel(
+        case, o * hx if x is None else x, o * hy if y is None else y, X, Y, v
+    )
+
+
+def _over_directions(case: PropagationCase, p: Array) -> Array:
+    """(line, direction) of the window kernel along p at fixed lens rows."""
+    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    grid = np.meshgrid(
+        np.array([-0.9, 0.0, 0.9]) * hy,
+        probe_positions() * wx,
+        probe_positions() * wy,
+        indexing="ij",
+    )
+    e, X, Y = (g.reshape(-1, 1) for g in grid)
+    residual = plane_wave_residual(case, p, e, X, Y)
+    q = cosine_y(case, p, e)
+    return np.asarray(residual * np.exp(-1j * case.wavenumber * (p * X + q * Y)))
+
+
+def _over_window(
+    case: PropagationCase, span: tuple[float, float], **line: Array
+) -> Array:
+    """(line, node) of the correction along one of X, Y, p, e, the others on a few
+    probes.
+    """
+    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    low, high = span
+    middle, reach = (low + high) / 2, (high - low) / 2
+    probes = {
+        "X": probe_positions() * wx,
+        "Y": probe_positions() * wy,
+        "p": middle + reach * probe_positions(),
+        "e": probe_positions() * hy,
+    }
+    names = [n for n in probes if n not in line]
+    grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
+    at: dict[str, Any] = {
+        n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)
+    } | line
+    return plane_wave_residual(case, at["p"], at["e"], at["X"], at["Y"])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DepthBasis:
+    """Fields on the lens nodes that span the curvatures of all depths.
+
+    basis: (b, e, x); coefficients: (depth, b); strength: (b,).
+    """
+
+    basis: Array
+    coefficients: Array
+    strength: Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TileOperators:
+    """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column
+    nodes, p = directions.
+
+    to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
+    lens_terms: (p, e, r), window_terms: (X, Y, r) of the correction; strength: (r,).
+    """
+
+    to_directions: Array
+    along_y: Array
+    along_x: Array
+    lens_terms: Array
+    window_terms: Array
+    strength: Array
+
+
+def depth_factors(
+    case: PropagationCase, e: Any, x: Any, tangents: Any, inverse: Any
+) -> Any:
+    """k(s_z - s_ref) on the lens nodes (depth, e, x), rad; numpy or torch operands.
+
+    Args:
+        case: geometry of the propagation.
+        tangents: (x, y) of the field angle, in air.
+        inverse: 1 / depth of the source, 1/um.
+    """
+    reference = from_source(case, x, e, case.tangents, reference_depth(case))
+    return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
+
+
+def depth_basis(
+    case: PropagationCase,
+    nodes_um: tuple[Array, Array],
+    tolerance: float,
+    *,
+    moving: bool = False,
+) -> DepthBasis:
+    """Few fields that span the curvatures of all depths.
+
+    With ``moving`` they also span the derivatives in inverse depth and tangents.
+    Orthonormal under the quadrature of
+    the nodes; truncated at ``tolerance`` root mean square.
+
+    Args:
+        case: geometry of the propagation.
+        nodes_um: (e,) and (x,) positions on the lens.
+    """
+    e, x = nodes_um[0][:, None], nodes_um[1]
+    weight = np.sqrt(
+        np.outer(
+            legendre.gauss_legendre_nodes(len(e))[1],
+            legendre.gauss_legendre_nodes(len(x))[1],
+        )
+    )
+    inverse = np.array(case.inverse_depths_per_um)
+    count = 48
+    # until the rank says that no depth lies between the nodes: they need pi a period,
+    # the fields two
+    while True:
+        few = len(inverse) > count
+        training = (
+            np.clip(legendre.mapped_nodes(count, inverse.min(), inverse.max()), 0, None)
+            if few
+            else inverse
+        )
+        fields = (
+            np.exp(
+                1j * depth_factors(case, e, x, case.tangents, training[:, None, None])
+            )
+            * weight
+        )
+        if moving:
+            fields = np.concatenate(
+                [fields, *_tangents(case, e, x, training[:, None, None], fields)]
+            )
+        _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
+        tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+        rank = int(max(1, (tail > tolerance).sum()))
+        if not few or rank <= 2 / np.pi * count:
+            break
+        count *= 2
+    basis = v[:rank].reshape(rank, len(e), len(x))
+    coefficients = np.empty((len(inverse), rank), complex)
+    for start in range(0, len(inverse), 16):
+        part = inverse[start : start + 16, None, None]
+        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
+        coefficients[start : start + 16] = (
+            fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
+        )
+    return DepthBasis(
+        np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
+    )
+
+
+def _tangents(
+    case: PropagationCase, e: Array, x: Array, inverse: Array, fields: Array
+) -> list[Array]:
+    """Derivatives of the depth fields in inverse depth and the tangents, each of the
+    fields' own norm; complex step.
+    """
+    out = []
+    h = 1e-30
+    for step in ((0, 0, 1j * h), (1j * h, 0, 0), (0, 1j * h, 0)):
+        tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
+        slope = (
+            case.wavenumber
+            * from_source(case, x, e, tangents, inverse + step[2]).imag
+            / h
+        )
+        slope = np.broadcast_to(slope, fields.shape)
+        scale = np.sqrt(
+            (np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum()
+        )
+        if scale > 0:
+            out.append(1j * slope / scale * fields)
+    return out
+
+
+def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
+    """(2, n) pairs (correction term, depth field) whose joint strength matters; the
+    rest sums below tolerance.
+
+    Args:
+        size: strengths of the depth fields.
+    """
+    joint = (np.outer(strength, size) ** 2).ravel()
+    order = np.argsort(joint)
+    least = np.cumsum(joint[order]) <= tolerance**2 * joint.sum()
+    kept = np.sort(order[~least])
+    return np.stack(np.unravel_index(kept, (len(strength), len(size))))
+
+
+def build_operators(
+    case: PropagationCase,
+    chosen: NodeCounts,
+    tolerance: float,
+    *,
+    slope: int | None = None,
+) -> TileOperators:
+    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
+    window centre x, y instead.
+
+    Args:
+        case: geometry of the propagation.
+        chosen: counts of nodes and directions.
+        tolerance: relative error of the field.
+    """
+    (ny, nx), m = chosen.nodes, chosen.directions
+    high_y, high_x = case.half_size_um
+    e, x = (
+        legendre.mapped_nodes(ny, -high_y, high_y),
+        legendre.mapped_nodes(nx, -high_x, high_x),
+    )
+    low, high = direction_range(case, e)
+    p = legendre.mapped_nodes(m, low, high)
+    far = (e - case.centre_um[1])[:, None]
+    towards = ray_cosines(case, x - case.centre_um[0], far)
+    y_um, x_um = case.window_um
+    k = case.wavenumber
+    q = cosine_y(case, p[:, None], e[None, :])
+    lens_terms, window_terms, strength = _low_rank(
+        case, chosen, tolerance / 2, (low, high), slope
+    )
+    return TileOperators(
+        to_directions=legendre.interpolation_matrix(
+            m, (2 * towards - low - high) / (high - low)
+        ),
+        along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
+        along_x=np.exp(-1j * k * x_um[:, None] * p),
+        lens_terms=lens_terms,
+        window_terms=window_terms * np.exp(1j * k * chief_path(case)),
+        strength=strength,
+    )
+
+
+def _low_rank(
+    case: PropagationCase,
+    chosen: NodeCounts,
+    tolerance: float,
+    span: tuple[float, float],
+    slope: int | None,
+) -> tuple[Array, Array, Array]:
+    """Correction as Σ_r lens_terms[p, e, r] window_terms[X, Y, r], pillar area
+    included; and strengths (r,).
+    """
+    (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
+    (my, mx), (me, mp) = chosen.window, chosen.lens
+    Y, X = legendre.mapped_nodes(my, -wy, wy), legendre.mapped_nodes(mx, -wx, wx)
+    e, p = legendre.mapped_nodes(me, -hy, hy), legendre.mapped_nodes(mp, *span)
+    at = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
+    table = plane_wave_residual(case, *at)
+    if slope is not None:
+        table = table * kernel_derivatives(case, *at)[slope]
+    left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
+    y_um, x_um = case.window_um
+    Iy, Ix = (
+        legendre.interpolation_matrix(my, y_um / wy),
+        legendre.interpolation_matrix(mx, x_um / wx),
+    )
+    window_terms = np.einsum(
+        "Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True
+    )
+    e_um = legendre.gauss_legendre_nodes(chosen.nodes[0])[0]
+    p_um = legendre.gauss_legendre_nodes(chosen.directions)[0]
+    Ie, Ip = (
+        legendre.interpolation_matrix(me, e_um),
+        legendre.interpolation_matrix(mp, p_um),
+    )
+    lens_terms = np.einsum(
+        "Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True
+    )
+    return lens_terms, window_terms, np.linalg.norm(left, axis=0)
+
+
+def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
+    """table ≈ left (row, r) @ right (r, column) within ``tolerance`` in the Frobenius
+    norm; randomised range finder.
+    """
+    random = np.random.default_rng(0)
+    total = np.linalg.norm(table)
+    rank = min(16, *table.shape)
+    while True:
+        left = np.linalg.qr(table @ random.standard_normal((table.shape[1], rank)))[0]
+        right = left.conj().T @ table
+        if (
+            rank == min(table.shape)
+            or np.linalg.norm(table - left @ right) <= tolerance * total / 4
+        ):
+            break
+        rank = min(2 * rank, *table.shape)
+    u, size, v = np.linalg.svd(right, full_matrices=False)
+    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1]) / total
+    keep = int(max(1, (tail > tolerance).sum()))
+    return left @ u[:, :keep] * size[:keep], v[:keep]
+
 
 SMOOTH = (
     4,
     2,
 )  # nodes more over the lens, and in a block, where light is multiplied by such factors there
+
+
 MORE = 8  # orders of the moments beyond those used, for the posterior error
-KEPT_BYTES = 400e6  # of plans that are kept
+
+
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
 
@@ -106,71 +587,7 @@ class MovingGeometry:
     centre: torch.Tensor
 
 
-Kept = TypeVar("Kept", WindowPlan, WidePlan)
-_kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
-_lock = threading.Lock()
-
-
-def plan_window(
-    case: PropagationCase,
-    tolerance: float,
-    dtype: torch.dtype,
-    moving: bool = False,
-    *,
-    smooth: bool = False,
-) -> WindowPlan:
-    """Plan a windowed propagation; those used last are kept, as many as fit in
-    ``KEPT_BYTES``.
-
-    Args:
-        case, tolerance: geometry, and relative error of the field.
-        dtype: of the maps; sums over blocks of pillars are in float64.
-        moving: for use with :class:`MovingGeometry`.
-        smooth: with factors (``Pupils``) on the light of the nodes.
-
-    Raises:
-        PropagationError: the window is too large for the method.
-    """
-    made = functools.partial(
-        _planned, case, tolerance, dtype, moving=moving, smooth=smooth
-    )
-    return _keep((case, tolerance, dtype, moving, smooth), made)
-
-
-def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
-    """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
-
-    Args:
-        case, tolerance: geometry, and relative error of the field.
-        dtype: of the maps and of the transforms.
-
-    Raises:
-        PropagationError: rays too steep for the method.
-    """
-    made = functools.partial(wide_plan, case, tolerance, dtype)
-    return _keep((case, tolerance, dtype, "wide"), made)
-
-
-def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
-    """The plan that is kept under a key, or a new one."""
-    with _lock:
-        found = _kept.pop(key, None)
-        if found is not None:
-            _kept[key] = found
-            return found  # type: ignore[no-any-return]
-    with one_blas_thread():
-        found = made()
-    with _lock:
-        _kept[key] = found
-        room = KEPT_BYTES
-        for other in reversed(list(_kept)):
-            room -= _kept[other].bytes
-            if room < 0 and other != key:
-                del _kept[other]
-    return found
-
-
-def _planned(
+def window_plan(
     case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,

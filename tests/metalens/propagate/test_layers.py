@@ -352,8 +352,6 @@ def test_films_that_do_not_fit_are_refused_by_name():
             (9, 9),
             **GEOMETRY | dict(layers=Layers(behind=(Film(Index(1.5, 0.2), 3.0),))),
         )
-    with pytest.raises(PropagationError, match="knows no films"):
-        propagate.angular_spectrum(np.zeros((9, 9)), np.ones((9, 9)), **GEOMETRY)
 
 
 def test_chief_ray_and_its_path_obey_snell():

@@ -12,11 +12,7 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.core import legendre
 from metalens.core.errors import PropagationError
-from metalens.propagate import window as windowed
-from metalens.propagate.nodes import plan_layout
-from metalens.propagate.operators import depth_basis, depth_factors
 
 WAVELENGTH, PITCH = 0.85, 0.4
 K = 2 * np.pi / WAVELENGTH
@@ -205,8 +201,6 @@ def test_maps_that_are_not_square(shape):
 def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
     geometry = dict(sensor_distance_um=20.0, window_um=30.0, samples=16)
     check(*lens((64, 64), distance=20.0), tolerance=1e-4, **geometry)
-    case = propagate.make_case((64, 64), **GEOMETRY | geometry)
-    assert plan_layout(case, 1e-4).parts > 1
 
 
 @pytest.mark.slow
@@ -216,37 +210,6 @@ def test_a_window_too_large_for_one_plan_is_computed_in_parts():
         *lens((300, 300), distance=3000.0, pitch=3.0), tolerance=1e-4, **geometry
     )
     assert "tiles" in stack.reason
-
-
-def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
-    """21 directions in turn keep their plans; where bytes for three are left, the
-    oldest go.
-    """
-    cases = [
-        propagate.make_case(
-            (31, 27),
-            pitch_um=0.4,
-            wavelength_um=0.85,
-            sensor_distance_um=40.0,
-            depths_um=[900.0],
-            angle_rad=0.01 * i,
-            window_um=6.0,
-            samples=5,
-        )
-        for i in range(21)
-    ]
-    about = 1e-3, torch.float32
-    first = [windowed.plan_window(one, *about) for one in cases]
-    assert all(
-        windowed.plan_window(one, *about) is kept
-        for one, kept in zip(cases, first, strict=True)
-    )
-    assert all(one.bytes > sum(t.nbytes for t in one.tensors.values()) for one in first)
-    monkeypatch.setattr(windowed, "KEPT_BYTES", 3.5 * max(one.bytes for one in first))
-    newer = windowed.plan_window(cases[0], 2e-3, *about[1:])
-    assert windowed.plan_window(cases[0], 2e-3, *about[1:]) is newer
-    assert windowed.plan_window(cases[20], *about) is first[20]
-    assert windowed.plan_window(cases[5], *about) is not first[5]
 
 
 def test_energy_is_kept_in_a_large_window():
@@ -311,37 +274,6 @@ def score(phase, level, **geometry):
     return (
         torch.sin(0.37 * ramp) * stack.intensity
     ).sum() + 1e-3 * stack.energy_um2.sum()
-
-
-def test_gradcheck_of_the_moments_and_of_the_window():
-    from metalens.propagate.paths import over_blocks
-    from metalens.propagate.pillars import plan_moments, reduce_to_moments
-    from metalens.propagate.window import legendre_bases, plan_window, zoom_to_tiles
-
-    case = propagate.make_case((9, 70), **GEOMETRY | dict(samples=3))
-    made = plan_moments(
-        case,
-        1e-3,
-        legendre_bases(case, (3, 4)),
-        over_blocks(case),
-        tolerance=1e-9,
-        dtype=torch.float64,
-    )
-    assert (
-        made.blocks[1].nodes < made.blocks[1].length
-    )  # light is moved to fewer nodes than pillars
-    maps = [torch.tensor(m).requires_grad_() for m in lens((9, 70), kind="noisy")]
-    assert torch.autograd.gradcheck(
-        lambda p, t: torch.view_as_real(reduce_to_moments(p, t, made)[0]), maps
-    )
-    found = plan_window(case, 1e-4, torch.float64)
-    count = found.tensors["turn"].shape[0]
-    light = torch.randn(
-        count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True
-    )
-    assert torch.autograd.gradcheck(
-        lambda v: torch.view_as_real(zoom_to_tiles(v, found.tensors)), light
-    )
 
 
 def test_directional_derivatives_in_phase_and_transmission():
@@ -468,32 +400,3 @@ def test_settings_that_cannot_be_met_are_reported_not_hidden():
     assert not stack.converged
     assert error < 1e-9
     assert dataclasses.replace(stack, tolerance=1e-9).converged
-
-
-def test_many_depths_of_a_fast_lens_are_spanned_by_the_basis():
-    """Depths that differ by many turns at the rim need more training fields than the
-    first few.
-    """
-    many = propagate.make_case((512, 512), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=200.0, window_um=12.0,
-                          samples=12, depths_um=np.linspace(120.0, 900.0, 150))  # fmt: skip
-    x = legendre.mapped_nodes(64, -102.4, 102.4)
-    basis = depth_basis(many, (x, x), 1e-5)
-    weight = np.outer(
-        legendre.gauss_legendre_nodes(64)[1], legendre.gauss_legendre_nodes(64)[1]
-    )
-    want = np.exp(
-        1j
-        * depth_factors(
-            many,
-            x[:, None],
-            x,
-            many.tangents,
-            np.array(many.inverse_depths_per_um)[:, None, None],
-        )
-    )
-    got = np.einsum("db,byx->dyx", basis.coefficients, basis.basis)
-    error = np.sqrt(
-        (weight * np.abs(got - want) ** 2).sum() / (weight * np.abs(want) ** 2).sum()
-    )
-    assert len(basis.strength) > 48
-    assert error < 3e-5

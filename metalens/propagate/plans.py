@@ -1,0 +1,212 @@
+"""The method for a case at a tolerance; plans of the last cases are kept."""
+
+import functools
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+
+from metalens.core.arrays import to_tensor
+from metalens.core.errors import PropagationError
+from metalens.core.threads import one_blas_thread
+from metalens.propagate.geometry import PropagationCase, make_case, split_window
+from metalens.propagate.wide import WidePlan, is_wide, wide_plan
+from metalens.propagate.window import (
+    MOST_NODES,
+    WindowLayout,
+    WindowPlan,
+    field_windowed,
+    plan_layout,
+    window_plan,
+)
+
+EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
+
+
+WIDE_WORK = 1e9  # pillars x samples from which transforms are
+
+
+@dataclass(frozen=True, slots=True)
+class MethodChoice:
+    """How the field on a window is computed.
+
+    method: ``exact``, ``windowed``, ``tiled`` or ``wide``. reason: in words.
+    tiles: (row, column) windows that are computed separately.
+    """
+
+    method: str
+    reason: str
+    tiles: tuple[tuple[PropagationCase, ...], ...]
+
+
+@functools.lru_cache(maxsize=1024)
+def choose_method(
+    case: PropagationCase,
+    tolerance: float,
+    *,
+    differentiable: bool = False,
+    moving: bool = False,
+) -> MethodChoice:
+    """Exact sum for little work, Fourier transforms for wide windows, else windowed.
+
+    The angular spectrum is never chosen: its error (lattice, padding) has no bound.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        differentiable: leave out the exact sum, which has no derivatives.
+        moving: leave out the transforms too, which have none in the geometry.
+
+    Returns:
+        The method, its reason and its tiles.
+    """
+    pillars, points = case.shape[0] * case.shape[1], case.samples[0] * case.samples[1]
+    depths = len(case.inverse_depths_per_um)
+    if not differentiable and pillars * points * (depths + 2) / 3 < EXACT_WORK:
+        reason = f"exact sum: {pillars:,} pillars at {points} points"
+        return MethodChoice("exact", reason, ((case,),))
+    many = pillars * points > WIDE_WORK
+    if not moving and many and is_wide(case, tolerance):
+        return MethodChoice("wide", "wide window by Fourier transforms", ((case,),))
+    with one_blas_thread():
+        tiles = _windows(case, tolerance)
+        layout = _layout(tiles[0][0], tolerance)
+    count = sum(map(len, tiles))
+    if count > 1 or layout is None:
+        why = f"the whole window would need over {MOST_NODES} nodes or a large table"
+        return MethodChoice("tiled", f"windowed in {count} tiles: {why}", tiles)
+    rows, columns = layout.nodes
+    return MethodChoice("windowed", f"windowed: {rows} x {columns} nodes", tiles)
+
+
+def _windows(
+    case: PropagationCase, tolerance: float
+) -> tuple[tuple[PropagationCase, ...], ...]:
+    """The window, cut into equal parts until each can be planned with a useful number
+    of nodes.
+    """
+    parts = 1
+    while True:
+        rows = split_window(case, parts)
+        corners = rows[0][0], rows[-1][-1]
+        if all(_layout(window, tolerance) is not None for window in corners):
+            return rows
+        if parts >= max(case.samples):
+            raise PropagationError(
+                "the windowed method cannot reach this geometry even sample by sample; use propagate.exact"
+            )
+        parts *= 2
+
+
+def _layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
+    try:
+        return plan_layout(case, tolerance)
+    except PropagationError:
+        return None
+
+
+KEPT_BYTES = 400e6  # of plans that are kept
+
+
+Kept = TypeVar("Kept", WindowPlan, WidePlan)
+
+
+_kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
+
+
+_lock = threading.Lock()
+
+
+def plan_window(
+    case: PropagationCase,
+    tolerance: float,
+    dtype: torch.dtype,
+    moving: bool = False,
+    *,
+    smooth: bool = False,
+) -> WindowPlan:
+    """Plan a windowed propagation; those used last are kept, as many as fit in
+    ``KEPT_BYTES``.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps; sums over blocks of pillars are in float64.
+        moving: for use with :class:`MovingGeometry`.
+        smooth: with factors (``Pupils``) on the light of the nodes.
+
+    Raises:
+        PropagationError: the window is too large for the method.
+    """
+    make = functools.partial(
+        window_plan, case, tolerance, dtype, moving=moving, smooth=smooth
+    )
+    return _keep((case, tolerance, dtype, moving, smooth), make)
+
+
+def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
+    """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps and of the transforms.
+
+    Raises:
+        PropagationError: rays too steep for the method.
+    """
+    made = functools.partial(wide_plan, case, tolerance, dtype)
+    return _keep((case, tolerance, dtype, "wide"), made)
+
+
+def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
+    """The plan that is kept under a key, or a new one."""
+    with _lock:
+        found = _kept.pop(key, None)
+        if found is not None:
+            _kept[key] = found
+            return found  # type: ignore[no-any-return]
+    with one_blas_thread():
+        found = made()
+    with _lock:
+        _kept[key] = found
+        room = KEPT_BYTES
+        for other in reversed(list(_kept)):
+            room -= _kept[other].bytes
+            if room < 0 and other != key:
+                del _kept[other]
+    return found
+
+
+def windowed(
+    phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **geometry: Any
+) -> Any:
+    """Windowed propagation: only the field on the window, differentiable in torch phase
+    and transmission.
+
+    Args:
+        phase_rad, transmission: (y, x) torch tensors or numpy arrays, float32 or
+            float64.
+        tolerance: relative error of the field that the node counts are chosen for.
+        geometry: as :func:`make_case`.
+
+    Returns:
+        (depth, y, x) complex, of the kind that came in.
+
+    Raises:
+        PropagationError: the window is too large for the method, a tolerance that is
+            not above 0 and below 1;
+            otherwise as :func:`exact`.
+
+    Sums are in float64 whatever comes in, so that a tighter tolerance is not lost in
+    rounding.
+    """
+    if not 0 < tolerance < 1:
+        raise PropagationError(
+            f"tolerance is {tolerance}, need a relative error above 0 and below 1"
+        )
+    phase = to_tensor(phase_rad)
+    level = to_tensor(transmission).to(phase)
+    made = plan_window(make_case(phase.shape, **geometry), tolerance, torch.float64)
+    field = field_windowed(phase.double(), level.double(), made)
+    field = field.to(torch.complex(phase.new_zeros(()), phase.new_zeros(())).dtype)
+    return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()
