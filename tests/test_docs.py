@@ -49,7 +49,7 @@ def _blocks(path, language):
 def _records():
     from characterize.bench.bench import HiddenLens
     from characterize.bench.protocol import BenchProtocol
-    from characterize.pupil.record import PupilSpec
+    from characterize.pupil.model import PupilSpec
     from codesign.commands.evaluate_optics import OpticsSettings as Optics
     from layout.arrange.record import Floorplan
     from layout.process.process import Process

@@ -13,7 +13,7 @@ from benchmarks import Row
 from characterize.inference import leastsquares
 from characterize.inference.leastsquares import FitImages, GaussianPrior, SolverSettings
 from characterize.pupil import zernike
-from characterize.pupil.record import PupilModel, PupilSpec
+from characterize.pupil.model import PupilModel, PupilSpec
 
 WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = (
     0.85,
@@ -82,7 +82,7 @@ def positions_um() -> np.ndarray:
 
 def _model(side: int = SIDE) -> PupilModel:
     of = dataclasses.replace(spec(), window=side)
-    return PupilModel(of, positions_um(), phase_order=ORDER, amplitude_order=0)
+    return PupilModel(of, positions_um())
 
 
 def _stack(seed: int) -> dict[str, Any]:
@@ -101,12 +101,10 @@ def _stack(seed: int) -> dict[str, Any]:
 def _vector(
     model: PupilModel, phase: np.ndarray, light: float, level: float
 ) -> np.ndarray:
-    layout = model.layout()
-    x = np.zeros(layout.size)
-    x[: layout.phase] = phase
-    x[layout.size - 2 * layout.frames - 1] = 1e-3 * model.spec.pixel_um
-    x[-2 * layout.frames : -layout.frames] = math.log(light)
-    x[-layout.frames :] = level
+    x = np.zeros(sum(model.sizes.values()))
+    parts = model.unpack(x)
+    parts["phase"][:], parts["blur"][:] = phase, 1e-3 * model.spec.pixel_um
+    parts["gain"][:], parts["background"][:] = math.log(light), level
     return x
 
 
@@ -121,7 +119,7 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
     level = float(np.median(images[:, 0]))
     begin = _vector(
         small,
-        np.zeros(small.layout().phase),
+        np.zeros(small.sizes["phase"]),
         float((images - level).sum((1, 2)).mean()),
         level,
     )
@@ -143,7 +141,7 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
     found = best or found
     seconds = time.process_time() - start
     return seconds, float(
-        np.linalg.norm(found.value[: large.layout().phase] - case["phase"])
+        np.linalg.norm(found.value[: large.sizes["phase"]] - case["phase"])
     )
 
 
@@ -159,8 +157,11 @@ def _fit(
         np.ones(images.shape),
     )
     prior = GaussianPrior.none(begin)
-    blur = len(begin) - 2 * len(images) - 1
-    prior.low[blur] = prior.high[blur] = begin[blur]
+    for name in ("blur", "gradient"):
+        low, high, held = (
+            model.unpack(v)[name] for v in (prior.low, prior.high, begin)
+        )
+        low[:] = high[:] = held
     return leastsquares.fit_levenberg_marquardt(
         model.images, data, begin, prior=prior, settings=settings
     )

@@ -18,7 +18,7 @@ from characterize.measure import sem
 from characterize.model.forward import ForwardModel, FrameSetting
 from characterize.model.parameters import parameter_vector
 from characterize.pupil.fit import fit_pupil
-from characterize.pupil.record import PupilSpec
+from characterize.pupil.model import PupilSpec
 
 ROOT = Path(__file__).parents[2]
 BEADS = (

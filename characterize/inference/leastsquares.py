@@ -113,7 +113,7 @@ class GaussianPrior:
     def none(cls, start: Array) -> "GaussianPrior":
         """Nothing known: no pull, no bounds."""
         wide = np.full(len(start), np.inf)
-        return cls(np.array(start, float), wide, -wide, wide)
+        return cls(np.array(start, float), wide, -wide, wide.copy())
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,18 +1,17 @@
-"""Fit of a generic pupil to a through-focus stack, judged on planes that the fit never
-saw.
+"""Maximum-likelihood phase retrieval from a through-focus stack, scored on planes that
+the fit never saw.
 """
 
 import dataclasses
-import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
 from characterize.captures import ElectronFrames, to_electrons
-from characterize.captures import capture as captures
+from characterize.captures.capture import Capture
 from characterize.inference import (
     FitImages,
     FitSolution,
@@ -20,32 +19,42 @@ from characterize.inference import (
     SolverSettings,
     leastsquares,
 )
-from characterize.pupil import check as pupilcheck
-from characterize.pupil.free import Optics, fit_free_settings, freed_text
-from characterize.pupil.judge import (
+from characterize.pupil.model import RELATIVE_PRIOR, PupilModel, PupilSpec
+from characterize.pupil.score import (
     StackAgreement,
     measure_agreement,
     predict_by_splines,
+    pupil_problems,
 )
-from characterize.pupil.record import PupilModel, PupilSpec, stage_sigma_um
 from metalens.core import config, store
 from metalens.core.arrays import Array
-from metalens.core.errors import FitError, FitRefused
+from metalens.core.errors import CaptureError, FitError, FitRefused
+
+_STORED = (
+    "value",
+    "sigma",
+    "position_um",
+    "measured",
+    "predicted",
+    "residual_sigma",
+    "phase_rad",
+    "amplitude",
+)
+Optics = tuple[tuple[str, float, float], ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PupilFit:
-    """The pupil that explains a stack.
+    """Retrieved pupil of a stack.
 
-    names, value, sigma: parameters with 1 sigma intervals (widened where chi2_per_dof
-    is above 1).
+    names, value, sigma: parameters with standard errors (widened where chi2_per_dof is
+    above 1).
     measured, predicted: (n, y, x) windows in electrons; every plane of ``predicted`` by
     the fit of all planes.
     phase_rad, amplitude: (nodes, nodes) pupil maps, nan and 0 outside the aperture.
-    held_out: agreement on planes left out, predicted from a fit of the others, or None
-    where not judged.
-    between: the same of a cubic spline along the stack through the planes that were
-    fitted, pixel by pixel.
+    agreement: of all planes with their fit. held_out: of planes left out, predicted
+    from a fit of the others; None where too few.
+    between: of the same planes by a cubic spline along the stack, without physics.
     optics: (name, value, standard error) of what was freed.
     cautions: degeneracies and corrections in words. problems: checks that failed, with
     their cause.
@@ -64,7 +73,7 @@ class PupilFit:
     agreement: StackAgreement
     held_out: StackAgreement | None
     between: StackAgreement | None
-    optics: tuple[tuple[str, float, float], ...]
+    optics: Optics
     chi2_per_dof: float
     converged: bool
     reason: str
@@ -73,52 +82,58 @@ class PupilFit:
 
 
 def fit_pupil(
-    capture: captures.Capture,
+    capture: Capture,
     spec: PupilSpec,
     *,
     judge: bool = True,
     sparse: int = 2,
     insist: bool = False,
 ) -> PupilFit:
-    """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also of
-    some planes, tested on others.
+    """Fit phase, amplitude, drift, stage errors, blur, gains and backgrounds to all
+    planes; with ``judge`` also to some of them, tested on the others.
 
     Args:
-        capture: frames in counts.
+        capture: through-focus stack of one bead, in counts.
         spec: what is known of optics and stage.
-        sparse: of which planes alone: every second, third ...
+        judge: whether planes are left out and predicted.
+        sparse: 2 fits every second plane first and predicts the others, 3 every third.
         insist: return a pupil that fails its checks (problems filled) instead of
             refusing it.
 
     Raises:
         CaptureError: wavelength, pixel or stage positions unknown.
-        FitError: too few planes, no bead, or refused: no convergence, planes out of
-            order, predictions too poor.
+        FitError: too few planes, no bead, or refused by a check of
+            :func:`characterize.pupil.score.pupil_problems`.
     """
-    spec, frames = _complete(spec, capture), to_electrons(capture)
-    position = _positions(capture, spec)
-    stated = dataclasses.replace(spec, stage_sigma_um=stage_sigma_um(spec, position))
-    data, background, notes = _crop(frames, stated)
-    spec, position, optics = _freed(stated, position, data, sparse if judge else 1)
-    held_out, between, start = _judge(
-        spec, position, data, background, sparse if judge else len(position)
+    stated, frames = complete_spec(spec, capture), to_electrons(capture)
+    position_um = stage_positions_um(capture, stated)
+    data, bead = crop_to_bead(frames, stated)
+    whole = PupilModel(stated, position_um)
+    mean = initial_parameters(whole, data, bead)
+    enough = judge and len(position_um) > 2 * sparse
+    model, optics = fit_optics(whole, data, mean, sparse if enough else 1)
+    mean = transfer_parameters(mean, whole, model)
+
+    held_out = between = None
+    if enough:
+        start, held_out, between = score_held_out(model, data, mean, sparse)
+    else:
+        start = fit_low_orders(model, data, mean)
+    solution = maximize_likelihood(model, data, start, mean)
+    agreement = measure_agreement(
+        solution.image, data, model.background(solution.value)
     )
-    model, solution = _fit(spec, position, data, start)
-    phase, amplitude = _maps(model, solution.value)
-    agreement = measure_agreement(solution.image, data, background)
     stopped = "" if solution.converged else solution.reason
-    score = held_out or agreement
-    share = pupilcheck.unexplained_share(score.nrmse, data, background)
-    problems = pupilcheck.pupil_problems(data, score.ncc, share, stopped)
-    notes += pupilcheck.pupil_warnings(share, stopped)
+    problems = pupil_problems(held_out or agreement, stopped)
     if problems and not insist:
         raise FitRefused("fit refused: " + "; ".join(problems))
+    phase, amplitude = model.pupil_maps(solution.value)
     return PupilFit(
-        spec=spec,
-        names=tuple(model.names()),
+        spec=model.spec,
+        names=tuple(name for group in model.names().values() for name in group),
         value=solution.value,
         sigma=np.sqrt(np.diag(solution.covariance) * max(1.0, solution.chi2_per_dof)),
-        position_um=position,
+        position_um=model.position_um,
         measured=data.electrons,
         predicted=solution.image,
         residual_sigma=solution.residual_sigma,
@@ -131,12 +146,7 @@ def fit_pupil(
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        cautions=(
-            *frames.corrections,
-            *notes,
-            *freed_text(stated, optics),
-            *_cautions(spec, solution),
-        ),
+        cautions=(*frames.corrections, *describe_limits(stated, solution, optics)),
         problems=tuple(problems),
     )
 
@@ -144,341 +154,340 @@ def fit_pupil(
 def save(
     path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None
 ) -> None:
-    """Write a pupil file (kind ``pupil``).
+    """Write a pupil file (HDF5, kind ``pupil``).
 
     Args:
         path: the file to write.
         fit: the fitted pupil.
         provenance: inputs and settings, for the record.
     """
-    arrays = {
-        key: getattr(fit, key)
-        for key in (
-            "value",
-            "sigma",
-            "position_um",
-            "measured",
-            "predicted",
-            "residual_sigma",
-            "phase_rad",
-            "amplitude",
-        )
-    }
-    arrays |= {
-        "names": np.array(fit.names),
-        "cautions": np.array(fit.cautions),
-        "problems": np.array(fit.problems or ("",)),
-    }
+    arrays = {name: getattr(fit, name) for name in _STORED}
+    for name in ("names", "cautions", "problems"):
+        arrays[name] = np.array(getattr(fit, name) or ("",))
+    known = [n for n in config.dumps(fit.spec).splitlines() if not n.endswith("nan")]
     about: dict[str, store.Attribute] = {
-        "spec": _spec_text(fit.spec),
+        "spec": "\n".join(known) + "\n",
         "chi2_per_dof": fit.chi2_per_dof,
         "converged": fit.converged,
         "reason": fit.reason,
     }
     about |= {f"fitted_{name}": value for name, value, _ in fit.optics}
-    for label, score in (
-        ("agreement", fit.agreement),
-        ("held_out", fit.held_out),
-        ("between", fit.between),
-    ):
+    for label in ("agreement", "held_out", "between"):
+        score = getattr(fit, label)
         if score is not None:
-            about |= {
-                f"{label}_{key}": value
-                for key, value in dataclasses.asdict(score).items()
-            }
+            entries = dataclasses.asdict(score).items()
+            about |= {f"{label}_{key}": value for key, value in entries}
     store.save(path, "pupil", arrays, attributes=about, provenance=provenance)
 
 
-def _spec_text(spec: PupilSpec) -> str:
-    return (
-        "\n".join(
-            line for line in config.dumps(spec).splitlines() if not line.endswith("nan")
-        )
-        + "\n"
-    )
+def complete_spec(spec: PupilSpec, capture: Capture) -> PupilSpec:
+    """Wavelength and pixel from the capture where not stated; a window no larger than
+    the frame.
 
+    Args:
+        spec: as given.
+        capture: the stack with its metadata.
 
-def _complete(spec: PupilSpec, capture: captures.Capture) -> PupilSpec:
-    wave = (
-        capture.wavelength_um if math.isnan(spec.wavelength_um) else spec.wavelength_um
-    )
-    pixel = capture.pixel_um if math.isnan(spec.pixel_um) else spec.pixel_um
+    Raises:
+        CaptureError: neither of them states the wavelength or the pixel.
+    """
+    found = {}
+    for name in ("wavelength_um", "pixel_um"):
+        value = getattr(spec, name)
+        found[name] = getattr(capture, name) if math.isnan(value) else value
+        if math.isnan(found[name]):
+            raise CaptureError(
+                f"{name} is missing: give it in the pupil file or in capture.toml; it "
+                "cannot be fitted"
+            )
     window = min(spec.window, *capture.frames.shape[1:])
-    return dataclasses.replace(spec, wavelength_um=wave, pixel_um=pixel, window=window)
+    return replace(spec, window=window, **found)
 
 
-def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
-    """Stage positions about the sharpest plane, from the capture or from step_um."""
-    if len(capture.frames) < 3:
-        raise FitError(
-            f"{len(capture.frames)} planes: a pupil needs three or more through focus"
-        )
-    stated = capture.position_um
-    if not math.isnan(spec.step_um) or not np.isfinite(stated).all():
-        stated = np.arange(len(capture.frames)) * spec.step_um
+def stage_positions_um(capture: Capture, spec: PupilSpec) -> Array:
+    """(n,) stage positions from the sharpest plane: of the capture, or by ``step_um``.
+
+    Args:
+        capture: frames and their positions.
+        spec: ``step_um`` overrides the positions.
+
+    Raises:
+        FitError: fewer than three planes.
+        CaptureError: no positions.
+    """
     frames = np.asarray(capture.frames, float)
-    sharp = frames.max((1, 2)) - np.median(frames, axis=(1, 2))
-    weight = np.maximum(sharp - 0.5 * sharp.max(), 0)
-    return np.asarray(stated - (weight * stated).sum() / weight.sum())
+    if len(frames) < 3:
+        raise FitError(f"{len(frames)} planes: a pupil needs three or more")
+    position_um = np.asarray(capture.position_um, float)
+    if not math.isnan(spec.step_um):
+        position_um = np.arange(len(frames)) * spec.step_um
+    if not np.isfinite(position_um).all():
+        raise CaptureError(
+            "stage positions are missing: give step_um in the pupil file, or a "
+            "stage.csv"
+        )
+    peak = frames.max((1, 2)) - np.median(frames, axis=(1, 2))
+    weight = np.maximum(peak - peak.max() / 2, 0)
+    return np.asarray(position_um - np.average(position_um, weights=weight))
 
 
-def _crop(
+def crop_to_bead(
     frames: ElectronFrames, spec: PupilSpec
-) -> tuple[FitImages, float, list[str]]:
-    """The window about the bead, moved inwards where it would reach over the edge; the
-    background level; notes.
+) -> tuple[FitImages, tuple[int, int]]:
+    """Square region of interest about the bead, moved inwards at the edges of the
+    frame; the bead's (row, column) from the middle of it.
+
+    The brightest spot of a difference of Gaussians is the bead, which no background
+    gradient moves.
+
+    Args:
+        frames: the whole stack in electrons.
+        spec: gives the side of the window and, where stated, the bead's place.
     """
-    total = np.where(frames.usable, frames.electrons, np.nan)
-    background = float(np.nanmedian(total))
-    row, column = spec.center or _find(total - _plane(total) - background)
-    sides = zip((row, column), total.shape[1:], strict=True)
-    first = [
-        int(np.clip(place - spec.window // 2, 0, side - spec.window))
-        for place, side in sides
-    ]
-    notes = []
-    if first != [row - spec.window // 2, column - spec.window // 2]:
-        notes.append(
-            f"the bead at row {row}, column {column} is near the edge: the window is not centred on it"
-        )
-    cut = (slice(None), *(slice(f, f + spec.window) for f in first))
-    floor, scale = (
-        np.broadcast_to(a, total.shape)[cut] for a in (frames.variance_e2, frames.scale)
+    shape, window = frames.electrons.shape, spec.window
+    center = spec.center
+    if center is None:
+        middle = np.median(frames.electrons, axis=(1, 2), keepdims=True)
+        filled = np.where(frames.usable, frames.electrons, middle)
+        spot = ndimage.gaussian_filter(filled, (0, 1, 1))
+        spot -= ndimage.gaussian_filter(filled, (0, window / 4, window / 4))
+        bright = np.sort(spot, axis=0)[-3:].mean(0)
+        row, column = np.unravel_index(int(bright.argmax()), bright.shape)
+        center = int(row), int(column)
+    half = window // 2
+    first = np.clip(np.subtract(center, half), 0, np.subtract(shape[1:], window))
+    top, left = first.tolist()
+    cut = (slice(None), slice(top, top + window), slice(left, left + window))
+    electrons, usable, saturated, variance_e2, scale = (
+        np.broadcast_to(getattr(frames, name), shape)[cut]
+        for name in ("electrons", "usable", "saturated", "variance_e2", "scale")
     )
-    plane = _plane(total[cut])
-    seen = total[cut] - background
-    if np.ptp(plane) > 0.02 * np.nanmax(seen):
-        background = float(np.nanpercentile(total[cut] - plane, 20))
-        notes.append(
-            f"a background plane of {np.ptp(plane):.3g} e across the window was taken off"
-        )
-    else:
-        plane = np.zeros_like(plane)
-    electrons = frames.electrons[cut] - plane
-    data = FitImages(
-        electrons,
-        frames.usable[cut],
-        frames.saturated[cut],
-        floor,
-        scale,
-        spec.model_error,
-    )
-    return data, background, notes
+    data = FitImages(electrons, usable, saturated, variance_e2, scale, spec.model_error)
+    return data, (center[0] - half - top, center[1] - half - left)
 
 
-def _plane(frames: Array) -> Array:
-    """(y, x) tilt of the background, of mean 0: least squares on the rim of the median
-    plane, without its outliers.
-    """
-    bad = np.isnan(frames).all(0)
-    level = np.where(bad, np.nan, np.nanmedian(np.where(bad, 0, frames), axis=0))
-    ny, nx = level.shape
-    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
-    rim = np.isfinite(level) & ((np.abs(x) > 0.8) | (np.abs(y) > 0.8))
-    design = np.stack([np.ones(ny * nx), x.ravel(), y.ravel()], 1)
-    keep = rim.ravel()
-    for _ in range(3):
-        found = np.linalg.lstsq(design[keep], level.ravel()[keep], rcond=None)[0]
-        rest = level.ravel() - design @ found
-        spread = 1.4826 * np.median(np.abs(rest[keep]))
-        keep = rim.ravel() & (np.abs(rest) <= 3 * max(spread, 1e-9))
-    return np.asarray(found[1] * x + found[2] * y)
-
-
-def _find(light: Array) -> tuple[int, int]:
-    """Row and column of the light's centre in the brightest planes; ``light`` (n, y, x)
-    is nan where masked.
-    """
-    light = np.nan_to_num(light)
-    peak = np.sort(ndimage.gaussian_filter(light, (0, 1, 1)), axis=0)[-3:].mean(0)
-    row, column = (int(i) for i in np.unravel_index(int(peak.argmax()), peak.shape))
-    return row, column
-
-
-def _freed(
-    spec: PupilSpec, position: Array, data: FitImages, sparse: int
-) -> tuple[PupilSpec, Array, Optics]:
-    """What is free, from every ``sparse``-th plane, so that the others judge it too."""
-    seen = np.arange(0, len(position), sparse if len(position) >= 2 * sparse + 1 else 1)
-    part, planes = position[seen], data.planes(seen)
-    coarse = functools.partial(_coarse, spec, part, planes)
-    made, optics, longer = fit_free_settings(
-        spec, part, planes, coarse, step_um=float(np.abs(np.diff(position)).mean())
-    )
-    return made, longer * position, optics
-
-
-def _judge(
-    spec: PupilSpec, position: Array, data: FitImages, background: float, sparse: int
-) -> tuple[StackAgreement | None, StackAgreement | None, Array | None]:
-    """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a
-    spline through the same planes.
-
-    Gains and backgrounds between neighbours, drift from its polynomial; all planes
-    where they are stated, as it is not
-    seen how far those left out stand off. Also the parameters of all planes so found,
-    where a fit of all of them
-    starts. Nothing of too few planes.
-    """
-    if len(position) < 2 * sparse + 1:
-        return None, None, None
-    seen = np.arange(0, len(position), sparse)
-    hidden = np.setdiff1d(np.arange(seen[-1]), seen)
-    exact = dataclasses.replace(spec, stage_sigma_um=0.0)
-    fitted, solution = _fit(exact, position[seen], data.planes(seen))
-    model = PupilModel(
-        exact,
-        position,
-        phase_order=spec.phase_order,
-        amplitude_order=spec.amplitude_order,
-    )
-    model.span_um = fitted.span_um
-    shared = fitted.layout().size - 2 * len(seen)
-    order = np.argsort(position[seen])
-    gain, level = (
-        np.interp(
-            position,
-            position[seen][order],
-            solution.value[shared + k * len(seen) :][: len(seen)][order],
-        )
-        for k in (0, 1)
-    )
-    x = np.concatenate([solution.value[:shared], gain, level])
-    predicted, rest = model.images(x, False)[0][hidden], data.planes(hidden)
-    start = np.insert(
-        x,
-        fitted.layout().off.start,
-        np.zeros(len(position) if spec.stage_sigma_um > 0 else 0),
-    )
-    between = predict_by_splines(position, data, seen, hidden)
-    return (
-        measure_agreement(predicted, rest, background),
-        measure_agreement(between, rest, background),
-        start,
-    )
-
-
-def _fit(
-    spec: PupilSpec, position: Array, data: FitImages, start: Array | None = None
-) -> tuple[PupilModel, FitSolution]:
-    """Low orders from several starts, the best one on to all orders; all orders at once
-    from a known ``start``.
-    """
-    model = PupilModel(
-        spec,
-        position,
-        phase_order=spec.phase_order,
-        amplitude_order=spec.amplitude_order,
-    )
-    if start is None:
-        start = _coarse(spec, position, data, model)
-    settings = SolverSettings(iterations=60, step_tolerance=1.0, near=2.0, secant=True)
-    return model, leastsquares.fit_levenberg_marquardt(
-        model.images, data, start, prior=_prior(model, start), settings=settings
-    )
-
-
-def _coarse(
-    spec: PupilSpec, position: Array, data: FitImages, model: PupilModel
+def initial_parameters(
+    model: PupilModel, data: FitImages, bead: tuple[int, int]
 ) -> Array:
-    coarse = PupilModel(spec, position, phase_order=4, amplitude_order=0)
-    starts = [_start(coarse, data, spherical) for spherical in (0.0, 0.8, -0.8)]
-    settings = SolverSettings(
-        iterations=12, step_tolerance=1.0, near=1.0, secant=True, finish=False
-    )
-    tries = [
-        leastsquares.fit_levenberg_marquardt(
-            coarse.images, data, s, prior=_prior(coarse, s), settings=settings
-        )
-        for s in starts
-    ]
-    return _grow(min(tries, key=lambda t: t.merit).value, coarse, model)
+    """(p,) parameters: unaberrated pupil, blur of half a pixel, light and background of
+    the data.
 
+    Args:
+        model: gives the parameter vector.
+        data: region of interest.
+        bead: (row, column) of the bead from the middle of the window.
 
-def _start(model: PupilModel, data: FitImages, spherical: float) -> Array:
-    layout = model.layout()
-    x = np.zeros(layout.size)
-    x[model.phase_indices.index((4, 0))] = spherical
-    x[layout.size - 2 * layout.frames - 1] = 0.5 * model.spec.pixel_um
-    shift = _offset(data) * model.spec.pixel_um
-    first = layout.phase + layout.amplitude
-    x[[first, first + layout.drift]] = shift[::-1]
-    edge = np.concatenate([data.electrons[:, 0], data.electrons[:, -1]], axis=1)
-    level = np.percentile(edge, 20, axis=1)
+    Raises:
+        FitError: no light above the background.
+    """
+    x = np.zeros(sum(model.sizes.values()))
+    level = np.percentile(data.electrons, 20, axis=(1, 2))
     light = (data.electrons - level[:, None, None]).sum((1, 2)).max()
     if light <= 0:
         raise FitError(
             "no light above the background in the window; check center and window"
         )
-    x[-2 * layout.frames : -layout.frames] = math.log(light)
-    x[-layout.frames :] = level
+    parts, pixel_um = model.unpack(x), model.spec.pixel_um
+    parts["background"][:], parts["gain"][:] = level, math.log(light)
+    parts["blur"][:] = 0.5 * pixel_um
+    parts["drift_y"][0], parts["drift_x"][0] = np.array(bead) * pixel_um
     return x
 
 
-def _offset(data: FitImages) -> Array:
-    """(y, x) pixels from the window's centre to the bead, where it is more than a
-    quarter of the window; else 0.
+def fit_optics(
+    model: PupilModel, data: FitImages, mean: Array, every: int
+) -> tuple[PupilModel, Optics]:
+    """Model with the optics that ``spec.free`` names, fitted with low orders of the
+    pupil; (name, value, standard error) of each.
+
+    Where the images fix products only (aperture times pixel, say), the priors about the
+    stated values decide.
+
+    Args:
+        model: with the stated values.
+        data: its planes.
+        mean: (p,) mean of the prior.
+        every: distance of the planes that are used: the others judge it too.
     """
-    light = np.where(data.usable, data.electrons, np.nanmedian(data.electrons))
-    peak = ndimage.gaussian_filter(light, (0, 1, 1)).max(0)
-    place = (
-        np.array(np.unravel_index(int(peak.argmax()), peak.shape))
-        - np.array(peak.shape) // 2
+    spec = model.spec
+    if not spec.free:
+        return model, ()
+    low, planes = _lower(spec, 6, 2), np.arange(0, len(model.position_um), every)
+    part = PupilModel(low, model.position_um[planes])
+    part_mean, some = transfer_parameters(mean, model, part), data.planes(planes)
+    start = fit_low_orders(part, some, part_mean)
+    found = maximize_likelihood(part, some, start, part_mean, iterations=40, step=0.1)
+    optics, position_um = part.optics_at(found.value)
+    longer = float(np.ptp(position_um) / np.ptp(part.position_um))
+    step_um = longer * float(np.abs(np.diff(model.position_um)).mean())
+    widened = found.covariance * max(1.0, found.chi2_per_dof)
+    sigma = part.unpack(np.sqrt(np.diag(widened)))["optics"].tolist()
+    values = [step_um if n == "step_um" else getattr(optics, n) for n in spec.free]
+    fitted = zip(spec.free, values, sigma, strict=True)
+    orders = {n: getattr(spec, n) for n in ("phase_order", "amplitude_order")}
+    known = replace(
+        optics, free=(), stage_sigma_um=model.stage_sigma_um, model=spec.model, **orders
     )
-    return np.asarray(place * (np.abs(place).max() > peak.shape[0] / 8), float)
-
-
-def _grow(value: Array, small: PupilModel, large: PupilModel) -> Array:
-    """Parameters of the larger model with the added orders at zero."""
-    a, b = small.layout(), large.layout()
-    phase, amplitude, *_ = a.split(value)
-    add = np.zeros(b.phase - len(phase)), np.zeros(b.amplitude - len(amplitude))
-    return np.concatenate(
-        [phase, add[0], amplitude, add[1], value[a.phase + a.amplitude :]]
+    return PupilModel(known, longer * model.position_um), tuple(
+        (name, value, value * relative) for name, value, relative in fitted
     )
 
 
-def _prior(model: PupilModel, start: Array) -> GaussianPrior:
-    """Smoothness: coefficients of higher orders are smaller; gains of frames scatter by
-    30 % about their start.
+def score_held_out(
+    model: PupilModel, data: FitImages, mean: Array, every: int
+) -> tuple[Array, StackAgreement, StackAgreement]:
+    """Fit every n-th plane, predict the planes between, compare with a cubic spline
+    through the same planes.
+
+    The stage is taken as exact here, as stage errors of planes left out are unknown.
+
+    Args:
+        model: of all planes.
+        data: all planes.
+        mean: (p,) mean of the prior of ``model``.
+        every: distance of the fitted planes; the last plane is fitted too.
+
+    Returns:
+        (p,) parameters of ``model`` to start from, score of the pupil, of the spline.
     """
-    layout = model.layout()
-    sigma = np.full(layout.size, np.inf)
-    sigma[: layout.phase] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
-    sigma[layout.phase :][: layout.amplitude] = [
-        0.5 / n for n, _ in model.amplitude_indices
-    ]
-    blur = layout.size - 2 * layout.frames - 1
-    drift = slice(layout.phase + layout.amplitude, layout.off.start)
-    sigma[drift], sigma[layout.off] = 10 * model.spec.pixel_um, model.stage_sigma_um
-    mean = np.zeros(layout.size)
-    mean[drift] = start[drift]
-    mean[blur:] = start[blur:]
-    sigma[blur + 1 :][: layout.frames] = 0.3
-    low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-    low[blur], high[blur] = 0.05 * model.spec.pixel_um, 4 * model.spec.pixel_um
-    return GaussianPrior(mean, sigma, low, high)
+    planes = np.arange(len(data.electrons))
+    fitted = np.union1d(planes[::every], planes[-1])
+    hidden = np.setdiff1d(planes, fitted)
+    exact = replace(model.spec, stage_sigma_um=0.0)
+    part, some = PupilModel(exact, model.position_um[fitted]), data.planes(fitted)
+    part_mean = transfer_parameters(mean, model, part)
+    start = fit_low_orders(part, some, part_mean)
+    solution = maximize_likelihood(part, some, start, part_mean)
+    value = transfer_parameters(solution.value, part, model)
+    background, rest = model.background(value)[hidden], data.planes(hidden)
+    spline = predict_by_splines(model.position_um, data, fitted, hidden)
+    pupil = model.images(value, False)[0][hidden]
+    return (
+        value,
+        measure_agreement(pupil, rest, background),
+        measure_agreement(spline, rest, background),
+    )
 
 
-def _maps(model: PupilModel, value: Array) -> tuple[Array, Array]:
-    phase, amplitude, *_ = model.layout().split(value)
-    shape = (model.nodes, model.nodes)
-    angle, level = np.full(shape, np.nan), np.zeros(shape)
-    angle[model.inside] = phase @ model.phase_basis
-    level[model.inside] = np.exp(amplitude @ model.amplitude_basis)
-    return angle, level
+def fit_low_orders(model: PupilModel, data: FitImages, mean: Array) -> Array:
+    """(p,) start of a fit: the best of three fits of radial order 4, begun at spherical
+    aberrations of 0, 0.8 and -0.8 rad.
+
+    Args:
+        model: of all orders.
+        data: its planes.
+        mean: (p,) parameters to begin with, mean of the prior.
+    """
+    low = PupilModel(replace(_lower(model.spec, 4, 0), free=()), model.position_um)
+    low_mean, solutions = transfer_parameters(mean, model, low), []
+    for spherical_rad in (0.0, 0.8, -0.8):
+        start = low_mean.copy()
+        start[low.phase_indices.index((4, 0))] = spherical_rad
+        solutions.append(maximize_likelihood(low, data, start, low_mean, iterations=12))
+    best = min(solutions, key=lambda solution: solution.merit)
+    return transfer_parameters(best.value, low, model)
 
 
-def _cautions(spec: PupilSpec, solution: FitSolution) -> list[str]:
-    words = [
-        "reversing the stack turns the phase by 180 degrees about the axis and flips its sign: the order of the stage "
-        "cannot be seen in the images alone",
-        "stage zero and the defocus term are one quantity; sideways position and tilt are one quantity",
+def _lower(spec: PupilSpec, phase: int, amplitude: int) -> PupilSpec:
+    """The specification with orders of at most so much."""
+    return replace(
+        spec,
+        phase_order=min(spec.phase_order, phase),
+        amplitude_order=min(spec.amplitude_order, amplitude),
+    )
+
+
+def transfer_parameters(x: Array, source: PupilModel, target: PupilModel) -> Array:
+    """(p,) parameters for a model of other orders, planes or optics: gains and
+    backgrounds interpolated along the axis, new orders and stage errors 0.
+
+    Args:
+        x: parameters of ``source``.
+        source: model of the same stack.
+        target: model of nested orders, over the same range of planes.
+    """
+    order = np.argsort(source.position_um)
+    out = np.zeros(sum(target.sizes.values()))
+    into = target.unpack(out)
+    for name, values in source.unpack(x).items():
+        if name in ("gain", "background"):
+            place, along = target.position_um, source.position_um[order]
+            into[name][:] = np.interp(place, along, values[order])
+        else:
+            count = min(len(values), target.sizes[name])
+            into[name][:count] = values[:count]
+    return out
+
+
+def maximize_likelihood(
+    model: PupilModel,
+    data: FitImages,
+    start: Array,
+    mean: Array,
+    *,
+    iterations: int = 60,
+    step: float = 1.0,
+) -> FitSolution:
+    """Levenberg-Marquardt with Gaussian priors: smooth pupils, gains within 30 %.
+
+    Args:
+        model: images and derivatives.
+        data: measured planes.
+        start: (p,) parameters.
+        mean: (p,) mean of the prior.
+        iterations: at most.
+        step: standard errors of a step at which it stops.
+    """
+    width, spec = np.full(len(start), np.inf), model.spec
+    low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
+    sigma, least, most = (model.unpack(one) for one in (width, low, high))
+    sigma["phase"][:] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
+    sigma["amplitude"][:] = [0.5 / n for n, _ in model.amplitude_indices]
+    sigma["drift_x"][:] = sigma["drift_y"][:] = 10 * spec.pixel_um
+    if model.sizes["stage"]:
+        sigma["stage"][:] = model.stage_sigma_um
+    sigma["gain"][:] = 0.3
+    sigma["optics"][:] = [RELATIVE_PRIOR[name] for name in spec.free]
+    # the derivative by the blur vanishes at 0
+    least["blur"][:], most["blur"][:] = 0.05 * spec.pixel_um, 4 * spec.pixel_um
+    least["optics"][:], most["optics"][:] = -0.3, 0.3
+    settings = SolverSettings(
+        iterations=iterations, step_tolerance=step, near=2.0, secant=True
+    )
+    return leastsquares.fit_levenberg_marquardt(
+        model.images,
+        data,
+        start,
+        prior=GaussianPrior(mean, width, low, high),
+        settings=settings,
+    )
+
+
+def describe_limits(
+    spec: PupilSpec, solution: FitSolution, optics: Optics
+) -> list[str]:
+    """Degeneracies and misfits of a fit in words.
+
+    Args:
+        spec: as stated.
+        solution: the fit.
+        optics: fitted optics.
+    """
+    words = []
+    for name, value, sigma in optics:
+        before = getattr(spec, name)
+        given = f", stated {before:.4g}" if math.isfinite(before) else ""
+        words.append(f"{name} = {value:.4g} +- {sigma:.2g} was fitted{given}")
+    words += [
+        "the images cannot tell the direction of the stage: a reversed stack gives the "
+        "phase turned by 180 degrees with the other sign",
+        "stage zero and the defocus term are one quantity; lateral position and tilt "
+        "are one quantity",
     ]
     if solution.chi2_per_dof > 1.5:
         words.append(
-            f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}: the images hold more than this model; "
-            "intervals are widened by its root"
+            f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}: the "
+            "images hold more than this model; errors are widened by its root"
         )
     if not spec.bead_um:
         words.append("no bead size given: it is part of the fitted blur")

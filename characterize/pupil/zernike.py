@@ -1,6 +1,4 @@
-"""Zernike polynomials on the unit disc, normalised to unit variance (Noll 1976), by
-radial order.
-"""
+"""Zernike polynomials on the unit disc, orthonormal (Noll 1976), by radial order."""
 
 import math
 
@@ -29,7 +27,7 @@ def zernike_indices(lowest: int, highest: int) -> list[Index]:
 
 
 def zernike_name(index: Index) -> str:
-    """Usual name where there is one, else ``Z(n, m)``.
+    """Usual name of the aberration where there is one, else ``Z(n, m)``.
 
     Args:
         index: (n, m) radial and azimuthal order.
@@ -38,23 +36,20 @@ def zernike_name(index: Index) -> str:
 
 
 def zernike_polynomial(index: Index, rho: Array, theta: Array) -> Array:
-    """Z_n^m at polar coordinates of the unit disc: sqrt(n + 1) (sqrt 2 if m) R(rho)
-    cos(m theta), or sin for m < 0.
+    """Z_n^m on the unit disc: N R_n^|m|(rho) cos(m theta), or sin(|m| theta) for m < 0;
+    N = sqrt(n + 1), times sqrt(2) for m other than 0.
 
     Args:
         index: (n, m) radial and azimuthal order.
+        rho: (*shape) radius. theta: (*shape) azimuth, rad.
     """
     n, m = index
-    k = abs(m)
+    q = (n - abs(m)) // 2
     radial = np.zeros_like(rho)
-    for s in range((n - k) // 2 + 1):
-        term = math.factorial(n - s) / (
-            math.factorial(s)
-            * math.factorial((n + k) // 2 - s)
-            * math.factorial((n - k) // 2 - s)
-        )
-        radial = radial + (-1) ** s * term * rho ** (n - 2 * s)
-    angular = np.cos(k * theta) if m >= 0 else np.sin(k * theta)
+    for s in range(q + 1):
+        term = (-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, q - s)
+        radial = radial + term * rho ** (n - 2 * s)
+    angular = np.cos(m * theta) if m >= 0 else np.sin(-m * theta)
     return np.asarray(math.sqrt((n + 1) * (2 if m else 1)) * radial * angular)
 
 
@@ -62,12 +57,12 @@ def zernike_basis(which: list[Index], x: Array, y: Array) -> Array:
     """(len(which), *shape) polynomials at Cartesian coordinates of the unit disc.
 
     Args:
-        x: x in the pupil over its radius.
-        y: y in the pupil over its radius.
+        which: (n, m) of each.
+        x: (*shape) x in the pupil over its radius.
+        y: (*shape) y in the pupil over its radius.
     """
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
-    return (
-        np.stack([zernike_polynomial(index, rho, theta) for index in which])
-        if which
-        else np.empty((0, *x.shape))
-    )
+    basis = np.empty((len(which), *x.shape))
+    for row, index in zip(basis, which, strict=True):
+        row[...] = zernike_polynomial(index, rho, theta)
+    return basis

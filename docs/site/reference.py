@@ -41,7 +41,7 @@ SETTINGS = {
         "MetrologySettings",
         "fit --metrology",
     ),
-    "PUPIL.toml": ("characterize.pupil.record", "PupilSpec", "fit --pupil"),
+    "PUPIL.toml": ("characterize.pupil.model", "PupilSpec", "fit --pupil"),
     "SCENE.toml": ("codesign.commands.scene", "SceneSettings", "scene"),
     "RUN.toml": ("codesign.train.run", "RunConfig", "codesign"),
     "OPTICS.toml": (

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from characterize.bench.bench import HiddenLens
 from characterize.commands.fit import MetrologySettings
-from characterize.pupil.record import PupilSpec
+from characterize.pupil.model import PupilSpec
 from codesign.train import run as runs
 from layout.process import process as processes
 from metalens import materials

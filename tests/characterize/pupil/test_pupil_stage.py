@@ -10,7 +10,7 @@ import pytest
 
 from characterize.captures import capture
 from characterize.pupil.fit import fit_pupil
-from characterize.pupil.record import PupilModel, PupilSpec
+from characterize.pupil.model import PupilModel, PupilSpec
 from metalens.core.errors import FitError
 
 SPEC = PupilSpec(
@@ -134,10 +134,7 @@ def test_planes_off_their_places_move_no_pupil_beyond_its_interval():
 
 
 def test_stage_errors_are_a_tenth_of_the_step_unless_stated():
-    made = [
-        PupilModel(replace(SPEC, stage_sigma_um=s), Z, phase_order=4, amplitude_order=0)
-        for s in (math.nan, 0.07)
-    ]
+    made = [PupilModel(replace(SPEC, stage_sigma_um=s), Z) for s in (math.nan, 0.07)]
     assert [one.stage_sigma_um for one in made] == pytest.approx([0.03, 0.07])
     for bad in (-0.1, math.inf):
         with pytest.raises(FitError, match="stage_sigma_um"):
