@@ -171,6 +171,11 @@ class PupilModel:
                 spec.mask, self.u, self.v, turn_rad=math.radians(spec.mask_turn_deg)
             )
         self.sizes = {name: len(group) for name, group in self.names().items()}
+        last = np.cumsum(list(self.sizes.values())).tolist()
+        self._places = {
+            name: slice(end - size, end)
+            for (name, size), end in zip(self.sizes.items(), last, strict=True)
+        }
 
     @property
     def stage_sigma_um(self) -> float:
@@ -204,8 +209,7 @@ class PupilModel:
         Args:
             x: (p, ...) parameters in the order of :meth:`names`.
         """
-        ends = np.cumsum(list(self.sizes.values()))
-        return dict(zip(self.sizes, np.split(x, ends[:-1]), strict=True))
+        return {name: x[place] for name, place in self._places.items()}
 
     def optics_at(self, x: Array) -> tuple[PupilSpec, Array]:
         """Specification and stage positions (n,) with the optics of parameters ``x``,

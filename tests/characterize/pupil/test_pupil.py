@@ -169,9 +169,7 @@ def test_shuffled_planes_are_refused():
         ).held_out.ncc
         > 0.97
     )
-    with pytest.raises(
-        FitError, match=r"planes (are missing or )?out of order"
-    ):
+    with pytest.raises(FitError, match=r"planes (are missing or )?out of order"):
         pupilfit.fit_pupil(
             shots_of(frames[[4, 0, 7, 2, 8, 5, 1, 6, 3]]),
             dataclasses.replace(SPEC, step_um=2.0),
