@@ -13,7 +13,7 @@ import pytest
 
 from characterize.captures.stage import read_about
 from characterize.model import PARAMETERS
-from metalens.chain.stages import ChainFiles
+from metalens.commands.chain import ChainFiles
 from metalens.cli import VERBS, main
 from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile

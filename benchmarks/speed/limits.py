@@ -19,8 +19,8 @@ from pathlib import Path
 
 from benchmarks import Row
 from benchmarks.__main__ import table
-from metalens.chain import stages as chain
-from metalens.chain.stages import ChainStage
+from metalens.commands import chain
+from metalens.commands.chain import ChainStage
 
 NAN = float("nan")
 BUDGET = (

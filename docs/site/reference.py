@@ -49,7 +49,7 @@ SETTINGS = {
         "OpticsSettings",
         "evaluate optics --config",
     ),
-    "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
+    "CHAIN.toml": ("metalens.commands.chain", "ChainFiles", "demo --config"),
 }
 
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import tyro
 
-from metalens.chain import ChainFiles, ChainStage, module_view
-from metalens.chain import stages as chain
 from metalens.cli import main as run_verb
+from metalens.commands import chain
+from metalens.commands.chain import ChainFiles, ChainStage
 from metalens.commands.common import CommonOptions
 from metalens.core import manifest, report, store
 from metalens.core.errors import ConfigError, MetalensError
@@ -199,7 +199,6 @@ def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
             (timing,),
         ),
         *(_section(folder, outcome) for outcome in outcomes),
-        _module(folder),
     ]
     report.write_report(
         folder / "report.html",
@@ -208,18 +207,6 @@ def _write(folder: Path, outcomes: list[StageOutcome]) -> None:
         lead="A metalens for an eye tracker: the physics of one silicon pillar, the mask, and the lens that was made.",
         key_figures=keys,
     )
-
-
-def _module(folder: Path) -> report.Section:
-    from metalens import lens
-
-    made = lens.load(folder / "lens.h5")
-    drawn = module_view.draw_module(
-        aperture_mm=2e-3 * (made.diameters.radius_um + made.diameters.pitch_um / 2),
-        sensor_distance_mm=made.sensor_distance_um * 1e-3,
-    )
-    words = "`metalens layout lens.h5 --step` writes it as a STEP assembly with mount and joints."
-    return report.Section("The module", words, (drawn,))
 
 
 def _section(folder: Path, outcome: StageOutcome) -> report.Section:

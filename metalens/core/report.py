@@ -80,13 +80,6 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Markup:
-    """A piece of ready HTML (an interactive view); it must be self-contained."""
-
-    html: str
-
-
-@dataclass(frozen=True, slots=True)
 class Section:
     """A titled part of the report; ``text`` holds plain paragraphs separated by blank
     lines.
@@ -94,7 +87,7 @@ class Section:
 
     title: str
     text: str = ""
-    items: Sequence[Figure | Table | Markup] = ()
+    items: Sequence[Figure | Table] = ()
 
     @property
     def paragraphs(self) -> list[str]:
@@ -293,7 +286,7 @@ def write_report(
     template = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True
     ).from_string(source)
-    kinds = {Figure: "figure", Table: "table", Markup: "markup"}
+    kinds = {Figure: "figure", Table: "table"}
     page = template.render(
         title=title,
         lead=lead,

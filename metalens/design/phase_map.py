@@ -5,14 +5,14 @@ import re
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from metalens.core import reading, store
 from metalens.core.arrays import Array
-from metalens.core.errors import LensError, StoreError, nearest_name_hint
-from metalens.design import limited
+from metalens.core.errors import LensError, nearest_name_hint
+from metalens.design.foreign_arrays import read_matlab, read_npz
 from metalens.design.profiles import PhaseMap
 
 ZEMAX_UNIT_UM = (1e3, 1e4, 25.4e3, 1e6)  # unit flags 0 to 3: mm, cm, inch, m
@@ -72,10 +72,12 @@ def read_phase_map(shape: PhaseMap) -> PhaseSamples:
     ending = path.suffix.lower()
     if ending == ".dat":
         samples = _zemax(path, shape.pitch_um)
-    elif ending in (".npy", ".npz", ".mat"):
-        reader = {".npy": _npy, ".npz": _npz, ".mat": _mat}[ending]
+    elif ending == ".npy":
+        samples = _square(_npy(path, shape.variable), path, shape)
+    elif ending in (".npz", ".mat"):
         _require_pitch(path, shape.pitch_um)
-        samples = _square(reader(path, shape.variable), path, shape)
+        arrays = read_npz(path) if ending == ".npz" else read_matlab(path)
+        samples = _square(_named(path, arrays, shape.variable), path, shape)
     else:
         samples = _text(path, shape)
     phase = samples.phase_rad if ending == ".dat" else _radians(samples, path, shape)
@@ -409,41 +411,21 @@ def _no_variable(path: Path, variable: str | None) -> None:
         )
 
 
-def _mat(path: Path, variable: str | None) -> Any:
-    """A matrix of a MATLAB file; the only 2-D one where no name is given."""
-    return _named(path, _held(path, "MATLAB"), variable)
-
-
-def _npz(path: Path, variable: str | None) -> Any:
-    """A matrix of a NumPy archive, chosen as in a MATLAB file."""
-    return _named(path, _held(path, "NPZ"), variable)
-
-
-def _named(path: Path, held: dict[str, Any], variable: str | None) -> Any:
+def _named(path: Path, arrays: dict[str, Array], variable: str | None) -> Array:
     """The matrix of that name; without one the only matrix."""
-    arrays = {
-        k: v
-        for k, v in held.items()
-        if isinstance(v, np.ndarray) and v.ndim == 2 and min(v.shape) > 1
-    }
     if variable is not None:
-        if variable not in held:
+        if variable not in arrays:
             raise LensError(
-                f"{path}: holds no variable {variable!r}{nearest_name_hint(variable, held)}"
+                f"{path}: holds no variable {variable!r}"
+                f"{nearest_name_hint(variable, arrays)}"
             )
-        return held[variable]
+        return arrays[variable]
+    arrays = {k: v for k, v in arrays.items() if v.ndim == 2 and min(v.shape) > 1}
     if len(arrays) != 1:
         raise LensError(
             f"{path}: holds {len(arrays)} matrices ({', '.join(sorted(arrays))}); name one: variable = ..."
         )
     return next(iter(arrays.values()))
-
-
-def _held(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Any]:
-    try:
-        return dict(limited.read_arrays_in_subprocess(path, kind))
-    except StoreError as error:
-        raise LensError(str(error)) from None
 
 
 def _zemax(path: Path, pitch_um: float | None) -> PhaseSamples:

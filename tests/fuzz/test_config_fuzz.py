@@ -12,7 +12,7 @@ from characterize.pupil.model import PupilSpec
 from codesign.train import run as runs
 from layout.process import process as processes
 from metalens import materials
-from metalens.chain.stages import ChainFiles
+from metalens.commands.chain import ChainFiles
 from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile
 from metalens.commands.psf import PsfSettings

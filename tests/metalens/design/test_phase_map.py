@@ -55,8 +55,10 @@ def write(folder, kind):
         path.write_bytes(("\ufeff" + "\r\n".join(rows)).encode("utf-8"))
     elif kind == "txt":
         np.savetxt(path, PHASE, fmt="%.17g")
-    elif kind == "mat":
-        savemat(path, {"phi": PHASE, "note": "text", "scale": 3.0})
+    elif kind in ("mat", "mat-packed", "mat-4"):
+        about = {"phi": PHASE, "note": "text", "scale": 3.0}
+        level = "4" if kind == "mat-4" else "5"
+        savemat(path, about, format=level, do_compression=kind == "mat-packed")
     elif kind == "mat-73":
         with h5py.File(path, "w") as file:
             file["phi"] = PHASE.T  # MATLAB keeps columns first
@@ -75,6 +77,8 @@ def write(folder, kind):
         "txt",
         "txt-decimal-comma",
         "mat",
+        "mat-packed",
+        "mat-4",
         "mat-73",
         "dat",
     ],
@@ -189,7 +193,7 @@ def test_an_archive_of_numpy_gives_its_only_matrix_or_the_named_one(tmp_path):
         PhaseMap(tmp_path / "two.npz", STEP, variable="phase")
     ).phase_rad == pytest.approx(PHASE)
     np.savez(tmp_path / "objects.npz", phase=np.array([{}], dtype=object))
-    with pytest.raises(LensError, match=r"objects\.npz: not an NPZ file: ValueError"):
+    with pytest.raises(LensError, match=r"objects\.npz: not an NPZ file"):
         phase_map.read_phase_map(PhaseMap(tmp_path / "objects.npz", STEP))
 
 
@@ -206,18 +210,13 @@ def test_every_flipped_bit_of_a_header_is_refused_or_read(tmp_path):
 
 
 @settings(max_examples=160)
-@given(kind=st.sampled_from(["npy", "csv", "txt", "mat-73", "dat"]), data=st.data())
+@given(
+    kind=st.sampled_from(
+        ["npy", "csv", "txt", "mat", "mat-packed", "mat-4", "mat-73", "dat"]
+    ),
+    data=st.data(),
+)
 def test_damaged_files_are_refused_or_read(tmp_path_factory, kind, data):
-    damaged(tmp_path_factory, kind, data)
-
-
-@settings(max_examples=16)  # each is read by a process of its own
-@given(data=st.data())
-def test_damaged_matlab_files_are_refused_or_read(tmp_path_factory, data):
-    damaged(tmp_path_factory, "mat", data)
-
-
-def damaged(tmp_path_factory, kind, data):
     """Truncated or with a flipped bit: a typed refusal or a map, never another
     exception.
     """

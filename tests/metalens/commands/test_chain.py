@@ -1,20 +1,15 @@
-"""The chain from one file: which stages it asks for, its settings laid out, its module
-drawn.
-"""
+"""The chain from one file: which stages it asks for, and its settings laid out."""
 
 import json
 import os
-import re
 import sys
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from metalens.chain import module_view
-from metalens.chain import stages as chain
-from metalens.chain.stages import ChainFiles
-from metalens.commands import demo
+from metalens.commands import chain, demo
+from metalens.commands.chain import ChainFiles
 from metalens.commands.design import DesignSettings
 from metalens.core import config, manifest
 from metalens.core.errors import ConfigError
@@ -200,35 +195,6 @@ def test_the_shipped_settings_are_laid_out(tmp_path):
     )
 
 
-def test_the_drawn_module_needs_nothing_from_outside_and_grows_with_the_lens():
-    small, large = (
-        module_view.draw_module(aperture_mm=a, sensor_distance_mm=2.0).html
-        for a in (0.5, 3.0)
-    )
-    assert not re.search(r"(?:src|href)=|https?:", small)
-    parts = [
-        json.loads(re.search(r"const parts = (\[.*?\]);\n", html)[1])
-        for html in (small, large)
-    ]
-    names = [p["name"] for p in parts[0] if p["name"]]
-    assert names == ["NIR filter", "substrate", "metalens", "mount", "sensor", "flex"]
-    widths = [
-        max(x for part in p for face in part["faces"] for x, _, _ in face)
-        for p in parts
-    ]
-    assert widths[1] > widths[0] + 0.9
-    bottom = min(z for part in parts[0] for face in part["faces"] for _, _, z in face)
-    assert bottom == pytest.approx(-2.7)  # 2 mm of air, 0.5 mm sensor, 0.2 mm flex
-
-
-def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
-    """It is not said to have refused its input, and nothing is noted as done."""
-    monkeypatch.setattr(demo, "run_verb", lambda words: 130)
-    with pytest.raises(KeyboardInterrupt):
-        list(demo._chain(tmp_path, chain.shipped_settings()))
-    assert not (tmp_path / demo.OUTCOMES).exists()
-
-
 def begun(tmp_path, monkeypatch, config=None):
     """A chain that was interrupted at its third stage; the words of all stages that are
     begun from then on.
@@ -368,12 +334,3 @@ def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch
     path.write_text(f"{first[: len(first) // 2]}\n{second}\n")
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
     assert seen[3:5] == ["library", "psf"]
-
-
-@pytest.mark.parametrize(
-    ("found", "told"),
-    [(6043.0, "6000 counts"), (7.13e-7, "7.1e-07 counts"), ({"a": [3, 5]}, "2 counts")],
-)
-def test_errors_of_the_page_have_no_power_of_ten_where_none_is_needed(found, told):
-    stage = chain.ChainStage("Captures", "", ("capture",), ("peak", "counts"))
-    assert demo._error(demo.StageOutcome(stage, 0, {"peak": found}, 1.5)) == told

@@ -1,0 +1,135 @@
+"""Numeric arrays of MATLAB files (levels 4, 5 and 7.3) and NumPy archives."""
+
+import io
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from metalens.core import reading, store
+from metalens.core.arrays import Array
+from metalens.core.errors import DAMAGE, LensError
+
+_LARGEST = 1 << 31  # bytes that the arrays of one file may take
+_MATRIX, _COMPRESSED, _COMPLEX = 14, 15, 0x800
+_STORED = dict(zip((1, 2, 3, 4, 5, 6, 7, 9, 12, 13), "bBhHiIfdqQ", strict=True))
+_CLASSES = dict(zip(range(6, 16), "dfbBhHiIqQ", strict=True))
+_LEVEL_4 = "dfihHB"  # by the third digit of a matrix's type
+_REFUSED = (*DAMAGE, EOFError, IndexError, zlib.error, zipfile.BadZipFile)
+
+
+def read_matlab(path: Path) -> dict[str, Array]:
+    """Numeric arrays of a MATLAB file by name; text, cells and structures are left out.
+
+    scipy.io.loadmat ends the process on some damaged files of levels 4 and 5. Here
+    every size is compared with the bytes that are there before it is used. Source:
+    MAT-File Format (The MathWorks), chapter 1.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        LensError: damaged, no such file, or larger than 2 GB when unpacked.
+    """
+    try:
+        content = path.read_bytes()
+        if b"\x89HDF\r\n\x1a\n" in content[:4096]:
+            return reading.read_hdf5(path, lambda file: _level_7(path, file))
+        order = {b"IM": "<", b"MI": ">"}.get(content[126:128], "")
+        if order and 0 not in content[:4]:
+            return dict(_level_5(content[128:], order))
+        return dict(_level_4(content))
+    except _REFUSED as error:
+        raise LensError(f"{path}: not a MATLAB file: {error}") from error
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """Arrays of a NumPy archive by name.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        LensError: damaged, no such file, or larger than 2 GB when unpacked.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_size(sum(entry.file_size for entry in archive.infolist()))
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (*_REFUSED, SyntaxError, RecursionError) as error:
+        raise LensError(f"{path}: not an NPZ file: {error}") from error
+
+
+def _check_size(size: int) -> None:
+    if size > _LARGEST:
+        raise ValueError(f"holds {size:,} bytes, need at most {_LARGEST:,}")
+
+
+def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Type and bytes of the data elements of level 5, one after the other."""
+    place = 0
+    while place < len(content):
+        kind, size = np.frombuffer(content[place : place + 8], f"{order}u4").tolist()
+        start, step = place + 8, size
+        if kind >> 16:  # small: type, size and data in 8 bytes
+            kind, size, start, step = kind & 0xFFFF, kind >> 16, place + 4, 0
+        if size > (len(content) - start if step else 4):
+            raise ValueError("cut short")
+        yield kind, content[start : start + size]
+        place += 8 + (step if kind == _COMPRESSED else -(-step // 8) * 8)
+
+
+def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
+    for kind, data in _elements(content, order):
+        if kind == _COMPRESSED:
+            stream = zlib.decompressobj()
+            head = stream.decompress(data, 8)
+            size = int(np.frombuffer(head, f"{order}u4")[1])
+            _check_size(size)
+            data = stream.decompress(stream.unconsumed_tail, size + 1)
+            if not stream.eof or len(data) != size:
+                raise ValueError("cut short")
+        parts = list(_elements(data, order))
+        flags = int(np.frombuffer(parts[0][1], f"{order}u4")[0])
+        if flags & 0xFF not in _CLASSES:
+            continue
+        shape = np.frombuffer(parts[1][1], f"{order}i4").tolist()
+        values = [
+            np.frombuffer(data, order + _STORED[kind]).astype(_CLASSES[flags & 0xFF])
+            for kind, data in parts[3:]
+        ]
+        whole = values[0] + 1j * values[1] if flags & _COMPLEX else values[0]
+        yield parts[2][1].decode("latin-1"), whole.reshape(shape, order="F")
+
+
+def _level_4(content: bytes) -> Iterator[tuple[str, Array]]:
+    order = "<" if int.from_bytes(content[:4], "little") < 5000 else ">"
+    file = io.BytesIO(content)
+    while head := file.read(20):
+        kind, rows, columns, imaginary, length = np.frombuffer(
+            head, f"{order}i4"
+        ).tolist()
+        name = file.read(length).rstrip(b"\0").decode("latin-1")
+        number = np.dtype(order + _LEVEL_4[kind // 10 % 10])
+        parts = [
+            np.frombuffer(file.read(rows * columns * number.itemsize), number)
+            for _ in range(1 + bool(imaginary))
+        ]
+        if kind % 10 == 0:  # neither text nor sparse
+            whole = parts[0] + 1j * parts[1] if imaginary else parts[0]
+            yield name, whole.reshape(rows, columns, order="F")
+
+
+def _level_7(path: Path, file: h5py.File) -> dict[str, Array]:
+    arrays = {}
+    for name in file:
+        if isinstance(file.get(name, getlink=True), h5py.HardLink):
+            item = file[name]
+            if isinstance(item, h5py.Dataset):
+                store.check_claim(path, item, name)
+                arrays[name] = item[...].T
+    return arrays
