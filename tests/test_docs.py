@@ -13,8 +13,8 @@ import pytest
 
 from characterize.captures.stage import read_about
 from characterize.model import PARAMETERS
-from metalens.commands.chain import ChainFiles
 from metalens.cli import VERBS, main
+from metalens.commands.chain import ChainFiles
 from metalens.commands.design import DesignSettings
 from metalens.commands.library import CellFile
 from metalens.commands.psf import PsfSettings
