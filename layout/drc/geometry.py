@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from layout.formats.library import stable_order
 from layout.process.jit import compile_loop
 from layout.shapes import convex
 from metalens.core.arrays import Array
@@ -181,32 +182,40 @@ def edge_boxes(edges: Array) -> Array:
     return np.hstack([np.minimum(start, end), np.maximum(start, end)])
 
 
-def find_close_boxes(boxes: Array, distance: float) -> Array:
+def find_close_boxes(
+    boxes: Array,
+    distance: float,
+    *,
+    which: Array | None = None,
+    shift: Array | None = None,
+) -> Array:
     """Plane sweep along x in horizontal bands: pairs of boxes closer than a distance
     along x and along y.
 
     Args:
-        boxes: (n, 4) left, bottom, right, top.
+        boxes: (k, 4) left, bottom, right, top in whole database units.
         distance: database units.
+        which: (n,) box of each copy; None: every box stands once.
+        shift: (n, 2) displacement of each copy; None: none.
 
     Returns:
-        (m, 2) indices, each pair once.
+        (m, 2) indices of copies, each pair once.
 
     Raises:
         MaskFileError: more than 40 million pairs.
     """
-    if len(boxes) < 2:
+    which = np.arange(len(boxes)) if which is None else which
+    if len(which) < 2:
         return np.empty((0, 2), np.int64)
-    order = np.argsort(boxes[:, 0], kind="stable")
-    boxes = np.asarray(boxes[order], float)
-    bottom = boxes[:, 1].min()
-    extent = boxes[:, 3].max() + distance - bottom
-    height = max(np.median(boxes[:, 3] - boxes[:, 1]) + distance, extent / len(boxes))
-    first = ((boxes[:, 1] - bottom) // height).astype(np.int64)
-    last = ((boxes[:, 3] + distance - bottom) // height).astype(np.int64)
-    start, member = _fill_bands(first, last)
-    pairs = np.empty((len(boxes), 2), np.int64)
-    count = _sweep_bands(boxes, first, start, member, distance, pairs)
+    shift = np.zeros((len(which), 2), np.int32) if shift is None else shift
+    boxes = np.asarray(boxes, float)
+    heights = boxes[:, 3] - boxes[:, 1]
+    typical = np.median(heights[which[:: max(1, len(which) // 10_000)]])
+    copies = boxes, which, np.ascontiguousarray(shift)
+    order = stable_order(boxes[which, 0] + shift[:, 0])
+    bands = _fill_bands(*copies, order, float(typical + distance), distance)
+    pairs = np.empty((len(which), 2), np.int64)
+    count = _sweep_bands(*copies, *bands, distance, pairs)
     if count > MAX_PAIRS:
         raise MaskFileError(
             f"{count:,} pairs of shapes closer than {distance:g} units, at most "
@@ -214,31 +223,52 @@ def find_close_boxes(boxes: Array, distance: float) -> Array:
         )
     if count > len(pairs):
         pairs = np.empty((count, 2), np.int64)
-        _sweep_bands(boxes, first, start, member, distance, pairs)
-    return order[pairs[:count]]
+        _sweep_bands(*copies, *bands, distance, pairs)
+    return pairs[:count].copy()
 
 
 @compile_loop
-def _fill_bands(first: Array, last: Array) -> tuple[Array, Array]:
-    """Offsets of the bands, and the boxes of each band in the given order."""
-    start = np.zeros(last.max() + 2, np.int64)
-    for n in range(len(first)):
-        for band in range(first[n], last[n] + 1):
+def _fill_bands(
+    boxes: Array,
+    which: Array,
+    shift: Array,
+    order: Array,
+    height: float,
+    distance: float,
+) -> tuple[float, float, Array, Array]:
+    """Bottom and height of the bands, offsets of their copies, and the copies of each
+    band in order; no more bands than copies.
+    """
+    low, high = np.inf, -np.inf
+    for n in range(len(which)):
+        low = min(low, boxes[which[n], 1] + shift[n, 1])
+        high = max(high, boxes[which[n], 3] + shift[n, 1] + distance)
+    height = max(height, (high - low) / len(which))
+    start = np.zeros(int((high - low) // height) + 2, np.int64)
+    for n in range(len(which)):
+        bottom = boxes[which[n], 1] + shift[n, 1] - low
+        top = boxes[which[n], 3] + shift[n, 1] + distance - low
+        for band in range(int(bottom // height), int(top // height) + 1):
             start[band + 1] += 1
     start = np.cumsum(start)
-    member = np.empty(start[-1], np.int64)
+    member = np.empty(start[-1], np.int32)
     place = start.copy()
-    for n in range(len(first)):
-        for band in range(first[n], last[n] + 1):
+    for n in order:
+        bottom = boxes[which[n], 1] + shift[n, 1] - low
+        top = boxes[which[n], 3] + shift[n, 1] + distance - low
+        for band in range(int(bottom // height), int(top // height) + 1):
             member[place[band]] = n
             place[band] += 1
-    return start, member
+    return low, height, start, member
 
 
 @compile_loop
 def _sweep_bands(
     boxes: Array,
-    first: Array,
+    which: Array,
+    shift: Array,
+    low: float,
+    height: float,
     start: Array,
     member: Array,
     distance: float,
@@ -251,16 +281,19 @@ def _sweep_bands(
     for band in range(len(start) - 1):
         for k in range(start[band], start[band + 1]):
             i = member[k]
-            right = boxes[i, 2] + distance
+            one = boxes[which[i]]
+            right = one[2] + shift[i, 0] + distance
             for other in range(k + 1, start[band + 1]):
                 j = member[other]
-                if boxes[j, 0] >= right:
+                two = boxes[which[j]]
+                if two[0] + shift[j, 0] >= right:
                     break
-                if max(first[i], first[j]) != band:
+                bottom, next_bottom = one[1] + shift[i, 1], two[1] + shift[j, 1]
+                if int((max(bottom, next_bottom) - low) // height) != band:
                     continue
                 if (
-                    boxes[j, 1] - boxes[i, 3] >= distance
-                    or boxes[i, 1] - boxes[j, 3] >= distance
+                    next_bottom - one[3] - shift[i, 1] >= distance
+                    or bottom - two[3] - shift[j, 1] >= distance
                 ):
                     continue
                 if count < len(pairs):

@@ -133,7 +133,9 @@ class _Element:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Placements:
-    """(n,) number of the element, and (n, 2) place of each."""
+    """(n,) number of the element, and (n, 2) place of each; int32 where that holds
+    them.
+    """
 
     element: Array
     xy: Array
@@ -143,11 +145,15 @@ class _Placements:
 
 
 def _concatenate(parts: Sequence[_Placements]) -> _Placements:
-    element = np.concatenate([np.empty(0, np.int64), *(part.element for part in parts)])
-    return _Placements(
-        element,
-        np.concatenate([np.empty((0, 2), np.int64), *(part.xy for part in parts)]),
-    )
+    element = [np.empty(0, np.int32), *(part.element for part in parts)]
+    xy = [np.empty((0, 2), np.int32), *(part.xy for part in parts)]
+    return _Placements(np.concatenate(element), np.concatenate(xy))
+
+
+def _narrowed(xy: Array) -> Array:
+    """Places as int32 where that holds them."""
+    reach = max(-int(xy.min(initial=0)), int(xy.max(initial=0)))
+    return xy.astype(np.int32) if reach < 2**31 else xy
 
 
 class _LayerCheck:
@@ -184,7 +190,7 @@ class _LayerCheck:
             if self.bounding_box(name) is not None
         ]
         place = _Placements(
-            np.array(tops, np.int32), np.zeros((len(tops), 2), np.int64)
+            np.array(tops, np.int32), np.zeros((len(tops), 2), np.int32)
         )
         found = self._check_placements(self.content.tops[0], place)
         report.shapes += found.shapes
@@ -219,10 +225,11 @@ class _LayerCheck:
         """(referenced cell, orientation, (n, 2) places) of all references that draw on
         the layer.
         """
+        content = self.content.cells[cell]
+        drawing = [c for c in content.children if self.bounding_box(c) is not None]
         return [
-            (child, turn, np.column_stack([x, y]))
-            for child, turn, x, y in self.content.cells[cell].instances()
-            if self.bounding_box(child) is not None
+            (child, turn, np.array([x, y]).T)
+            for child, turn, x, y in content.instances(drawing)
         ]
 
     def _bounding_box(self, cell: str) -> tuple[int, int, int, int] | None:
@@ -250,9 +257,8 @@ class _LayerCheck:
         placed = []
         for number, places in parts:
             xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
-            placed.append(
-                _Placements(np.full(len(xy), number, np.int64), xy.astype(np.int64))
-            )
+            every = np.full(len(xy), number, np.int32)
+            placed.append(_Placements(every, _narrowed(xy)))
         return _concatenate(placed)
 
     def _polygon(self, cell: str, outline: Array, turn: Orientation) -> int:
@@ -291,7 +297,7 @@ class _LayerCheck:
         for number, members in group_equal(placed.element):
             element = self.elements[number]
             contents = self._contents(element.cell, element.turn or UPRIGHT)
-            places = placed.xy[members]
+            places = placed.xy[members].astype(np.int64)
             total += len(places) * len(contents.element)
             if total > self.max_elements:
                 raise MaskFileError(
@@ -299,7 +305,7 @@ class _LayerCheck:
                     "space to other shapes; expanding them takes more than "
                     f"{self.max_elements:,} elements (metalens check --max-shapes)"
                 )
-            xy = (places[:, None] + contents.xy).reshape(-1, 2)
+            xy = _narrowed((places[:, None] + contents.xy).reshape(-1, 2))
             parts.append(_Placements(np.tile(contents.element, len(places)), xy))
         return _concatenate(parts)
 
@@ -342,13 +348,13 @@ class _LayerCheck:
         """(n, 2) pairs with boxes closer than the minimum space; their Euclidean and
         projected distances.
         """
-        used, element = np.unique(placed.element, return_inverse=True)
-        elements = [self.elements[number] for number in used.tolist()]
+        occurs = np.bincount(placed.element, minlength=len(self.elements)) > 0
+        elements = [self.elements[number] for number in np.flatnonzero(occurs)]
+        element = (np.cumsum(occurs, dtype=np.int32) - 1)[placed.element]
         corners = [contour_box(one.contours) for one in elements]
-        boxes = np.array(corners, np.int64).reshape(-1, 4)[element] + np.hstack(
-            [placed.xy, placed.xy]
-        )
-        pairs = find_close_boxes(boxes, max(self.space, 1.0))
+        boxes = np.array(corners, float).reshape(-1, 4)
+        distance = max(self.space, 1.0)
+        pairs = find_close_boxes(boxes, distance, which=element, shift=placed.xy)
         first, second = element[pairs].T
         offset = placed.xy[pairs[:, 1]].astype(np.int64) - placed.xy[pairs[:, 0]]
         _, example, which = _distinct_rows(np.column_stack([first, second, offset]))
@@ -512,7 +518,7 @@ class _LayerCheck:
                 self._add_element(_Element(cell, None, contours, contours, rounded))
             )
         union = _Placements(
-            np.array(merged, np.int64), np.zeros((len(merged), 2), np.int64)
+            np.array(merged, np.int32), np.zeros((len(merged), 2), np.int32)
         )
         return _concatenate([placed.select(single), union])
 

@@ -8,7 +8,7 @@ import dataclasses
 import graphlib
 import math
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -165,6 +165,16 @@ class PillarSites:
             self.lattice, source=lambda a, b: lookup[source(a, b)], array=None
         )
 
+    def places(self) -> Iterator[tuple[str, Array, Array]]:
+        """Cell, x and y (n,) of the pillars, some rows at a time."""
+        array = self.lattice
+        for first, block in array.blocks():
+            row, column = np.nonzero(block)
+            x = array.x0 + column * array.pitch
+            y = array.y0 - (first + row) * array.down
+            for number, members in group_equal(block[row, column]):
+                yield self.children[number - 1], x[members], y[members]
+
     def sums(self) -> dict[str, tuple[int, ...]]:
         """{cell: count, sums of x and y, turned, hash} of those that occur."""
         array, digest = self.lattice, RunningDigest()
@@ -248,35 +258,36 @@ class MaskCell:
                 found[child, QUARTERS[0]] += count
         return {key: count for key, count in found.items() if count}
 
-    def instances(self) -> Iterator[tuple[str, Orientation, Array, Array]]:
+    def instances(
+        self, among: Collection[str] | None = None
+    ) -> Iterator[tuple[str, Orientation, Array, Array]]:
         """Placements by cell and orientation: name, orientation, x and y (n,) each.
+
+        Args:
+            among: cells whose placements are listed; None: all.
 
         Raises:
             MaskFileError: only sums of the placements were kept.
         """
         placed = self.kept()
-        for first in range(0, len(placed.child), _AT_ONCE):
+        among = set(self.children if among is None else among)
+        wanted = np.array([name in among for name in placed.children], bool)
+        for first in range(0, len(placed.child) if wanted.any() else 0, _AT_ONCE):
             block = slice(first, first + _AT_ONCE)
-            x, y = placed.x[block], placed.y[block]
-            for kind, members in group_equal(placed.kinds(block)):
+            x, y, kinds = placed.x[block], placed.y[block], placed.kinds(block)
+            if not wanted.all():
+                chosen = wanted[placed.child[block]]
+                x, y, kinds = x[chosen], y[chosen], kinds[chosen]
+            for kind, members in group_equal(kinds):
                 child, turn = divmod(kind, len(placed.turns))
                 yield placed.children[child], placed.turns[turn], x[members], y[members]
         for one in self.references:
-            yield one.child, one.turn, *one.places()
-        if self.pillars is not None:
-            yield from self._pillars(self.pillars)
-
-    def _pillars(
-        self, sites: PillarSites
-    ) -> Iterator[tuple[str, Orientation, Array, Array]]:
-        array = sites.lattice
-        for first, block in array.blocks():
-            row, column = np.nonzero(block)
-            x = array.x0 + column * array.pitch
-            y = array.y0 - (first + row) * array.down
-            for number, members in group_equal(block[row, column]):
-                child = sites.children[number - 1]
-                yield child, QUARTERS[0], x[members], y[members]
+            if one.child in among:
+                yield one.child, one.turn, *one.places()
+        if self.pillars is not None and among.intersection(self.pillars.children):
+            for child, x, y in self.pillars.places():
+                if child in among:
+                    yield child, QUARTERS[0], x, y
 
     def drawn(self) -> dict[LayerNumber, list[Array]]:
         """Polygons of each layer, true circles as polygons of 64 corners."""
@@ -530,11 +541,29 @@ def group_equal(numbers: Array) -> Iterator[tuple[int, Array]]:
     Args:
         numbers: (n,) integers.
     """
-    order = np.argsort(numbers, kind="stable")
-    distinct, starts = np.unique(numbers[order], return_index=True)
-    if len(distinct):
-        parts = np.split(order, starts[1:])
-        yield from zip(distinct.tolist(), parts, strict=True)
+    if not len(numbers):
+        return
+    order = stable_order(numbers)
+    sorted_numbers = numbers[order]
+    starts = np.flatnonzero(np.diff(sorted_numbers)) + 1
+    parts = np.split(order, starts)
+    yield from zip(sorted_numbers[np.r_[0, starts]].tolist(), parts, strict=True)
+
+
+def stable_order(numbers: Array) -> Array:
+    """Indices that sort integers, equal ones in their order (radix sort by 16 bits).
+
+    Args:
+        numbers: (n,) integers.
+    """
+    if not len(numbers):
+        return np.empty(0, np.int64)
+    rank = numbers.astype(np.int64) - int(numbers.min())
+    order = np.argsort(rank.astype(np.uint16), kind="stable")
+    for shift in range(16, int(rank.max()).bit_length(), 16):
+        digit = (rank[order] >> shift).astype(np.uint16)
+        order = order[np.argsort(digit, kind="stable")]
+    return order
 
 
 def circle_polygon(x: int, y: int, radius: int) -> Array:
