@@ -4,7 +4,7 @@ import torch
 
 from codesign.batches import EyeScenes, SceneConfig, sensor_irradiance
 from codesign.optics import OpticsConfig
-from codesign.optics.stack import lens_psf_stack, prepare_transfers
+from codesign.optics.stack import lens_psf_stack, stack_imager
 from codesign.train.formation import read_out
 from metalens.image import Sensor
 
@@ -22,8 +22,8 @@ def train(
     batch, losses = scenes.batch(0, 16), []
     for _ in range(steps):
         psfs = lens_psf_stack(lens, phase_rad)
-        optics = prepare_transfers(lens, psfs, 64, margin=8)
-        light = sensor_irradiance(batch.frames, optics, margin=8)
+        optics = stack_imager(lens, psfs, 64, margin=8)
+        light = sensor_irradiance(batch.frames, optics)
         frames = read_out(light, 24.0, pitch_um, Sensor(), generator=None)
         loss = (network(frames) - batch.slip_mm).abs().mean()  # yours
         optimiser.zero_grad()

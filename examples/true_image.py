@@ -28,8 +28,6 @@ from metalens.image import (
     Frames,
     Grid,
     SmoothWave,
-    basis,
-    image,
     imager,
     uniform_imager,
 )
@@ -127,13 +125,9 @@ plt.show()
 flat = made["field"]
 middle = len(flat.plan.x_um) // 2
 centre = flat.stack[middle, middle]
-order = torch.argsort(flat.plan.depths_um)
-kernels = basis(
-    centre[order].double(), flat.plan.depths_um[order].double(), tolerance=1e-4
-)
-one = uniform_imager(kernels, (SIDE, SIDE), margin=GRID.margin)
+one = uniform_imager(centre, flat.plan.depths_um, GRID, tolerance=1e-4)
 with torch.no_grad():
-    seen = {"one PSF": image(scene, one, margin=GRID.margin)[0].float()}
+    seen = {"one PSF": one(scene)[0]}
     seen |= {name: each(scene)[0] for name, each in made.items()}
 
 figure, axes = plt.subplots(1, len(seen), figsize=(14, 3.2), layout="constrained")

@@ -208,19 +208,19 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
 
 
 def _stages(threads: int, made: pool.FramePool) -> list[Row]:
-    lens = optics.prepare_transfers(
+    lens = optics.stack_imager(
         OPTICS, optics.lens_psf_stack(OPTICS, torch.zeros(35)), 160, margin=16
     )
     sheets, scale = SCENES.rendered(0, 8).frames, SCENES.states(0, 8).scale
     exact, quick = (
-        sensor_irradiance(sheets, lens, margin=16),
-        sensor_irradiance(flatten_layers(sheets, scale), lens, margin=16),
+        sensor_irradiance(sheets, lens),
+        sensor_irradiance(flatten_layers(sheets, scale), lens),
     )
     error = float(
         (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
     )
     batch = PoolScenes(made, 16, 0.2, 0).batch(0, BATCH)
-    light = sensor_irradiance(batch.frames, lens, margin=16)
+    light = sensor_irradiance(batch.frames, lens)
     pitch, noise = (
         torch.tensor(9.0, dtype=torch.float64),
         torch.Generator().manual_seed(0),
@@ -231,7 +231,7 @@ def _stages(threads: int, made: pool.FramePool) -> list[Row]:
 
     render = fastest(lambda: SCENES.rendered(1, 8)) / 8
     one, two = (
-        fastest(partial(sensor_irradiance, f, lens, margin=16)) / n
+        fastest(partial(sensor_irradiance, f, lens)) / n
         for f, n in ((batch.frames, BATCH), (sheets, 8))
     )
     fast, slow = (fastest(partial(sensor, e)) / BATCH for e in (False, True))
@@ -399,7 +399,7 @@ def _data(made: pool.FramePool, of: OpticsConfig) -> float:
     @torch.no_grad()
     def work() -> None:
         batch = scenes.batch(0, BATCH)
-        light = sensor_irradiance(batch.frames, lens, margin=16)
+        light = sensor_irradiance(batch.frames, lens)
         blur.window_vergence(depth_um(batch.frames, margin=16))
         read_out(light, 9.0, pitch, SENSOR, generator=noise.manual_seed(0), exact=False)
 

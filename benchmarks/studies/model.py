@@ -33,10 +33,7 @@ from metalens.image import (
     Grid,
     Optics,
     SmoothWave,
-    UniformImager,
     Window,
-    basis,
-    image,
     imager,
     psfs,
     uniform_imager,
@@ -473,9 +470,8 @@ def _by_one(
         wavelength_um=WAVELENGTH,
         window=window,
     )[0]
-    size = tuple(n + 2 * grid.margin for n in grid.samples)
-    made: UniformImager = uniform_imager(basis(stack, depths), size, margin=0)  # type: ignore[arg-type]
-    seen_, seconds = timed(lambda: image(frames, made, margin=grid.margin))
+    made = uniform_imager(stack, depths, grid)
+    seen_, seconds = timed(lambda: made(frames))
     return seen_[0].numpy(), seconds
 
 

@@ -3,24 +3,14 @@ training affords.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
-from metalens.image import (
-    CODES,
-    Frames,
-    Imager,
-    UniformImager,
-    image,
-    scene,
-    weight_maps,
-)
+from metalens.image import Frames, Imager
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,133 +110,14 @@ def _radiance(frames: SingleSurfaceFrames, device: torch.device | str) -> Tensor
     return torch.from_numpy(frames.light).to(device).float() * (1 / 255)
 
 
-def sensor_irradiance(
-    frames: Frames | SingleSurfaceFrames, optics: UniformImager | Imager, *, margin: int
-) -> Tensor:
-    """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the
-    kernels of ``optics``.
+def sensor_irradiance(frames: Frames | SingleSurfaceFrames, optics: Imager) -> Tensor:
+    """(n, y, x) light on the sensor grid; differentiable in the PSFs of ``optics``.
 
     Args:
-        frames: rendered frames of two layers or of one.
+        frames: rendered frames of two layers or of one, with the margin of ``optics``.
+        optics: what forms the image.
     """
-    device = (
-        optics.stack.device if isinstance(optics, Imager) else optics.transfer.device
-    )
-    if isinstance(optics, Imager):
-        if isinstance(frames, Frames):
-            return optics(frames.to(device))
-        return optics.surface(
-            _radiance(frames, device), depth_um(frames, device=device)
-        )
+    device = optics.stack.device
     if isinstance(frames, Frames):
-        return image(frames.to(device), optics, margin=margin)
-    if device.type != "cpu":
-        return _elsewhere(frames, optics, margin=margin)
-    table = _table(optics)
-    near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
-    inside, out = _inside(frames.light.shape[-2:], margin), []
-    for start in range(
-        0, len(frames.light), 4
-    ):  # a few frames stay in the processor's cache
-        part = slice(start, start + 4)
-        scale = frames.scale[part].astype(np.float32)
-        sources = np.empty((len(scale), table.shape[1], *optics.shape), np.float32)
-        _weigh(
-            frames.light[part],
-            frames.depth_um[part],
-            scale,
-            table,
-            np.float32(near),
-            np.float32(far),
-            sources,
-        )
-        spectrum = torch.fft.rfft2(torch.from_numpy(sources))
-        blurred = torch.fft.irfft2((spectrum * optics.transfer).sum(1), s=optics.shape)
-        out.append(blurred[:, *inside])
-    return torch.cat(out)
-
-
-def _elsewhere(
-    frames: SingleSurfaceFrames, optics: UniformImager, *, margin: int
-) -> Tensor:
-    """As :func:`sensor_irradiance` of flat frames, all at once on another device than
-    the
-    processor.
-    """
-    light, depth = (
-        part(frames, device=optics.transfer.device) for part in (_radiance, depth_um)
-    )
-    table = torch.from_numpy(_table(optics)).to(light.device)
-    near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
-    code = (
-        ((near - 1 / depth) * ((len(table) - 1) / (near - far)) + 0.5)
-        .clamp(0, len(table) - 1)
-        .long()
-    )
-    sources = scene.pad_borders(table[code].movedim(-1, 0) * light, optics.shape)
-    blurred: Tensor = torch.fft.irfft2(
-        (torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape
-    )
-    return blurred[:, *_inside(light.shape[-2:], margin)]
-
-
-def _table(optics: UniformImager) -> Array:
-    """(codes, rank) weights of the kernels at depths at equal steps of 1/z.
-
-    Raises:
-        SceneError: the PSF varies over the image.
-    """
-    psf = optics.psf
-    if psf.weights.shape[:2] != (1, 1):
-        raise SceneError(
-            "flat frames take one PSF for the whole image; give two-sheet frames for a field of PSFs"
-        )
-    near, far = 1 / float(psf.depths_um[0]), 1 / float(psf.depths_um[-1])
-    depths = 1 / torch.linspace(near, far, CODES, dtype=torch.float64)
-    maps = weight_maps(psf, depths[None].to(psf.weights.device))[:, 0]
-    return np.ascontiguousarray(maps.detach().float().cpu().numpy().T)
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _weigh(
-    light: Array,
-    depth: Array,
-    scale: Array,
-    table: Array,
-    near: Any,
-    far: Any,
-    out: Array,
-) -> None:
-    """out (n, rank, Y, X) = table[code of depth, rank] light; spare rows and columns
-    continue the border.
-    """
-    height, width = light.shape[1:]
-    rows, columns = out.shape[2:]
-    top = np.float32(table.shape[0] - 1)
-    unit = top / (near - far)
-    for n in range(light.shape[0]):
-        inverse = np.float32(1) / scale[n]
-        for row in range(rows):
-            y = (
-                row
-                if row < height
-                else (height - 1 if row < height + (rows - height + 1) // 2 else 0)
-            )
-            for column in range(columns):
-                x = (
-                    column
-                    if column < width
-                    else (
-                        width - 1 if column < width + (columns - width + 1) // 2 else 0
-                    )
-                )
-                vergence = inverse / max(np.float32(depth[n, y, x]), np.float32(1))
-                code = int(
-                    min(
-                        max((near - vergence) * unit + np.float32(0.5), np.float32(0)),
-                        top,
-                    )
-                )
-                value = np.float32(light[n, y, x]) * np.float32(1 / 255)
-                for k in range(table.shape[1]):
-                    out[n, k, row, column] = table[code, k] * value
+        return optics(frames.to(device))
+    return optics.surface(_radiance(frames, device), depth_um(frames, device=device))

@@ -25,7 +25,6 @@ from metalens.fabrication import Printed, State, draw_lenses
 from metalens.image import (
     Imager,
     Optics,
-    UniformImager,
     node_light,
     normalise_psfs,
     with_psfs,
@@ -372,7 +371,7 @@ class NetworkReading:
     def _read(
         self,
         subjects: list[RenderedFrames],
-        optics: Imager | UniformImager,
+        optics: Imager,
         *,
         quiet: bool = False,
     ) -> NetworkReadings:

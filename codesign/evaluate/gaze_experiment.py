@@ -40,7 +40,7 @@ from codesign.optics import formed
 from codesign.train import Predictions, SensorFrames, assess, frame_wide, read_out
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, PropagationError, SceneError
-from metalens.image import Imager, Sensor, UniformImager, low_snr
+from metalens.image import Imager, Sensor, low_snr
 
 # streams of the random generator
 LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
@@ -154,7 +154,7 @@ def turned_to(states: EyeStates, looks_deg: Array, rig: CameraRig) -> EyeStates:
 def image_frames(
     source: FinishedRun,
     made: RenderedFrames,
-    prepared: UniformImager | Imager,
+    prepared: Imager,
     *,
     seed: int,
     sensor: Sensor | None = None,
@@ -171,7 +171,7 @@ def image_frames(
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
-    light = sensor_irradiance(batch.frames, prepared, margin=margin)
+    light = sensor_irradiance(batch.frames, prepared)
     noise = torch.Generator().manual_seed(seed)
     pitch = trainer.model.pitch_um
     pixels = read_out(
@@ -358,7 +358,7 @@ def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
 
 def prepare_run(
     source: FinishedRun, *, image: Literal["true", "trained"] = "true"
-) -> UniformImager | Imager:
+) -> Imager:
     """The imager of a run's lens, of a retraining the made one; its network set to
     statistics of training frames, as
     they were formed.
@@ -425,7 +425,7 @@ def sphere_calibrator(
 @torch.no_grad()
 def run_calibrator(
     source: FinishedRun,
-    imager: UniformImager | Imager,
+    imager: Imager,
     config: ExperimentConfig,
     sensor: Sensor,
 ) -> PersonCalibrator:

@@ -30,7 +30,7 @@ from codesign.train import SceneSource, read_out
 from metalens.core import threads
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table
-from metalens.image import Imager, Sensor, UniformImager
+from metalens.image import Imager, Sensor
 from metalens.lens import Lens
 
 SHARE = 0.9  # of the intervals
@@ -222,7 +222,7 @@ def render_scenes(config: ReaderConfig, *, sensor_distance_um: float) -> Judging
 
 
 def train_reader(
-    optics: Imager | UniformImager, seen: JudgingScenes, config: ReaderConfig
+    optics: Imager, seen: JudgingScenes, config: ReaderConfig
 ) -> ReaderResult:
     """Train the reader on images through ``optics`` and judge it; the same seed gives
     the same numbers.
@@ -249,7 +249,7 @@ def train_reader(
 
 @torch.no_grad()
 def lens_frames(
-    optics: Imager | UniformImager,
+    optics: Imager,
     scenes: SceneSource,
     config: ReaderConfig,
     count: int,
@@ -265,7 +265,7 @@ def lens_frames(
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
     for number in range(count // BATCH):
         batch = scenes.batch(number, BATCH)
-        light = sensor_irradiance(batch.frames, optics, margin=config.margin)
+        light = sensor_irradiance(batch.frames, optics)
         noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
         pixels.append(
             read_out(

@@ -8,7 +8,14 @@ from torch import Tensor
 from codesign.evaluate.optics import SensitivityScenes, scene_views
 from codesign.eye import states_at
 from metalens.design.free_form import DesignScore, ResolvedFisherSettings
-from metalens.image import OpticsLoss, Pupil, encircled_energy, optics_loss, scene
+from metalens.image import (
+    Grid,
+    OpticsLoss,
+    Pupil,
+    encircled_energy,
+    optics_loss,
+    uniform_imager,
+)
 from metalens.image import pupil as pupils
 from metalens.psf import integrate_pixels
 
@@ -53,22 +60,14 @@ class SceneObjective:
             * 2
             - 1
         )
-        self.sources = [self._cut(f) for f in self.frames]
+        self.grid = Grid(
+            (self.scenes.pixels, self.scenes.pixels),
+            self.scenes.pitch_um,
+            (low, high),
+            window=self.size,
+        )
         sharp = [f.radiance.sum(1) for f in self.frames]
         self.reference = self._fisher(sharp).diagonal().detach()
-
-    def _cut(self, frames: scene.Frames) -> Tensor:
-        """Spectra (depths, frames, light and coverage, sheets, Y, X) of the frames cut
-        at the depths.
-        """
-        nodes = torch.zeros(DEPTHS, self.size, self.size)
-        whole = scene.PsfBasis(
-            nodes, torch.eye(DEPTHS)[None, None], self.depths_um, 0.0, 0.0
-        )
-        self.optics = scene.uniform_imager(
-            whole, (self.scenes.pixels, self.scenes.pixels)
-        )
-        return scene.layer_spectra(frames, self.optics)
 
     def loss(
         self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
@@ -119,11 +118,8 @@ class SceneObjective:
         stack = integrate_pixels(
             fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size)
         )
-        optics = scene.with_kernels(
-            self.optics, stack / stack.sum((1, 2), keepdim=True)
-        )
-        size = (self.scenes.pixels, self.scenes.pixels)
-        images = [scene.image_spectra(source, optics, size) for source in self.sources]
+        optics = uniform_imager(stack, self.depths_um, self.grid)
+        images = [optics(frames) for frames in self.frames]
         scale = torch.sqrt(self.reference)
         fisher = self._fisher(images) / torch.outer(scale, scale)
         found = optics_loss(

@@ -15,13 +15,10 @@ from codesign.optics.lens_errors import LensError, variance_rad2
 from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from metalens.core.errors import PropagationError, SceneError, TrainingError
 from metalens.image import (
-    Grid,
     Imager,
     Optics,
     SmoothWave,
-    UniformImager,
     normalise_psfs,
-    scene,
     surrogate_loss,
     textured_frames,
     with_psfs,
@@ -71,19 +68,6 @@ def wave_of(
     return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
 
 
-def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
-    """Square frames of ``frame`` samples, margin included.
-
-    Args:
-        settings: of the lens and its image.
-    """
-    side = frame - 2 * margin
-    depths = settings.depths_mm[0] * 1e3, settings.depths_mm[1] * 1e3
-    return Grid(
-        (side, side), settings.sample_um, depths, margin, settings.window_samples
-    )
-
-
 def make_imager(
     settings: OpticsConfig,
     coefficients_rad: Tensor,
@@ -93,7 +77,7 @@ def make_imager(
     error: LensError | None = None,
     made: PixelPsfStack | None = None,
     device: torch.device | str = "cpu",
-) -> UniformImager | Imager:
+) -> Imager:
     """What images frames of ``frame`` samples, margin included.
 
     Args:
@@ -109,7 +93,7 @@ def make_imager(
     """
     if settings.image == "uniform":
         found = made or lens.lens_psf_stack(settings, coefficients_rad, error=error)
-        return lens.prepare_transfers(settings, found, frame, margin=margin).to(device)
+        return lens.stack_imager(settings, found, frame, margin=margin).to(device)
     there = frame, margin, torch.device(device)
     if made is not None:
         return _made(settings, made, there)
@@ -171,7 +155,7 @@ def imager_through(
     """
     whole = field_imager(
         plane.wave,
-        grid_of(settings, frame, margin),
+        lens.grid_of(settings, frame, margin),
         spectrum=source_of(settings),
         layers=plane.layers,
         field=(math.radians(settings.angle_deg), 0.0),
@@ -291,26 +275,23 @@ def uniform_image_error(
         frame,
         margin=margin,
     )
-    if not isinstance(true, Imager) or not isinstance(one, UniformImager):
-        raise TrainingError("no pair of images to compare")
     return relative_image_difference(one, true)
 
 
 @torch.no_grad()
-def relative_image_difference(one: UniformImager, true: Imager) -> float:
+def relative_image_difference(one: Imager, true: Imager) -> float:
     """Relative L2 difference of the image of a texture in depth through one PSF a depth
     from its true image.
 
     Of the texture's contrast; both images of frames of one size, with the same margin.
     """
-    frames, margin = textured_frames(true.grid), true.grid.margin
+    frames = textured_frames(true.grid)
     want = replace(true, stray=None)(frames)
-    got = scene.image(frames, one, margin=margin)
-    return float((got - want).norm() / (want - want.mean()).norm())
+    return float((one(frames) - want).norm() / (want - want.mean()).norm())
 
 
 def image_tolerance_problem(
-    settings: OpticsConfig, found: UniformImager | Imager
+    settings: OpticsConfig, found: Imager
 ) -> str:
     """Why the error of the true image is above ``optics.image_tolerance``; empty where
     it is not, or the image is
@@ -319,7 +300,7 @@ def image_tolerance_problem(
     Args:
         settings: of the lens and its image. found: what forms the images.
     """
-    return found.above(settings.image_tolerance) if isinstance(found, Imager) else ""
+    return "" if found.light.uniform else found.above(settings.image_tolerance)
 
 
 def describe_image(

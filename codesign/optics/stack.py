@@ -30,13 +30,12 @@ from metalens.core.errors import ConfigError, TrainingError
 from metalens.design import Focus, PhaseOf, profiles
 from metalens.image import (
     Field,
+    Grid,
+    Imager,
     Optics,
-    PsfBasis,
     Pupil,
     PupilView,
-    UniformImager,
     aperture_light,
-    basis,
     coordinates,
     radius,
     uniform_imager,
@@ -251,15 +250,6 @@ class PixelPsfStack:
     depths_um: Tensor = field(repr=False)
     plane: Optics | None = field(default=None, repr=False)
 
-    def basis(self, tolerance: float) -> PsfBasis:
-        """The stack as a few kernels; PSFs normalised by sum (paper Sec. 3.1).
-
-        Args:
-            tolerance: relative L2 error allowed.
-        """
-        total = self.intensity.sum((-2, -1), keepdim=True)
-        return basis(self.intensity / total, self.depths_um, tolerance=tolerance)
-
 
 def lens_psf_stack(
     settings: OpticsConfig,
@@ -369,16 +359,33 @@ def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     return phase
 
 
-def prepare_transfers(
+def stack_imager(
     settings: OpticsConfig, made: PixelPsfStack, frame: int, *, margin: int
-) -> UniformImager:
-    """Transfer functions for square frames of ``frame`` samples rendered with
-    ``margin`` to spare.
+) -> Imager:
+    """Shift-invariant imager of square frames of ``frame`` samples, margin included.
 
     Args:
         settings: of the lens and its image. made: PSFs over depth.
     """
-    return uniform_imager(made.basis(settings.tolerance), (frame, frame), margin=margin)
+    return uniform_imager(
+        made.intensity,
+        made.depths_um,
+        grid_of(settings, frame, margin),
+        tolerance=settings.tolerance,
+    )
+
+
+def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
+    """Square frames of ``frame`` samples, margin included.
+
+    Args:
+        settings: of the lens and its image.
+    """
+    side = frame - 2 * margin
+    depths = settings.depths_mm[0] * 1e3, settings.depths_mm[1] * 1e3
+    return Grid(
+        (side, side), settings.sample_um, depths, margin, settings.window_samples
+    )
 
 
 @functools.lru_cache(maxsize=8)

@@ -18,7 +18,7 @@ from codesign.optics import OpticsConfig, PixelPsfStack, formed
 from codesign.train.formation import frame_wide, read_out
 from codesign.train.inner import InnerConfig, SceneSource, Trainer
 from metalens.core.errors import PropagationError, SceneError
-from metalens.image import Imager, UniformImager
+from metalens.image import Imager
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -104,7 +104,7 @@ def sensor_frames(
         batches: how many batches.
     """
     optics = optics or trainer.optics
-    prepared: UniformImager | Imager | None = None
+    prepared: Imager | None = None
     pitch, wide, above = trainer.model.pitch_um, 1.0, ""
     pixels, masks, slips, depths = [], [], [], []
     for number in range(first, first + batches):
@@ -119,7 +119,7 @@ def sensor_frames(
                 *given, margin=scenes.margin, made=stack, device=trainer.light.device
             )
             above = formed.image_tolerance_problem(optics, prepared)
-        light = sensor_irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
+        light = sensor_irradiance(batch.frames, prepared).cpu()
         noise = torch.Generator().manual_seed(
             1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number
         )

@@ -39,7 +39,7 @@ from codesign.train.separability import (
 )
 from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
-from metalens.image import Frames, Imager, Sensor, UniformImager, encircled_energy
+from metalens.image import Frames, Imager, Sensor, encircled_energy
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,7 +357,7 @@ class Trainer:
         margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(step, batch.frames, live)
-            light = sensor_irradiance(batch.frames, optics, margin=margin)
+            light = sensor_irradiance(batch.frames, optics)
         vergence = blur.window_vergence(
             depth_um(batch.frames, margin=margin, device=self.light.device)
         )
@@ -429,7 +429,7 @@ class Trainer:
 
     def _light(
         self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
-    ) -> tuple[UniformImager | Imager, Tensor]:
+    ) -> tuple[Imager, Tensor]:
         """What images this step's frames, and the optics loss."""
         coefficients = self.model.coefficients_rad
         optics = self.light.at(
@@ -447,7 +447,7 @@ class Trainer:
             return optics, depth_loss(made, self.optics, energy=self.inner.energy)
         found = fisher_separability(
             triplet_frames(self.triplets, config, step),
-            lambda one: sensor_irradiance(one, optics, margin=self.scenes.margin),
+            lambda one: sensor_irradiance(one, optics),
             encircled_energy(
                 made.intensity,
                 self.optics.sample_um,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from codesign.optics import LensError, OpticsConfig, PixelPsfStack, formed
 from codesign.optics import stack as lens
-from metalens.image import Imager, UniformImager, draw_nodes
+from metalens.image import Imager, draw_nodes
 
 Draw = Callable[[int], LensError | None]
 
@@ -45,8 +45,8 @@ class StepImaging:
         self.device = torch.device(
             "cpu"
         )  # of images and losses: see :mod:`codesign.train.placement`
-        self._ready: UniformImager | Imager | None = None
-        self._given: dict[int, UniformImager | Imager] = {}
+        self._ready: Imager | None = None
+        self._given: dict[int, Imager] = {}
         self._live: formed.DifferentiableImager | None = None
 
     def state(self) -> dict[str, Any]:
@@ -66,7 +66,7 @@ class StepImaging:
         margin: int,
         *,
         live: bool,
-    ) -> UniformImager | Imager:
+    ) -> Imager:
         """The imager of a step for frames of ``frame`` samples, margin included;
         ``live``: the lens moves.
 
@@ -112,14 +112,14 @@ class StepImaging:
         margin: int,
         *,
         live: bool,
-    ) -> UniformImager | Imager:
+    ) -> Imager:
         error = self.draw(step)
         if not live and error is None and self._ready is not None:
             return self._ready
         made = lens.lens_psf_stack(
             self.optics, coefficients_rad, error=error, shared=True
         )
-        prepared = lens.prepare_transfers(self.optics, made, frame, margin=margin).to(
+        prepared = lens.stack_imager(self.optics, made, frame, margin=margin).to(
             self.device
         )
         self._ready = None if live or error is not None else prepared
@@ -160,7 +160,7 @@ class StepImaging:
 
     def _drawn(
         self, step: int, coefficients_rad: Tensor, frame: int, margin: int
-    ) -> UniformImager | Imager:
+    ) -> Imager:
         """The given PSFs that this step draws."""
         number = int(
             np.random.default_rng([self.seed, step, 4]).integers(len(self.stacks))

@@ -7,6 +7,7 @@ from .engine import normalise_psfs as normalise_psfs
 from .engine import textured_frames as textured_frames
 from .forming import Imager as Imager
 from .forming import image_direct as image_direct
+from .forming import uniform_imager as uniform_imager
 from .forming import with_psfs as with_psfs
 from .information import Normalisation as Normalisation
 from .information import OpticsLoss as OpticsLoss
@@ -28,14 +29,7 @@ from .pupil import aperture_light as aperture_light
 from .pupil import coordinates as coordinates
 from .pupil import radius as radius
 from .pupil import view_pupil as view_pupil
-from .scene import CODES as CODES
 from .scene import Frames as Frames
-from .scene import PsfBasis as PsfBasis
-from .scene import UniformImager as UniformImager
-from .scene import basis as basis
-from .scene import image as image
-from .scene import uniform_imager as uniform_imager
-from .scene import weight_maps as weight_maps
 from .sensor import Sensor as Sensor
 from .sensor import low_snr as low_snr
 from .slopes import draw_nodes as draw_nodes

@@ -1,9 +1,14 @@
-"""Compiled loops: light on the nodes of a pupil, and pillars averaged over cells."""
+"""Compiled loops: light on the nodes of a pupil, pillars averaged over cells, and
+sources weighted for every kernel.
+"""
 
 from typing import Any
 
 import numba
 import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
 
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
@@ -134,3 +139,79 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
                         sums[1, cell] += phase[j]
                         sums[2, cell] += 1
         out[:, row] = sums / (side * side)
+
+
+def weigh_sources(
+    content: Tensor, depth_um: Tensor, table: Tensor, vergence: tuple[float, float]
+) -> Tensor:
+    """(rank, *content) float32 sources times the weights of all kernels at their depths.
+
+    Args:
+        content: (frames, kinds, *sheets, y, x). depth_um: the same with 1 kind; or both
+            (frames, y, x).
+        table: (codes, rank) weights at equal steps of 1/z. vergence: (first, last) 1/z
+            of them.
+    """
+    frame, frames = content.shape[-2:], len(content)
+    kinds = content.numel() // max(depth_um.numel(), 1)
+    light = content.reshape(frames, kinds, -1, *frame).contiguous().numpy()
+    depth = depth_um.reshape(frames, -1, *frame).contiguous().numpy()
+    out = np.empty((table.shape[1], *light.shape), np.float32)
+    rows = np.ascontiguousarray(table.numpy().T)
+    near, far = (np.float32(end) for end in vergence)
+
+    run_split(frames, lambda a, b: _weigh(light, depth, rows, near, far, a, b, out))
+    return torch.from_numpy(out).reshape(-1, *content.shape)
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True)
+def _weigh(light, depth, table, near, far, start, stop, out):  # type: ignore[no-untyped-def]
+    """Row by row: the weight of the nearest depth of the table."""
+    _, kinds, sheets, height, width = light.shape
+    top = np.float32(table.shape[1] - 1)
+    unit = top / max(near - far, np.float32(1e-30))
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    code = np.empty(width, np.uint32)
+    for n in range(start, stop):
+        for sheet in range(sheets):
+            for y in range(height):
+                for x in range(width):
+                    place = (near - one / max(depth[n, sheet, y, x], one)) * unit
+                    code[x] = np.uint32(min(max(place + half, zero), top))
+                for k in range(table.shape[0]):
+                    row = table[k]
+                    for kind in range(kinds):
+                        given, made = (
+                            light[n, kind, sheet, y],
+                            out[k, n, kind, sheet, y],
+                        )
+                        for x in range(width):
+                            made[x] = row[code[x]] * given[x]
+
+
+def is_compilable(a: Tensor) -> bool:
+    """Whether compiled code may read the values: single precision, in main memory,
+    without derivatives.
+
+    Args:
+        a: a tensor.
+    """
+    return a.dtype in (torch.float32, torch.complex64) and is_plain_value(a)
+
+
+def is_plain_value(a: Tensor) -> bool:
+    """Whether it lies in main memory and carries no derivatives, backward or forward.
+
+    Args:
+        a: a tensor.
+    """
+    return a.device.type == "cpu" and has_no_gradient(a)
+
+
+def has_no_gradient(a: Tensor) -> bool:
+    """Whether it carries no derivatives, backward or forward.
+
+    Args:
+        a: a tensor.
+    """
+    return not a.requires_grad and forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from metalens.core.errors import SceneError
+from metalens.image.compiled import has_no_gradient
 from metalens.image.low_rank import (
     KernelBasis,
     LowRankPsfs,
@@ -18,7 +19,8 @@ from metalens.image.low_rank import (
     principal_kernels,
 )
 from metalens.image.plan import SHARES, Grid, Plan
-from metalens.image.scene import Frames, has_no_gradient
+from metalens.image.points import Window
+from metalens.image.scene import Frames
 from metalens.image.slopes import by_nodes
 from metalens.image.stray import Stray, add_stray
 
@@ -33,7 +35,8 @@ LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 class Imager:
     """A lens ready to image frames of one grid.
 
-    grid, plan: where the scene is sampled, and where the PSFs are known.
+    grid, plan: where the scene is sampled, and where the PSFs are known (one node on the
+        axis, and no wavelengths, where they were given for all of the field).
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1.
     energy: (rows, columns, depths) relative illumination E of each.
     basis: kernels of the PSFs.
@@ -96,13 +99,28 @@ class Imager:
         Raises:
             SceneError: frames of another size than the grid's with its margin.
         """
+        parts = (frames.radiance, frames.coverage, frames.depth_um)
+        if self.light.uniform:
+            return self._uniform_sheets(*self._continued(*parts))
         if _far_alone(frames):
             return self.surface(frames.radiance[:, 1], frames.depth_um[:, 1])
-        parts = (frames.radiance, frames.coverage, frames.depth_um)
         light, cover, depth_um = self._continued(*parts)
         both = self._blurred(light, depth_um, lit=True)
         covered = self._blurred(cover, depth_um, lit=False)
-        return self._returned(_over(both, covered), light.sum(1))
+        return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
+
+    def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
+        """Light over coverage, blurred alike: constant radiance stays constant.
+
+        The mean is not transformed, so that rounding grows with the contrast alone.
+        """
+        whole, covered = (
+            part.detach().sum((1, 2, 3), keepdim=True) for part in (light, cover)
+        )
+        mean = whole / covered.clamp_min(1e-30)
+        pair = torch.stack([light - mean * cover, cover], 1)
+        blurred = self._returned(self.light.blur(pair, depth_um[:, None]), light)
+        return occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
 
     def surface(self, light: Tensor, depth_um: Tensor) -> Tensor:
         """(frames, y, x) irradiance of one opaque surface in place of two sheets.
@@ -138,6 +156,8 @@ class Imager:
         """Light or coverage (frames, *sheets, y, x) through the PSFs."""
         used = self.light if lit else self.cover
         total = used.blur(content, depth_um.detach())
+        if self.light.uniform:
+            return total
         moves = self.stack.requires_grad or depth_um.requires_grad
         if moves and torch.is_grad_enabled():
             about = self.field, content.detach(), depth_um
@@ -186,6 +206,41 @@ def build_imager(
     return _assembled(grid, plan, found, basis, {})
 
 
+def uniform_imager(
+    psf: Tensor, depths_um: Tensor, grid: Grid, *, tolerance: float = 1e-3
+) -> Imager:
+    """Shift-invariant image formation: one PSF a depth for the whole field.
+
+    The :class:`Imager` of one field node. It is differentiable in the PSFs by kernels
+    that are mixed of them; PSFs that require a gradient get as many kernels as keep the
+    image's derivative by depth within 2 %.
+
+    Args:
+        psf: (depths, h, w) light on each sample, of the size of the grid's window; they
+            are divided by their sums (paper Sec. 3.1).
+        depths_um: (depths,) ascending; weights are linear in 1/z between them.
+        grid: where the scene is sampled.
+        tolerance: relative L2 error of the image of a 1/f texture, at the worst depth.
+
+    Raises:
+        SceneError: depths that do not ascend, or PSFs of another number or size.
+    """
+    if psf.shape != (len(depths_um), grid.window, grid.window):
+        raise SceneError(
+            f"PSFs {tuple(psf.shape)} of {len(depths_um)} depths for a window of "
+            f"{grid.window} samples: need one a depth, of that size"
+        )
+    if bool((depths_um[1:] <= depths_um[:-1]).any()):
+        raise SceneError(f"depths {depths_um.tolist()} um: need ascending ones")
+    unit = psf / psf.sum((-2, -1), keepdim=True)
+    axis, window = torch.zeros(1), Window(grid.window, grid.step_um)
+    plan = Plan(axis, axis, depths_um, None, window, False)  # type: ignore[arg-type]
+    one = torch.ones_like(unit[None, None, :, 0, 0]).detach()
+    found = PsfField(unit[None, None], one, depths_um)
+    basis = principal_kernels(found, grid.frame, tolerance=tolerance)
+    return _assembled(grid, plan, found, basis, {"kernels": basis.error})
+
+
 def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     """The same imager with other PSFs, its kernels mixed of them as of the first ones.
 
@@ -211,23 +266,22 @@ def _assembled(
     parts: Mapping[str, float],
 ) -> Imager:
     few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)
-    light = low_rank_psfs(found, basis, grid.frame)
-    cover = low_rank_psfs(found, basis, grid.frame, rank=few, lit=False)
+    light = cover = low_rank_psfs(found, basis, grid.frame)
+    if not found.uniform:
+        cover = low_rank_psfs(found, basis, grid.frame, rank=few, lit=False)
     given = found.psf, found.illumination, basis, light, cover, parts
     return Imager(grid, plan, *given)
 
 
-def _over(light: Tensor, cover: Tensor) -> Tensor:
-    """Near sheet over far sheet: (frames, 2, y, x) each to (frames, y, x); the plain
-    sum where one sheet is visible.
+def occlude(light: Tensor, cover: Tensor) -> Tensor:
+    """Near sheet over far sheet: (frames, 2, y, x) blurred light and coverage to the
+    (frames, y, x) light of what is visible, over its coverage.
     """
     free = (1 - cover[:, 0]).clamp(0, 1)
     share = (cover[:, 1] / FAINT).clamp(0, 1)
     behind = free * share * (3 - 2 * share) / cover[:, 1].clamp_min(FAINT)
     weight = cover[:, 0] + behind * cover[:, 1]
-    return (light[:, 0] + behind * light[:, 1]) * (
-        cover.sum(1) / weight.clamp_min(FAINT)
-    )
+    return (light[:, 0] + behind * light[:, 1]) / weight.clamp_min(FAINT)
 
 
 def _far_alone(frames: Frames) -> bool:

@@ -2,20 +2,24 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import scipy.fft
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, pad
 
+from metalens.image import compiled
 from metalens.image.splines import TAPS, spline_coefficients, spline_matrix, spline_taps
-from metalens.image.texture import scene_spectrum
+from metalens.image.texture import scene_spectrum, texture_spectrum
 
+CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
 SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
 MOST_KERNELS = 320
 FEWEST = 24  # kernels: single points hold more fine detail than a textured scene
 ROUNDS = 2  # of the correction of planes: each squares what the last left of it
 FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
 EVEN = 0.01  # rms error of an evenly lit plane that kernels may leave to correct
+SLOPE = 0.02  # relative error of an image's derivative by shift-invariant PSFs
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,6 +40,11 @@ class PsfField:
         """(rows, columns, depths, h, w) PSFs times their relative illumination."""
         return self.psf * self.illumination[..., None, None]
 
+    @property
+    def uniform(self) -> bool:
+        """Whether one node stands for the whole field: shift-invariant PSFs."""
+        return self.psf.shape[:2] == (1, 1)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KernelBasis:
@@ -43,21 +52,23 @@ class KernelBasis:
 
     mixture: (rank, sampled) of the PSFs of the nodes ``sampled`` (flat numbers).
     weights: (nodes, rank) projections of all nodes' PSFs, of sum 1.
+    error: relative L2 error of the image of a texture, at the worst depth.
     """
 
     mixture: Tensor
     sampled: Tensor
     weights: Tensor
+    error: float
 
     def kernels(self, psf: Tensor, rank: int) -> Tensor:
         """(rank, h, w) leading kernels mixed of PSFs (rows, columns, depths, h, w)."""
-        some = psf.detach().flatten(0, 2)[self.sampled]
+        some = psf.flatten(0, 2)[self.sampled]
         return torch.einsum("rn,nyx->ryx", self.mixture[:rank].to(some), some)
 
     def to(self, device: torch.device | str) -> "KernelBasis":
         """The same on a device."""
         parts = (self.mixture, self.sampled, self.weights)
-        return KernelBasis(*(part.to(device) for part in parts))
+        return KernelBasis(*(part.to(device) for part in parts), self.error)
 
 
 def principal_kernels(
@@ -79,11 +90,16 @@ def principal_kernels(
     light = field.illumination.detach().flatten().double()
     # an error that differs from node to node has frequencies up to half their number
     band = max((k - 1) / (2 * n) for k, n in zip(psf_nodes(field), frame, strict=True))
-    metric = max(tolerance / EVEN, 1.0), band
+
+    def transform(some: Tensor) -> Tensor:
+        if field.uniform:
+            return texture_spectrum(some.double())
+        return scene_spectrum(some.double(), max(tolerance / EVEN, 1.0), band)
+
     draw = torch.Generator().manual_seed(3)
     order = torch.randperm(len(psf), generator=draw)[:SAMPLED].sort().values
     sampled = order.to(psf.device)
-    features = scene_spectrum(psf[sampled].double(), *metric) * light[sampled, None]
+    features = transform(psf[sampled]) * light[sampled, None]
     power, vectors = torch.linalg.eigh(features @ features.mT)
     power, vectors = power.flip(0), vectors.flip(1)
     # below this is the rounding of single precision, in which the PSFs are given
@@ -93,19 +109,40 @@ def principal_kernels(
     axes = scaled.mT @ features
     weights, whole = [], []
     for some in torch.split(psf, SAMPLED):
-        spectrum = scene_spectrum(some.double(), *metric)
+        spectrum = transform(some)
         weights.append(spectrum @ axes.mT)
         whole.append(spectrum.square().sum(1, keepdim=True))
     weight, depths = torch.cat(weights), len(field.depths_um)
     in_light = light[:, None] ** 2
     kept = (weight**2 * in_light).reshape(-1, depths, rank).mean(0)
     total = (torch.cat(whole) * in_light).reshape(-1, depths, 1).mean(0)
-    brightest = in_light.reshape(-1, depths).mean(0).max()
-    left = (total - kept.cumsum(1)).clamp_min(0).amax(0)
-    missing = torch.sqrt(left / brightest)
-    rank = min(max(int((missing > tolerance).sum()) + 1, FEWEST), rank)
+    level = total if field.uniform else in_light.reshape(-1, depths).mean(0).max()
+    missing = torch.sqrt(((total - kept.cumsum(1)).clamp_min(0) / level).amax(0))
+    fewest = FEWEST
+    if field.uniform:
+        lost = _derivative_error(features, vectors[:, :rank])
+        fewest = int((lost > SLOPE).sum()) if field.psf.requires_grad else 1
+    rank = min(max(int((missing > tolerance).sum()) + 1, fewest), rank)
     mixture = scaled.mT[:rank] * light[sampled]
-    return KernelBasis(mixture, sampled, weight[:, :rank].contiguous())
+    error = float(missing[rank - 1])
+    return KernelBasis(mixture, sampled, weight[:, :rank].contiguous(), error)
+
+
+def _derivative_error(features: Tensor, axes: Tensor) -> Tensor:
+    """(components,) relative L2 error of the image's derivative by depth without them.
+
+    Changes of the PSFs vary with depth in ways that the PSFs themselves show weakly.
+
+    Args:
+        features: (depths, frequencies). axes: (depths, components) orthonormal mixtures
+            of them, of which component k and all later ones are left out.
+    """
+    if len(features) < 2:
+        return features.new_zeros(axes.shape[1])
+    (change,) = torch.gradient(features, dim=0)
+    power = (axes.mT @ change).square().sum(1)
+    total = change.square().sum().clamp_min(1e-300)
+    return torch.sqrt((1 - (power.cumsum(0) - power) / total).clamp_min(0))
 
 
 def psf_nodes(field: PsfField) -> tuple[int, int]:
@@ -124,7 +161,8 @@ class LowRankPsfs:
     kernels: (rank, h, w).
     transfer: (rank, Y, X // 2 + 1) their transforms, of size ``shape`` = (Y, X).
     table: (y, x, depth coefficients, rank) B-spline coefficients in 1/z of the weights
-        of every sample.
+        of every sample; (depths, rank) weights at equal steps of 1/z where all samples
+        share them.
     vergence: (nearest, farthest) 1/z of the nodes.
     """
 
@@ -139,13 +177,24 @@ class LowRankPsfs:
         parts = ("kernels", "transfer", "table")
         return replace(self, **{name: getattr(self, name).to(device) for name in parts})
 
+    @property
+    def uniform(self) -> bool:
+        """Whether all samples share their weights."""
+        return self.table.ndim == 2
+
     def weigh(self, content: Tensor, depth_um: Tensor) -> Tensor:
         """(rank, *batch, y, x) sources times their weights.
 
         Args:
-            content, depth_um: (*batch, y, x); depths beyond the nodes take the
-                outermost.
+            content: (*batch, y, x). depth_um: the same, or of sizes that broadcast;
+                depths beyond the nodes take the outermost.
         """
+        if self.uniform:
+            parts = content, depth_um, self.table
+            if all(compiled.is_compilable(part) for part in parts):
+                return compiled.weigh_sources(*parts, self.vergence)
+            rows = self.interpolate(depth_um).reshape(-1, *depth_um.shape)
+            return rows * content
         fixed = not (content.requires_grad and torch.is_grad_enabled())
         where = torch.nonzero(content.flatten())[:, 0] if fixed else None
         if where is None or 10 * len(where) > 9 * content.numel():
@@ -162,13 +211,16 @@ class LowRankPsfs:
         Args:
             depth_um: (*batch, y, x). where: (samples,) flat numbers into it.
         """
-        high, wide, coefficients, rank = self.table.shape
         number = torch.arange(depth_um.numel(), device=depth_um.device)
         depth = depth_um.flatten()
         if where is not None:
             number, depth = number[where], depth[where]
         near, far = self.vergence
         unit = ((near - 1 / depth) / max(near - far, 1e-30)).clamp(0, 1)
+        if self.uniform:
+            code = (unit * (len(self.table) - 1) + 0.5).long()
+            return self.table.mT.index_select(1, code)
+        high, wide, coefficients, rank = self.table.shape
         nodes = 1 if near == far else coefficients - 2
         first, taps = spline_taps(unit, nodes)
         index = (number % (high * wide)) * coefficients + first
@@ -217,16 +269,23 @@ def low_rank_psfs(
     lit planes is spread over the relative illumination (:func:`correct_planes`).
 
     Args:
-        field: differentiable in its illumination alone.
+        field: differentiable in its illumination, and in its PSFs where it is uniform.
         basis: of this field, or of a similar one on the same nodes.
         frame: (y, x) samples.
         rank: kernels that are used, by default all.
         lit: whether the sources carry light; else the PSFs are of sum 1.
     """
-    psf = field.psf.detach()
+    psf = field.psf if field.uniform else field.psf.detach()
     rank = len(basis.mixture) if rank is None else min(rank, len(basis.mixture))
-    kernels = basis.kernels(psf, rank)
-    weights = match_moments(basis.weights[:, :rank], kernels, psf.flatten(0, 2))
+    kernels, shape = basis.kernels(psf, rank), fast_shape(frame)
+    weights = match_moments(
+        basis.weights[:, :rank], kernels.detach(), psf.detach().flatten(0, 2)
+    )
+    vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
+    transfer = transfer_functions(kernels, shape)
+    if field.uniform:
+        table = depth_table(field.depths_um).to(weights) @ weights
+        return LowRankPsfs(kernels, transfer, shape, table.to(psf), vergence)
     weights = weights.to(psf).reshape(*psf.shape[:3], rank)
     if lit:
         weights = weights * field.illumination[..., None]
@@ -237,10 +296,15 @@ def low_rank_psfs(
         values = values * factor[..., None]
     deep = spline_coefficients(values.shape[2]).to(values)
     table = torch.einsum("cz,yxzr->yxcr", deep, values).contiguous()
-    vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
-    shape = fast_shape(frame)
-    transfer = transfer_functions(kernels, shape)
     return LowRankPsfs(kernels, transfer, shape, table, vergence)
+
+
+def depth_table(depths_um: Tensor) -> Tensor:
+    """(:data:`CODES`, depths) linear interpolation at equal steps of 1/z."""
+    vergence = -1 / depths_um.double().cpu().numpy()
+    at = np.linspace(vergence[0], vergence[-1], CODES)
+    each = [np.interp(at, vergence, row) for row in np.eye(len(vergence))]
+    return torch.from_numpy(np.stack(each, 1))
 
 
 def fast_shape(frame: tuple[int, int]) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from metalens.core.errors import SceneError
 from metalens.core.threads import run_split_torch
+from metalens.image.compiled import is_compilable
 from metalens.image.left_out import (
     JudgedPsfs,
     choose_polarisation,
@@ -19,7 +20,6 @@ from metalens.image.left_out import (
     transform_error,
 )
 from metalens.image.points import Optics, Window, psfs
-from metalens.image.scene import is_compilable
 from metalens.image.splines import TAPS, spline_matrix
 from metalens.image.texture import scene_error, texture_error
 from metalens.image.waves import PillarWave

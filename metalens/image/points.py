@@ -14,6 +14,7 @@ from torch import Tensor
 
 from metalens.core.errors import PropagationError
 from metalens.image import compiled, polarised
+from metalens.image.compiled import is_compilable
 from metalens.image.rays import (
     Paths,
     Rays,
@@ -22,7 +23,6 @@ from metalens.image.rays import (
     source_paths,
     through_stop,
 )
-from metalens.image.scene import is_compilable
 from metalens.image.waves import Wave
 from metalens.optics import Layers, media
 from metalens.psf import VectorPupil, dominant_components

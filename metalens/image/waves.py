@@ -15,7 +15,7 @@ from torch import Tensor
 from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.image import compiled
-from metalens.image.scene import is_plain_value
+from metalens.image.compiled import is_plain_value
 from metalens.lens import Lens, answers
 from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import among
