@@ -24,13 +24,7 @@ import torch
 
 from metalens.cell import Film
 from metalens.design import Focus
-from metalens.image import (
-    Frames,
-    Grid,
-    SmoothWave,
-    imager,
-    uniform_imager,
-)
+from metalens.image import Frames, Grid, SmoothWave, imager, uniform_imager
 from metalens.optics import Layers
 from metalens.psf import Source
 

@@ -22,13 +22,7 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError, LensError, PropagationError, SceneError
 from metalens.design import neighbours as supercell
 from metalens.fabrication import Printed, State, draw_lenses
-from metalens.image import (
-    Imager,
-    Optics,
-    node_light,
-    normalise_psfs,
-    with_psfs,
-)
+from metalens.image import Imager, Optics, node_light, normalise_psfs, with_psfs
 from metalens.lens import Lens, NeighbourRows
 from metalens.library import PillarLibrary, engines
 from metalens.psf import SpectralNodes, among
@@ -369,11 +363,7 @@ class NetworkReading:
 
     @torch.no_grad()
     def _read(
-        self,
-        subjects: list[RenderedFrames],
-        optics: Imager,
-        *,
-        quiet: bool = False,
+        self, subjects: list[RenderedFrames], optics: Imager, *, quiet: bool = False
     ) -> NetworkReadings:
         """What the network reads of frames through these optics; noise of the
         experiment's seeds.

@@ -424,10 +424,7 @@ def sphere_calibrator(
 
 @torch.no_grad()
 def run_calibrator(
-    source: FinishedRun,
-    imager: Imager,
-    config: ExperimentConfig,
-    sensor: Sensor,
+    source: FinishedRun, imager: Imager, config: ExperimentConfig, sensor: Sensor
 ) -> PersonCalibrator:
     """Calibrator of gaze for a run: mixed-effects model where the network reads the
     optic axis, else sphere and regressor.

@@ -249,10 +249,7 @@ def train_reader(
 
 @torch.no_grad()
 def lens_frames(
-    optics: Imager,
-    scenes: SceneSource,
-    config: ReaderConfig,
-    count: int,
+    optics: Imager, scenes: SceneSource, config: ReaderConfig, count: int
 ) -> LensFrames:
     """``count`` frames of a stream through a lens onto the sensor, with noise of the
     batch's number.

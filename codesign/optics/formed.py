@@ -290,9 +290,7 @@ def relative_image_difference(one: Imager, true: Imager) -> float:
     return float((one(frames) - want).norm() / (want - want.mean()).norm())
 
 
-def image_tolerance_problem(
-    settings: OpticsConfig, found: Imager
-) -> str:
+def image_tolerance_problem(settings: OpticsConfig, found: Imager) -> str:
     """Why the error of the true image is above ``optics.image_tolerance``; empty where
     it is not, or the image is
     uniform, whose distance from the true one is told instead.

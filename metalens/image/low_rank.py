@@ -265,8 +265,9 @@ def low_rank_psfs(
 ) -> LowRankPsfs:
     """PSFs of the samples of a frame, from those of a field's nodes.
 
-    Sum and centroid of every node's PSF are exact, before what kernels lack of evenly
-    lit planes is spread over the relative illumination (:func:`correct_planes`).
+    Of a field, sum and centroid of every node's PSF are exact, before what kernels lack
+    of evenly lit planes is spread over the relative illumination
+    (:func:`correct_planes`).
 
     Args:
         field: differentiable in its illumination, and in its PSFs where it is uniform.
@@ -278,14 +279,13 @@ def low_rank_psfs(
     psf = field.psf if field.uniform else field.psf.detach()
     rank = len(basis.mixture) if rank is None else min(rank, len(basis.mixture))
     kernels, shape = basis.kernels(psf, rank), fast_shape(frame)
-    weights = match_moments(
-        basis.weights[:, :rank], kernels.detach(), psf.detach().flatten(0, 2)
-    )
+    weights = basis.weights[:, :rank]
     vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
     transfer = transfer_functions(kernels, shape)
     if field.uniform:
         table = depth_table(field.depths_um).to(weights) @ weights
         return LowRankPsfs(kernels, transfer, shape, table.to(psf), vergence)
+    weights = match_moments(weights, kernels, psf.flatten(0, 2))
     weights = weights.to(psf).reshape(*psf.shape[:3], rank)
     if lit:
         weights = weights * field.illumination[..., None]

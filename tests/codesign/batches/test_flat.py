@@ -2,6 +2,8 @@
 kernels; pools draw from the seed.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,8 @@ from codesign.batches.scenes import EyeScenes, SceneConfig, draw_depth_scales
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import SceneError, TrainingError
-from metalens.image import scene
+from metalens.image import Frames, image_direct
+from tests.elsewhere import AWAY, elsewhere
 
 SCENES = EyeScenes(
     SceneConfig(pixels=64, margin=8, slip_mm=(2.0, 1.5, 3.0)), 18.0, 2000.0, 3
@@ -30,42 +33,37 @@ OPTICS = OpticsConfig(
 
 def _imager(size=80, margin=8):
     made = optics.lens_psf_stack(OPTICS, torch.zeros(0, dtype=torch.float64))
-    return optics.prepare_transfers(OPTICS, made, size, margin=margin)
+    return optics.stack_imager(OPTICS, made, size, margin=margin)
 
 
-def test_one_surface_is_imaged_as_the_two_sheet_formula_does():
-    """A single opaque sheet needs no division: only 8 bits of light and the rounded
-    coverage of 1 are left.
-    """
+def test_one_surface_is_imaged_by_the_psf_of_each_depth():
+    """Beside a direct sum, every source with a PSF of its own, linear in 1/z."""
     generator = torch.Generator().manual_seed(0)
-    light = (torch.rand(2, 80, 80, generator=generator) * 255).round() / 255
-    depth = (15_000 + 15_000 * torch.rand(2, 80, 80, generator=generator)).round()
-    zero = torch.zeros_like(light)
-    sheets = scene.Frames(
-        torch.stack([zero, light], 1),
-        torch.stack([zero, zero + 1], 1),
-        torch.stack([zero + 20_000, depth], 1),
+    light = (torch.rand(1, 80, 80, generator=generator) * 255).round() / 255
+    depth = (15_000 + 15_000 * torch.rand(1, 80, 80, generator=generator)).round()
+    sheets = Frames(
+        *(torch.stack([0 * a, a], 1) for a in (light, 0 * light + 1, depth))
     )
-    one = flatten_layers(sheets, torch.ones(2))
-    imager = _imager()
-    got = sensor_irradiance(one, imager, margin=8)
-    blurred = torch.fft.irfft2(
-        (
-            torch.fft.rfft2(scene.weight_maps(imager.psf, depth) * light)
-            * imager.transfer[:, None]
-        ).sum(0),
-        s=(80, 80),
-    )
-    assert (
-        float((got - blurred[:, 8:-8, 8:-8]).abs().max()) < 2e-4
-    )  # one code of 4096, and float32
+    one = flatten_layers(sheets, torch.ones(1))
+    made = optics.lens_psf_stack(OPTICS, torch.zeros(0, dtype=torch.float64))
+    fine = replace(OPTICS, tolerance=1e-5)
+    imager = optics.stack_imager(fine, made, 80, margin=8)
+    nodes = 1 / OPTICS.depths_um
+    place = (nodes[0] - 1 / depth[0].double()) / (nodes[0] - nodes[1])
+    first = place.floor().long()
+    share = (place - first)[..., None, None]
+    psfs = made.intensity / made.intensity.sum((1, 2), keepdim=True)
+    own = (1 - share) * psfs[first] + share * psfs[first + 1]
+    want = image_direct(light[0].double(), own)
+    got = sensor_irradiance(one, imager)[0]
+    assert float((got - want).abs().max()) < 2e-4  # one code of 4096, and float32
 
 
 def test_eyes_as_one_surface_are_near_their_two_sheets():
     made = SCENES.rendered(0, 8)
-    exact = sensor_irradiance(made.frames, _imager(), margin=8)
+    exact = sensor_irradiance(made.frames, _imager())
     quick = sensor_irradiance(
-        flatten_layers(made.frames, SCENES.states(0, 8).scale), _imager(), margin=8
+        flatten_layers(made.frames, SCENES.states(0, 8).scale), _imager()
     )
     error = (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
     assert (
@@ -80,16 +78,14 @@ def test_spare_rows_continue_the_border():
         np.ones(1),
     )
     imager = _imager(67, margin=0)
-    assert imager.shape[0] > 67
-    inside = sensor_irradiance(constant, imager, margin=0)
+    assert imager.light.shape[0] > 67
+    inside = sensor_irradiance(constant, imager)
     torch.testing.assert_close(
         inside, torch.full_like(inside, 100 / 255), rtol=2e-3, atol=0.0
     )  # tolerance of the basis
 
 
 def test_gradient_in_the_phase_agrees_with_a_finite_difference():
-    from dataclasses import replace
-
     settings = replace(OPTICS, polynomials=6, tolerance=1e-5)
     frames = flatten_layers(SCENES.rendered(0, 2).frames, SCENES.states(0, 2).scale)
     weight = torch.randn(2, 64, 64, generator=torch.Generator().manual_seed(2))
@@ -97,9 +93,7 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
     def value(coefficients):
         made = optics.lens_psf_stack(settings, coefficients)
         return (
-            sensor_irradiance(
-                frames, optics.prepare_transfers(settings, made, 80, margin=8), margin=8
-            )
+            sensor_irradiance(frames, optics.stack_imager(settings, made, 80, margin=8))
             * weight
         ).sum()
 
@@ -155,18 +149,10 @@ def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
     )
 
 
-def test_pools_too_small_and_fields_of_psfs_are_refused():
+def test_pools_too_small_and_uneven_frames_are_refused():
     with pytest.raises(TrainingError, match="smaller than a batch"):
         PoolScenes(pool.render_pool(SCENES, 2), 8, 0.2, seed=1).batch(0, 4)
-    made = optics.lens_psf_stack(OPTICS, torch.zeros(0, dtype=torch.float64)).intensity
-    field = scene.uniform_imager(
-        scene.basis(made[None, None].expand(2, 2, -1, -1, -1), OPTICS.depths_um),
-        (80, 80),
-        margin=8,
-    )
     frames = flatten_layers(SCENES.rendered(0, 1).frames, torch.ones(1))
-    with pytest.raises(SceneError, match="one PSF for the whole image"):
-        sensor_irradiance(frames, field, margin=8)
     with pytest.raises(SceneError, match=r"need \(n, y, x\) twice"):
         SingleSurfaceFrames(frames.light, frames.depth_um[:, :4], frames.scale)
     assert flat.frame_samples(frames) == 80
@@ -180,16 +166,12 @@ def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
     light = random.integers(0, 256, (2, 80, 80)).astype(np.uint8)
     depth = random.integers(9_000, 60_000, (2, 80, 80)).astype(np.uint16)
     frames, imager = SingleSurfaceFrames(light, depth, np.array([1.0, 0.83])), _imager()
-    want, got = (
-        sensor_irradiance(frames, imager, margin=8),
-        flat._elsewhere(frames, imager, margin=8),
-    )
+    want = sensor_irradiance(frames, imager)
+    with elsewhere():
+        got = sensor_irradiance(frames, imager.to(AWAY)).cpu()
     contrast = (want - want.mean((1, 2), keepdim=True)).norm()
     assert (
         float((got - want).norm() / contrast) < 1e-3
     )  # single precision, and a pixel between two codes of 4096
     near = SingleSurfaceFrames(light, np.full_like(depth, 16_000), frames.scale)
-    assert (
-        float((sensor_irradiance(near, imager, margin=8) - want).norm() / contrast)
-        > 0.05
-    )
+    assert float((sensor_irradiance(near, imager) - want).norm() / contrast) > 0.05

@@ -87,10 +87,10 @@ def test_the_loss_has_the_gradient_that_differences_say():
 
     def loss(coefficients):
         made = lens.lens_psf_stack(OPTICS, coefficients)
-        imager = lens.prepare_transfers(OPTICS, made, 56, margin=4)
+        imager = lens.stack_imager(OPTICS, made, 56, margin=4)
         shares = encircled_energy(made.intensity, 9.0, radius_um=18.0)
         return fisher_separability(
-            frames, lambda f: sensor_irradiance(f, imager, margin=4), shares, CONFIG,
+            frames, lambda f: sensor_irradiance(f, imager), shares, CONFIG,
             sensor=SENSOR, sample_um=9.0,
         ).loss.value  # fmt: skip
 

@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.peers import layered
 from metalens.core.errors import SceneError
-from metalens.image import scene
+from metalens.image import Grid, scene, uniform_imager
 from metalens.image.scene import Frames, Layers
 
 N, DEPTHS = 96, 1 / torch.linspace(1 / 28e3, 1 / 15e3, 21, dtype=torch.float64).flip(0)
@@ -22,6 +22,13 @@ def _stack(widths, size=31):
 
 WIDTHS = 0.6 + (1e4 / DEPTHS - 0.5).abs() * 20
 STACK = _stack(WIDTHS)
+
+
+def _imager(stack=STACK, depths=DEPTHS, **about):
+    """Of whole frames, borders continued."""
+    ends = float(depths.min()), float(depths.max())
+    grid = Grid((N, N), 9.0, ends, window=stack.shape[-1])
+    return uniform_imager(stack, depths, grid, **about)
 
 
 def _eye(radiance=None):
@@ -42,8 +49,7 @@ def _eye(radiance=None):
 
 def test_constant_radiance_stays_constant_at_every_edge():
     flat = _eye(radiance=0.37)
-    psf = scene.basis(STACK, DEPTHS)
-    fast = scene.image(flat, scene.uniform_imager(psf, (N, N)))
+    fast = _imager()(flat)
     assert (fast - 0.37).abs().max() < 1e-12
     layers = scene.cut_layers(flat, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
@@ -58,35 +64,16 @@ def _single(frames):
 
 def test_constant_radiance_stays_constant_in_single_precision():
     """The mean is not transformed: nothing is left to round but the mean itself."""
-    psf = scene.basis(STACK.float(), DEPTHS)
-    assert (
-        float(
-            (
-                scene.image(
-                    _single(_eye(radiance=0.37)), scene.uniform_imager(psf, (N, N))
-                )
-                / 0.37
-                - 1
-            )
-            .abs()
-            .max()
-        )
-        < 1e-6
-    )
+    image = _imager(STACK.float())(_single(_eye(radiance=0.37)))
+    assert float((image / 0.37 - 1).abs().max()) < 1e-6
 
 
 def test_compiled_weights_give_the_image_of_the_differentiable_path():
     """In single precision without gradients the weights are compiled; in double
     precision they are torch's.
     """
-    frames, psf = _eye(), scene.basis(STACK, DEPTHS)
-    imager = scene.uniform_imager(psf, (N, N))  # rows and columns to spare on all sides
-    assert imager.shape[0] > N
-    exact = scene.image(frames, imager)
-    quick = scene.image(
-        _single(frames),
-        scene.uniform_imager(scene.basis(STACK.float(), DEPTHS), (N, N)),
-    )
+    frames = _eye()
+    exact, quick = _imager()(frames), _imager(STACK.float())(_single(frames))
     assert (
         float((quick - exact).norm() / exact.norm()) < 2e-5
     )  # depths that round to the next of 4096 codes
@@ -136,9 +123,7 @@ def test_one_depth_is_an_ordinary_convolution():
     cover = torch.cat([none, torch.ones_like(light)], 1)
     flat = Frames(torch.cat([none, light], 1), cover, torch.full_like(cover, 20e3))
     kernel = _stack(torch.tensor([2.0]))
-    image = scene.image(
-        flat, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N))
-    )
+    image = _imager(kernel, torch.tensor([20e3]))(flat)
     want = torch.nn.functional.conv2d(light, kernel[None])[:, 0]
     assert (
         image[:, 15:-15, 15:-15] - want
@@ -149,9 +134,7 @@ def test_an_off_centre_psf_moves_the_image_the_same_way():
     kernel = torch.zeros(1, 31, 31, dtype=torch.float64)
     kernel[0, 15 + 2, 15 + 5] = 1
     frames = _eye()
-    image = scene.image(
-        frames, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N))
-    )
+    image = _imager(kernel, torch.tensor([20e3]))(frames)
     moved = frames.radiance.sum(1)[:, 10:88, 10:85]
     assert (
         image[:, 12:90, 15:90] - moved
@@ -165,14 +148,13 @@ def _psfs_of(layers):
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-5])
 def test_few_kernels_meet_the_tolerance(tolerance):
     frames = _eye()
-    psf = scene.basis(STACK, DEPTHS, tolerance=tolerance)
-    fast = scene.image(frames, scene.uniform_imager(psf, (N, N)))
+    made = _imager(tolerance=tolerance)
+    fast = made(frames)
     layers = scene.cut_layers(frames, DEPTHS)
     slow = layered.image_layers(layers, _psfs_of(layers))
-    assert psf.error <= tolerance
+    assert made.error <= tolerance
     error = float((fast - slow).norm() / slow.norm())
     assert error < tolerance + 4e-5  # the look-up table's 4096 depths
-    assert float((fast - slow).abs().max()) < 2 * (psf.bound + 1e-4)
 
 
 def test_only_occupied_layers_are_cut():
@@ -183,67 +165,24 @@ def test_only_occupied_layers_are_cut():
     )
 
 
-def test_fewer_depths_need_fewer_kernels():
-    whole, part = (
-        scene.basis(STACK, DEPTHS),
-        scene.basis(STACK, DEPTHS, occupied_um=(18e3, 20e3)),
-    )
-    assert part.kernels.shape[0] < whole.kernels.shape[0]
-    assert part.depths_um[0] <= 18e3
-    assert part.depths_um[-1] >= 20e3
-
-
 def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
     """The image is linear in the radiance: its derivative along a change is the image
     of the change.
     """
     frames = _single(_eye())
-    imager = scene.uniform_imager(scene.basis(STACK.float(), DEPTHS), (N, N))
+    imager = _imager(STACK.float())
     change = (
         torch.rand(frames.radiance.shape, generator=torch.Generator().manual_seed(0))
         * frames.coverage
     )
 
     def seen(light):
-        return scene.image(Frames(light, frames.coverage, frames.depth_um), imager)
+        return imager(Frames(light, frames.coverage, frames.depth_um))
 
     slope = torch.func.jvp(seen, (frames.radiance,), (change,))[1]
     assert (
         float((slope - seen(change)).abs().max()) < 2e-5
     )  # the two paths' depth codes
-
-
-def test_trimmed_bases_keep_their_word_on_frames_they_have_not_seen():
-    whole = scene.basis(STACK, DEPTHS, tolerance=1e-4)
-    few = layered.trimmed(whole, _eye(), tolerance=1e-2)
-    assert len(few.kernels) < len(whole.kernels)
-    assert few.error <= 1e-2
-    frames = _eye()
-    other = Frames(
-        frames.radiance.flip(3), frames.coverage.flip(3), frames.depth_um.flip(3) * 0.95
-    )
-    exact, quick = (
-        scene.image(other, scene.uniform_imager(psf, (N, N))) for psf in (whole, few)
-    )
-    assert (
-        float((quick - exact).norm() / exact.norm()) < 2 * few.error
-    )  # other depths of the same population
-    assert few.bound > whole.bound
-    assert layered.trimmed(whole, frames, tolerance=0.0) is whole
-
-
-def test_field_dependent_psfs_change_across_the_image():
-    """PSFs that differ between left and right field points: each side sees its own, the
-    middle the mean.
-    """
-    left, right = _stack(torch.full((2,), 0.5)), _stack(torch.full((2,), 3.0))
-    psf = scene.basis(torch.stack([left, right])[None], DEPTHS[:2])
-    maps = scene.weight_maps(
-        psf, torch.full((1, N, N), float(DEPTHS[0]), dtype=torch.float64)
-    )
-    for column, want in ((0, left[0]), (N - 1, right[0])):
-        built = (maps[:, 0, 5, column, None, None] * psf.kernels).sum(0)
-        assert (built - want).norm() < 1e-3 * want.norm()
 
 
 def test_gradient_reaches_the_psfs():
@@ -260,15 +199,7 @@ def test_gradient_reaches_the_psfs():
 
     # the same change at every depth: what the kept weights can follow
     def energy(stack):
-        return (
-            scene.image(
-                frames,
-                scene.uniform_imager(
-                    scene.basis(stack, DEPTHS, tolerance=1e-12), (N, N)
-                ),
-            )
-            ** 2
-        ).sum()
+        return (_imager(stack, tolerance=1e-12)(frames) ** 2).sum()
 
     energy(psfs).backward()
     step = 1e-4
@@ -282,6 +213,8 @@ def test_gradient_reaches_the_psfs():
 
 def test_mismatched_depths_and_shapes_are_refused():
     with pytest.raises(SceneError, match="ascending"):
-        scene.basis(STACK, DEPTHS.flip(0))
+        _imager(depths=DEPTHS.flip(0))
+    with pytest.raises(SceneError, match="need one a depth"):
+        _imager(STACK[:4])
     with pytest.raises(SceneError, match="shapes"):
         Frames(torch.zeros(2, 3, 4), torch.zeros(2, 3, 4), torch.zeros(2, 3, 4))
