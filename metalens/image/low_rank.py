@@ -67,8 +67,8 @@ class KernelBasis:
 
     def to(self, device: torch.device | str) -> "KernelBasis":
         """The same on a device."""
-        parts = (self.mixture, self.sampled, self.weights)
-        return KernelBasis(*(part.to(device) for part in parts), self.error)
+        parts = ("mixture", "sampled", "weights")
+        return replace(self, **{name: getattr(self, name).to(device) for name in parts})
 
 
 def principal_kernels(
