@@ -1,6 +1,7 @@
 """Comparison of a file that is read back: cells, shapes, every instance at its place."""
 
 import dataclasses
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from layout.formats.library import (
     library_of,
 )
 from layout.mask.plan import MaskPlan
-from layout.process.process import LayerNumber
+from layout.shapes import polygon
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
 
@@ -77,8 +78,7 @@ def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
         ]
     for name, cell in library.cells.items():
         read = content.cells[name]
-        if _shapes(cell) != _shapes(read):
-            found.append(f"cell {name}: shapes differ")
+        found += shape_differences(cell, read)
         merged = read.sums is not None
         planned, there = _sums(cell, merged=merged), _sums(read, merged=merged)
         for who in sorted(planned.keys() | there.keys(), key=str):
@@ -101,25 +101,38 @@ def _difference(planned: Sum, found: Sum) -> str:
     return f"{n} copies, not all at their places"
 
 
-def _shapes(cell: MaskCell) -> list[tuple[LayerNumber, list[tuple[int, ...]]]]:
-    """Polygons by layer in a form that does not depend on their order."""
-    drawn = cell.drawn().items()
-    every = {layer: sorted(map(canonical_corners, some)) for layer, some in drawn}
-    return sorted((layer, some) for layer, some in every.items() if some)
-
-
-def canonical_corners(points: Array) -> tuple[int, ...]:
-    """Corners from the smallest on, counter-clockwise.
+def shape_differences(planned: MaskCell, read: MaskCell) -> list[str]:
+    """Polygons of a cell that are missing, or that were not planned, by layer in words.
 
     Args:
-        points: (n, 2) corners of a polygon.
+        planned: that was written.
+        read: of the file.
     """
+    wanted, there = (
+        Counter(
+            (layer, _canonical_corners(points))
+            for layer, shapes in cell.drawn().items()
+            for points in shapes
+        )
+        for cell in (planned, read)
+    )
+    found = []
+    for rest, text in ((wanted - there, "missing"), (there - wanted, "not planned")):
+        layers = Counter(layer for layer, _ in rest.elements())
+        found += [
+            f"cell {planned.name}, layer {layer}/{datatype}: {count} polygons {text}"
+            for (layer, datatype), count in sorted(layers.items())
+        ]
+    return found
+
+
+def _canonical_corners(points: Array) -> bytes:
+    """Corners from the smallest on, counter-clockwise."""
     p = np.asarray(points, np.int64)
-    after = np.roll(p, -1, axis=0)
-    if (p[:, 0] * after[:, 1] - after[:, 0] * p[:, 1]).sum() < 0:
+    if polygon.twice_area(p) < 0:
         p = p[::-1]
     first = int(np.lexsort((p[:, 1], p[:, 0]))[0])
-    return tuple(np.roll(p, -first, axis=0).ravel().tolist())
+    return np.roll(p, -first, axis=0).tobytes()
 
 
 def _sums(cell: MaskCell, *, merged: bool) -> dict[Who, Sum]:

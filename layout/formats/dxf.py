@@ -4,7 +4,6 @@ for each mask layer; read back.
 
 import io
 import threading
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from layout.formats.compare import canonical_corners
+from layout.formats.compare import shape_differences
+from layout.formats.library import MaskCell
 from layout.mask.plan import MaskPlan, PillarArray
+from layout.process.process import LayerNumber
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError, ProcessError
+from metalens.core.units import nm
 
 MOST_PILLARS = 200_000
 _UM = 13  # of $INSUNITS
@@ -54,25 +56,27 @@ def write_dxf(plan: MaskPlan, path: str | Path, *, window: DxfWindow) -> int:
             installed.
         OSError: the target cannot be written.
     """
-    sites = _sites(plan, window)
+    sites = [s for lattice in plan.lattices for s in sites_in(plan, lattice, window)]
     if len(sites) > MOST_PILLARS:
         raise ProcessError(
             f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
             f"at most {MOST_PILLARS}, or OASIS for the whole mask"
         )
+    names = _names(plan)
     with _fixed_stamps():
         drawing = _ezdxf().new("R2000", units=_UM)
-        for n, (layer, name) in enumerate(_names(plan).items()):
+        for n, (layer, name) in enumerate(names.items()):
             made = drawing.layers.add(name, color=1 + n % _COLOURS)
             made.description = f"{layer[0]}/{layer[1]}"
         space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
-        for name, points in _drawn(plan, sites):
-            space.add_lwpolyline(
-                (points * scale).tolist(),
-                format="xy",
-                close=True,
-                dxfattribs={"layer": name},
-            )
+        for layer, shapes in _drawn(plan, window).polygons.items():
+            for points in shapes:
+                space.add_lwpolyline(
+                    (points * scale).tolist(),
+                    format="xy",
+                    close=True,
+                    dxfattribs={"layer": names[layer]},
+                )
         text = io.StringIO()
         drawing.write(text)
     store.write_text(path, text.getvalue())
@@ -86,7 +90,9 @@ def dxf_differences(
     the other way, in words.
 
     Args:
+        plan: of a die.
         path: of the file.
+        window: that was written.
 
     Raises:
         MaskFileError: the file cannot be read as DXF.
@@ -96,27 +102,17 @@ def dxf_differences(
         drawing = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError) as error:
         raise MaskFileError(f"{path}: cannot be read as DXF ({error})") from None
-    found = (
-        [] if drawing.units == _UM else [f"unit {drawing.units}, planned {_UM} (um)"]
+    layers = {name: layer for layer, name in _names(plan).items()}
+    read: dict[LayerNumber, list[Array]] = {}
+    for line in drawing.modelspace().query("LWPOLYLINE"):
+        points = np.array(line.get_points("xy")) / (plan.unit_nm * nm)
+        layer = layers.get(line.dxf.layer, (-1, -1))
+        read.setdefault(layer, []).append(np.rint(points).astype(np.int64))
+    unit = (
+        () if drawing.units == _UM else (f"unit {drawing.units}, planned {_UM} (um)",)
     )
-    scale = plan.unit_nm * 1e-3
-    read = Counter(
-        (
-            line.dxf.layer,
-            canonical_corners(np.rint(np.array(line.get_points("xy")) / scale)),
-        )
-        for line in drawing.modelspace().query("LWPOLYLINE")
-    )
-    planned = Counter(
-        (name, canonical_corners(points))
-        for name, points in _drawn(plan, _sites(plan, window))
-    )
-    for text, unlike in (("missing", planned - read), ("not planned", read - planned)):
-        for layer, number in sorted(
-            Counter(name for name, _ in unlike.elements()).items()
-        ):
-            found.append(f"layer {layer}: {number} polygons {text}")
-    return tuple(found)
+    shapes = shape_differences(_drawn(plan, window), MaskCell("window", read))
+    return (*unit, *shapes)
 
 
 def _ezdxf() -> Any:
@@ -142,12 +138,6 @@ def _fixed_stamps() -> Iterator[None]:
             yield
         finally:
             options.write_fixed_meta_data_for_testing = before
-
-
-def _sites(plan: MaskPlan, window: DxfWindow) -> list[tuple[int, int, int]]:
-    return [
-        site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
-    ]
 
 
 def sites_in(
@@ -184,27 +174,26 @@ def _ceil(distance: float, pitch: int, count: int) -> int:
     return int(np.clip(np.ceil(distance / pitch), 0, count))
 
 
-def _drawn(
-    plan: MaskPlan, sites: list[tuple[int, int, int]]
-) -> Iterator[tuple[str, Array]]:
-    """(DXF layer, polygon) of everything that is written."""
-    names = _names(plan)
-    for k, x, y in sites:
-        made = plan.classes[k - 1]
-        for shape in made.polygons:
-            yield names[made.layer], shape + np.array([x, y])
+def _drawn(plan: MaskPlan, window: DxfWindow) -> MaskCell:
+    """Everything that is written: the pillars of the window and all figures."""
+    shapes: dict[LayerNumber, list[Array]] = {}
+    for lattice in plan.lattices:
+        for k, x, y in sites_in(plan, lattice, window):
+            made = plan.classes[k - 1]
+            moved = [points + np.array([x, y]) for points in made.polygons]
+            shapes.setdefault(made.layer, []).extend(moved)
     for figure in plan.figures:
-        for layer, shapes in figure.polygons.items():
-            for shape in shapes:
-                yield names[layer], shape
+        for layer, polygons in figure.polygons.items():
+            shapes.setdefault(layer, []).extend(polygons)
+    return MaskCell("window", shapes)
 
 
-def _names(plan: MaskPlan) -> dict[tuple[int, int], str]:
+def _names(plan: MaskPlan) -> dict[LayerNumber, str]:
     """{(layer, datatype): DXF layer}, each its own."""
     used = {made.layer for made in plan.classes} | {
         layer for figure in plan.figures for layer in figure.polygons
     }
-    found: dict[tuple[int, int], str] = {}
+    found: dict[LayerNumber, str] = {}
     for layer in sorted(used):
         name = (
             plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}")

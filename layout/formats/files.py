@@ -1,17 +1,13 @@
-"""Bytes, names and limits of mask files, and placements while they are read."""
+"""Bytes, names and limits of mask files."""
 
 import mmap
 import os
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from layout.formats.digest import RunningDigest
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
-
-LARGE_PART = 1 << 23  # placements of which each column has 32 MB
 
 
 def map_bytes(path: str | Path) -> Array:
@@ -47,19 +43,6 @@ def decode_name(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def has_area(points: Array) -> bool:
-    """Whether the corners (n, 2) of a polygon do not all lie on one line.
-
-    Args:
-        points: (n, 2) corners.
-    """
-    steps = points[1:] - points[0]
-    if not len(steps):
-        return False
-    longest = steps[np.abs(steps).sum(1).argmax()]
-    return bool((steps[:, 0] * longest[1] != steps[:, 1] * longest[0]).any())
-
-
 def placement_limit(path: Path) -> int:
     """Placements and shapes that a mask file is expanded to by default.
 
@@ -86,59 +69,3 @@ def release_bytes(data: Array, end: int) -> None:
         and end >= mmap.PAGESIZE
     ):
         base.madvise(mmap.MADV_DONTNEED, 0, end // mmap.PAGESIZE * mmap.PAGESIZE)
-
-
-@dataclass(eq=False, slots=True)
-class PlacementSums:
-    """Placements of a cell while it is read: kept up to a number (None: all), beyond it
-    only their sums.
-
-    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged:
-    how many of them are large;
-    small: placements in the others.
-    """
-
-    keep: int | None = None
-    parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
-    count: int = 0
-    digest: RunningDigest | None = None
-    merged: int = 0
-    small: int = 0
-
-    def add(self, child: Array, x: Array, y: Array, turn: Array) -> None:
-        """Take in some more."""
-        self.count += len(child)
-        if self.digest is None:
-            self.parts.append((child, x, y, turn))
-            if self.keep is None or self.count <= self.keep:
-                self._merge(len(child))
-                return
-            self.digest = RunningDigest()
-            for part in self.parts:
-                self.digest.take(*part)
-            self.parts = []
-            return
-        self.digest.take(child, x, y, turn)
-
-    def _merge(self, more: int) -> None:
-        """Make one of the last parts where they are many: large arrays go back to the
-        system when they are let go.
-        """
-        self.small += more
-        if self.small >= LARGE_PART:
-            child, x, y, turn = (
-                np.concatenate(part)
-                for part in zip(*self.parts[self.merged :], strict=True)
-            )
-            self.parts[self.merged :] = [(child, x, y, turn)]
-            self.merged, self.small = self.merged + 1, 0
-
-    def columns(self) -> tuple[Array, Array, Array, Array]:
-        """child, x, y, turn of all that is kept; the parts are let go, one column after
-        the other.
-        """
-        columns = [list(part) for part in zip(*self.parts, strict=True)]
-        self.parts, made = [], []
-        while columns:
-            made.append(np.concatenate(columns.pop(0)))
-        return made[0], made[1], made[2], made[3]

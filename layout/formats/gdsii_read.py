@@ -1,32 +1,15 @@
 """GDSII reader: every record is checked; what is wrong is named with its byte offset."""
 
-import dataclasses
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from layout.formats import gdsii_records as gds
 from layout.formats import paths
-from layout.formats.digest import PlacementDigest
-from layout.formats.files import (
-    CONTEXT_CELL,
-    PlacementSums,
-    decode_name,
-    has_area,
-    map_bytes,
-    release_bytes,
-)
-from layout.formats.library import (
-    NOTHING,
-    QUARTERS,
-    CellPlacements,
-    MaskCell,
-    MaskLibrary,
-    Orientation,
-)
+from layout.formats.files import CONTEXT_CELL, decode_name, map_bytes, release_bytes
+from layout.formats.library import MaskCell, MaskLibrary, Orientation
+from layout.formats.open_cell import OpenCell, PlacementSums, has_area
 from layout.formats.read_loops import FARTHEST, sref_run
 from metalens.core.arrays import Array
 from metalens.core.errors import MaskFileError
@@ -37,42 +20,6 @@ _PATHS = (gds.PATH, gds.MBMSPATH)
 _SHAPES = {gds.BOUNDARY, gds.BOX, gds.TEXT, gds.NODE, gds.SREF, gds.AREF, *_PATHS}
 LIMIT = 2**29
 _AT_ONCE = 1 << 20  # copies of an array
-
-
-@dataclass(eq=False, slots=True)
-class _Batch:
-    """Placements of the structure that is being read."""
-
-    held: PlacementSums
-    names: dict[str, int] = field(default_factory=dict)
-    turns: dict[Orientation, int] = field(
-        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
-    )
-
-    def add(self, child: Array, x: Array, y: Array, turn: Orientation) -> None:
-        number = self.turns.setdefault(turn, len(self.turns))
-        turned = np.full(len(child), number, np.uint8 if number < 256 else np.int32)
-        self.held.add(
-            child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned
-        )
-
-    def number(self, name: str) -> int:
-        return self.names.setdefault(name, len(self.names))
-
-    def sums(self) -> PlacementDigest | None:
-        return (
-            None
-            if self.held.digest is None
-            else self.held.digest.of(np.arange(len(self.names)))
-        )
-
-    def placed(self) -> CellPlacements:
-        if not self.held.count:
-            return NOTHING
-        names = tuple(self.names)
-        if self.held.digest is not None:
-            return dataclasses.replace(NOTHING, children=names)
-        return CellPlacements(names, *self.held.columns(), tuple(self.turns))
 
 
 def read_gdsii(
@@ -122,6 +69,8 @@ class _Reader:
         )
         self.begin = 0  # of the latest record
         self.placed = 0
+        self.number_of: dict[str, int] = {}  # structures by first reference
+        self.names: list[str] = []
 
     def fail(self, text: str, at: int | None = None) -> MaskFileError:
         return MaskFileError(
@@ -186,28 +135,31 @@ class _Reader:
             raise self.fail("a structure or reference without a name")
         return text
 
+    def number(self, name: str) -> int:
+        if name not in self.number_of:
+            self.number_of[name] = len(self.names)
+            self.names.append(name)
+        return self.number_of[name]
+
     def structure(self) -> MaskCell:
         name = self.name(self.next(gds.STRNAME)[1])
-        batch, skipped = _Batch(PlacementSums(self.keep)), Counter[str]()
-        polygons: dict[tuple[int, int], list[Array]] = {}
+        cell = OpenCell(name, PlacementSums(self.keep))
         while True:
-            self.references(batch)
+            self.references(cell)
             kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
             if kind == gds.ENDSTR:
-                texts = skipped.pop(gds.NAMES[gds.TEXT], 0)
-                return MaskCell(
-                    name, polygons, {}, batch.placed(), texts, batch.sums(), skipped
-                )
+                cell.texts = cell.skipped.pop(gds.NAMES[gds.TEXT], 0)
+                return cell.close(name, self.names)
             if kind in (gds.SREF, gds.AREF):
-                self.reference(batch, kind)
+                self.reference(cell, kind)
             elif kind in (gds.BOUNDARY, gds.BOX, *_PATHS):
                 layer, points = self.line() if kind in _PATHS else self.boundary(kind)
                 if has_area(points):
-                    polygons.setdefault(layer, []).append(points)
+                    cell.polygons.setdefault(layer, []).append(points)
                 else:
-                    skipped[f"{gds.NAMES[kind]} without area"] += 1
+                    cell.skipped[f"{gds.NAMES[kind]} without area"] += 1
             elif kind != gds.STRCLASS:  # TEXT, NODE
-                skipped[gds.NAMES[kind]] += 1
+                cell.skipped[gds.NAMES[kind]] += 1
                 while self.next()[0] != gds.ENDEL:
                     self.refuse_outside_element()
 
@@ -216,14 +168,14 @@ class _Reader:
         if kind in _SHAPES or kind in (gds.BGNSTR, gds.ENDSTR, gds.ENDLIB, gds.HEADER):
             raise self.fail(f"{gds.NAMES[kind]} within an element; ENDEL is missing")
 
-    def references(self, batch: _Batch) -> None:
+    def references(self, cell: OpenCell) -> None:
         """Plain references in a row, by the compiled loop."""
         while True:
             names, child, x, y, end = sref_run(self.data, self.at)
             if not len(child):
                 return
-            numbers = np.array([batch.number(self.name(n)) for n in names], np.int32)
-            batch.add(numbers[child], x, y, QUARTERS[0])
+            numbers = np.array([self.number(self.name(n)) for n in names], np.int32)
+            cell.place(numbers[child], x, y)
             self.at = end
             release_bytes(self.data, end)
             self.count(len(child))
@@ -285,17 +237,17 @@ class _Reader:
             raise self.fail(f"element with {len(numbers)} coordinates, need pairs")
         return numbers.reshape(-1, 2)
 
-    def reference(self, batch: _Batch, kind: int) -> None:
+    def reference(self, cell: OpenCell, kind: int) -> None:
         start = self.begin
         found = self.fields()
-        number = batch.number(self.name(found.get(gds.SNAME, b"")))
+        number = self.number(self.name(found.get(gds.SNAME, b"")))
         turn = self.turn(found, start)
         xy = self.numbers(found, gds.XY, 2 if kind == gds.SREF else 6)
         if kind == gds.SREF:
-            batch.add(np.full(1, number), xy[:1], xy[1:], turn)
+            cell.place(number, xy[:1], xy[1:], turn)
             return
         for x, y in self.array(found, xy, start):
-            batch.add(np.full(len(x), number, np.int32), x, y, turn)
+            cell.place(number, x, y, turn)
 
     def array(
         self, found: dict[int, bytes], xy: Array, start: int

@@ -2,9 +2,7 @@
 texts, with modal values.
 """
 
-import dataclasses
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -12,19 +10,12 @@ import numpy as np
 from layout.formats import oasis_records as oasis
 from layout.formats import oasis_trapezoids as trapezoids
 from layout.formats import paths
-from layout.formats.files import PlacementSums, has_area
-from layout.formats.library import (
-    NOTHING,
-    QUARTERS,
-    CellPlacements,
-    MaskCell,
-    Orientation,
-)
+from layout.formats.library import QUARTERS, Orientation
 from layout.formats.oasis_cursor import ByteCursor, RepetitionOffsets
+from layout.formats.open_cell import Child, OpenCell, has_area
 from layout.formats.read_loops import scan_placements
 from metalens.core.arrays import Array
 
-Child = int | str  # reference number, or name
 Value = TypeVar("Value")
 _BATCH = 1 << 18
 _DRAWN = 8  # placements that take as much memory as a polygon without its corners
@@ -69,75 +60,6 @@ class ModalState:
     path_end: int | None = None
     kind: int | None = None
     repetition: RepetitionOffsets | None = None
-
-
-@dataclass(eq=False, slots=True)
-class OpenCell:
-    """A cell while it is read. names: of children that are placed by name, numbered
-    from -2 down.
-    """
-
-    key: Child
-    polygons: dict[tuple[int, int], list[Array]] = field(default_factory=dict)
-    circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(
-        default_factory=dict
-    )
-    held: PlacementSums = field(default_factory=PlacementSums)
-    names: dict[str, int] = field(default_factory=dict)
-    turns: dict[Orientation, int] = field(
-        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
-    )
-    texts: int = 0
-    skipped: Counter[str] = field(default_factory=Counter)
-
-    def close(self, name: str, table: dict[int, str]) -> MaskCell:
-        """The finished cell; KeyError names a reference number without a name."""
-        digest = self.held.digest
-        sums = None if digest is None else digest.of(digest.children)
-        return MaskCell(
-            name,
-            self.polygons,
-            self.circles,
-            self._placed(table),
-            self.texts,
-            sums,
-            self.skipped,
-        )
-
-    def _placed(self, table: dict[int, str]) -> CellPlacements:
-        if not self.held.count:
-            return NOTHING
-        own = {number: name for name, number in self.names.items()}
-        if self.held.digest is not None:
-            every = self.held.digest.children.tolist()
-            return dataclasses.replace(
-                NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every)
-            )
-        child, x, y, turn = self.held.columns()
-        used, index = _numbered(child)
-        names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
-        return CellPlacements(names, index, x, y, turn, tuple(self.turns))
-
-
-def _numbered(child: Array) -> tuple[Array, Array]:
-    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it
-    is changed in place.
-    """
-    low, high = int(child.min()), int(child.max())
-    if high - low >= 1 << 22:
-        used, index = np.unique(child, return_inverse=True)
-        return used, index.astype(np.int32)
-    occurs = np.zeros(high - low + 1, bool)
-    pieces = [
-        child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
-    ]  # numpy widens what it indexes by
-    for some in pieces:
-        some -= low
-        occurs[some] = True
-    lookup = np.cumsum(occurs, dtype=np.int32) - 1
-    for some in pieces:
-        some[:] = lookup[some]
-    return np.flatnonzero(occurs) + low, child
 
 
 class CellReader:
@@ -198,7 +120,8 @@ class CellReader:
             moved, c.at = at > c.at, int(at)
             if count:
                 child, x, y, turn = (row.copy() for row in out[:, :count])
-                self._add(c, child, x, y, turn.astype(np.uint8))
+                self._count(c, count)
+                self.cell.held.add(child, x, y, turn.astype(np.uint8))
                 m.placement_x, m.placement_y, m.child = (
                     int(state[0]),
                     int(state[1]),
@@ -207,12 +130,6 @@ class CellReader:
             m.relative = bool(state[2])
             if not moved:
                 return
-
-    def _add(
-        self, c: ByteCursor, child: Array, x: Array, y: Array, turn: Array
-    ) -> None:
-        self._count(c, len(child))
-        self.cell.held.add(child, x, y, turn)
 
     def _count(self, c: ByteCursor, more: int) -> None:
         self.budget.used += more
@@ -258,7 +175,7 @@ class CellReader:
         child = m.child
         if child is None:
             raise c.fail("placement without a cell, and none before it in this cell")
-        turn = info >> 1 & 3 | (info & 1) << 2
+        turn = QUARTERS[info >> 1 & 3 | (info & 1) << 2]
         if kind == oasis.PLACEMENT_ANY:
             size = c.real() if info & 4 else 1.0
             angle = c.real() if info & 2 else 0.0
@@ -266,26 +183,14 @@ class CellReader:
                 raise c.fail(
                     f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0"
                 )
-            turn = self.cell.turns.setdefault(
-                Orientation(angle % 360, bool(info & 1), size), len(self.cell.turns)
-            )
+            turn = Orientation(angle % 360, bool(info & 1), size)
         m.placement_x, m.placement_y = self._position(
             c, info, (0x20, 0x10), (m.placement_x, m.placement_y)
         )
         x, y = self._repeated(c, info, 8, m.placement_x, m.placement_y)
-        number = (
-            self.cell.names.setdefault(child, -2 - len(self.cell.names))
-            if isinstance(child, str)
-            else child
-        )
-        small = (
-            np.full(len(x), number, np.int32),
-            x.astype(np.int32),
-            y.astype(np.int32),
-        )
-        self._add(
-            c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32)
-        )
+        number = self.cell.number(child) if isinstance(child, str) else child
+        self._count(c, len(x))
+        self.cell.place(number, x, y, turn)
 
     def _layer(self, c: ByteCursor, info: int) -> None:
         if info & 1:

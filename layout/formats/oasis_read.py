@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from layout.formats import oasis_records as oasis
-from layout.formats.files import CONTEXT_CELL, PlacementSums, map_bytes
+from layout.formats.files import CONTEXT_CELL, map_bytes
 from layout.formats.library import MaskCell, MaskLibrary
-from layout.formats.oasis_cells import CellReader, Child, OpenCell, ReadBudget
+from layout.formats.oasis_cells import CellReader, ReadBudget
 from layout.formats.oasis_cursor import ByteCursor
+from layout.formats.open_cell import Child, OpenCell, PlacementSums
 from metalens.core.arrays import Array
 
 LIMIT = 2**29
@@ -149,7 +150,7 @@ class _Reader:
             raise c.fail(f"record of kind {kind}, which no pillar mask holds here")
 
     def _begin_cell(self, key: Child) -> None:
-        self.cells.append(OpenCell(key, held=PlacementSums(self.keep)))
+        self.cells.append(OpenCell(key, PlacementSums(self.keep)))
         self.cell = CellReader(self.cells[-1], self.budget)
 
     def _block(self, c: ByteCursor) -> None:

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from layout.formats import oasis_records as oasis
-from layout.formats import oasis_tiles as tiles
 from layout.formats.library import (
     QUARTERS,
     CellPlacements,
@@ -27,12 +26,17 @@ from layout.formats.library import (
     library_of,
 )
 from layout.mask.plan import MaskPlan, PillarArray
+from layout.process.jit import compile_loop
 from layout.process.process import LayerNumber
 from metalens.core import store
 from metalens.core.arrays import Array
 
 _LEVEL, _FAST_LEVEL = 6, 2  # of deflate
 _LARGE = 10**8  # sites from which a lattice takes the fast level: half the time
+# Raster order inside narrow tiles: the rows above stay within the 32 KiB that deflate
+# looks back on. That halves the file against whole rows.
+_TILE_COLUMNS, _TILE_ROWS = 96, 512
+LARGEST_RECORD = 18  # bytes of one placement
 _AT_ONCE = 1 << 16  # placements of a compressed block
 _REPEATED = 8  # bit of a placement that says that a repetition follows
 _THREADS = 2
@@ -201,12 +205,17 @@ def _listed(
 ) -> Iterator[bytes]:
     columns = placed.child, placed.x, placed.y, placed.turn
     child, x, y, turn = (column[where] for column in columns)
-    out = np.empty(min(len(x), _AT_ONCE) * tiles.LARGEST_RECORD + 2, np.uint8)
     for first in range(0, len(x), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        px, py, way = (column[some].astype(np.int64) for column in (x, y, turn))
-        used = tiles.encode_list(own[child[some]], px, py, way, out)
-        yield oasis.compressed_block(out[:used].tobytes(), _LEVEL)
+        yield _block(own[child[some]], x[some], y[some], turn[some], _LEVEL)
+
+
+def _block(child: Array, x: Array, y: Array, turn: Array, level: int) -> bytes:
+    """Compressed block of placements of quarter turns."""
+    out = np.empty(len(x) * LARGEST_RECORD + 2, np.uint8)
+    columns = (column.astype(np.int64) for column in (child, x, y, turn))
+    used = encode_list(*columns, out)
+    return oasis.compressed_block(out[:used].data, level)
 
 
 def _pillars(lattice: PillarArray) -> Iterator[bytes]:
@@ -216,10 +225,10 @@ def _pillars(lattice: PillarArray) -> Iterator[bytes]:
         steps = lattice.pitch, lattice.down
         is_large = lattice.rows * lattice.columns >= _LARGE
         level = _FAST_LEVEL if is_large else _LEVEL
-        for first, block in lattice.blocks(tiles.TILE_ROWS):
+        for first, block in lattice.blocks(_TILE_ROWS):
             y = lattice.y0 - first * lattice.down
-            for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
-                tile = block[:, left : left + tiles.TILE_COLUMNS]
+            for left in range(0, lattice.columns, _TILE_COLUMNS):
+                tile = block[:, left : left + _TILE_COLUMNS]
                 x = lattice.x0 + left * lattice.pitch
                 yield partial(_tile, tile, steps, x, y, level)
 
@@ -227,9 +236,11 @@ def _pillars(lattice: PillarArray) -> Iterator[bytes]:
 
 
 def _tile(tile: Array, steps: tuple[int, int], x0: int, y0: int, level: int) -> bytes:
-    out = np.empty(tile.size * tiles.LARGEST_RECORD, np.uint8)
-    used = tiles.encode_tile(tile, *steps, x0, y0, out)
-    return oasis.compressed_block(out[:used].data, level) if used else b""
+    row, column = np.nonzero(tile)
+    if not len(row):
+        return b""
+    x, y = x0 + column * steps[0], y0 - row * steps[1]
+    return _block(tile[row, column].astype(np.int64) - 1, x, y, 0 * row, level)
 
 
 def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[bytes]:
@@ -242,3 +253,55 @@ def _in_order(jobs: Iterable[Callable[[], bytes]], ahead: int = 8) -> Iterator[b
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+
+
+@compile_loop
+def _put_unsigned(out: Array, at: int, value: int) -> int:
+    """Write a variable-length integer; the position after it."""
+    while value > 127:
+        out[at] = value & 127 | 128
+        value >>= 7
+        at += 1
+    out[at] = value
+    return at + 1
+
+
+@compile_loop
+def _put_signed(out: Array, at: int, value: int) -> int:
+    return _put_unsigned(out, at, (-value << 1) | 1 if value < 0 else value << 1)
+
+
+@compile_loop
+def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
+    """Placements in their order: the first at its place, each other relative to the one
+    before; bytes used.
+
+    Args:
+        child: (n,) reference numbers.
+        x: (n,) places.
+        y: (n,) places.
+        turn: (n,) quarter turns and mirror, 0 to 7.
+        out: room for ``LARGEST_RECORD`` bytes a placement and 2 more.
+    """
+    out[0] = 15  # XYABSOLUTE
+    at, last_x, last_y = 1, 0, 0
+    for n in range(x.shape[0]):
+        move_x, move_y = n == 0 or x[n] != last_x, n == 0 or y[n] != last_y
+        out[at] = 17  # PLACEMENT
+        out[at + 1] = (
+            0xC0
+            | (0x20 if move_x else 0)
+            | (0x10 if move_y else 0)
+            | (turn[n] & 3) << 1
+            | turn[n] >> 2
+        )
+        at = _put_unsigned(out, at + 2, child[n])
+        if move_x:
+            at = _put_signed(out, at, x[n] - last_x)
+        if move_y:
+            at = _put_signed(out, at, y[n] - last_y)
+        if n == 0:
+            out[at] = 16  # XYRELATIVE
+            at += 1
+        last_x, last_y = x[n], y[n]
+    return at

@@ -338,8 +338,8 @@ def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path
     found = dxf.dxf_differences(plan, path, window=window)
     assert found[0].startswith("unit 4, planned 13")
     assert found[1:] == (
-        "layer PILLAR: 1 polygons missing",
-        "layer PILLAR: 1 polygons not planned",
+        "cell window, layer 1/0: 1 polygons missing",
+        "cell window, layer 1/0: 1 polygons not planned",
     )
     path.write_text("no drawing")
     with pytest.raises(MaskFileError, match=r"m\.dxf: cannot be read"):

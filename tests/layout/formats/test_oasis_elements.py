@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from layout.formats import oasis_records as oasis
-from layout.formats import oasis_tiles as tiles
+from layout.formats import oasis_write
 from layout.formats.oasis_cursor import ByteCursor
 from layout.formats.oasis_write import g_delta
 from metalens.core.errors import MaskFileError
@@ -39,7 +39,7 @@ def test_unsigned_integers_take_seven_bits_a_byte_least_first(value, data):
     assert oasis.unsigned_integer(value) == bytes.fromhex(data)
     assert cursor(data).unsigned() == value
     out = np.zeros(12, np.uint8)
-    end = tiles.put_unsigned(out, 1, value)
+    end = oasis_write._put_unsigned(out, 1, value)
     assert out[1:end].tobytes() == bytes.fromhex(data)
 
 
@@ -221,7 +221,7 @@ def test_placements_are_listed_from_each_to_the_next():
         np.array([-100, -93, -93]),
         np.array([40, 40, 29]),
     )
-    used = tiles.encode_list(child, x, y, np.array([0, 6, 3]), out)
+    used = oasis_write.encode_list(child, x, y, np.array([0, 6, 3]), out)
     want = "0f 11 f0 05 c9 01 50 10"  # absolute, (-100, 40), then relative
     # 7 to the right; turned by two quarters after a mirror; the same y is left out
     want += "11 e5 ac 02 0e"

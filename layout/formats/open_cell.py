@@ -1,0 +1,182 @@
+"""A cell of a mask file while it is read."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from layout.formats.digest import RunningDigest
+from layout.formats.library import (
+    NOTHING,
+    QUARTERS,
+    CellPlacements,
+    MaskCell,
+    Orientation,
+)
+from layout.process.process import LayerNumber
+from metalens.core.arrays import Array
+
+Child = int | str  # reference number, or name
+LARGE_PART = 1 << 23  # placements of which each column has 32 MB
+_BATCH = 1 << 18
+
+
+def has_area(points: Array) -> bool:
+    """Whether the corners (n, 2) of a polygon do not all lie on one line.
+
+    Args:
+        points: (n, 2) corners.
+    """
+    steps = points[1:] - points[0]
+    if not len(steps):
+        return False
+    longest = steps[np.abs(steps).sum(1).argmax()]
+    return bool((steps[:, 0] * longest[1] != steps[:, 1] * longest[0]).any())
+
+
+@dataclass(eq=False, slots=True)
+class PlacementSums:
+    """Placements of a cell while it is read: kept up to a number (None: all), beyond it
+    only their sums.
+
+    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged:
+    how many of them are large;
+    small: placements in the others.
+    """
+
+    keep: int | None = None
+    parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
+    count: int = 0
+    digest: RunningDigest | None = None
+    merged: int = 0
+    small: int = 0
+
+    def add(self, child: Array, x: Array, y: Array, turn: Array) -> None:
+        """Take in some more."""
+        self.count += len(child)
+        if self.digest is None:
+            self.parts.append((child, x, y, turn))
+            if self.keep is None or self.count <= self.keep:
+                self._merge(len(child))
+                return
+            self.digest = RunningDigest()
+            for part in self.parts:
+                self.digest.take(*part)
+            self.parts = []
+            return
+        self.digest.take(child, x, y, turn)
+
+    def _merge(self, more: int) -> None:
+        """Make one of the last parts where they are many: large arrays go back to the
+        system when they are let go.
+        """
+        self.small += more
+        if self.small >= LARGE_PART:
+            child, x, y, turn = (
+                np.concatenate(part)
+                for part in zip(*self.parts[self.merged :], strict=True)
+            )
+            self.parts[self.merged :] = [(child, x, y, turn)]
+            self.merged, self.small = self.merged + 1, 0
+
+    def columns(self) -> tuple[Array, Array, Array, Array]:
+        """child, x, y, turn of all that is kept; the parts are let go, one column after
+        the other.
+        """
+        columns = [list(part) for part in zip(*self.parts, strict=True)]
+        self.parts, made = [], []
+        while columns:
+            made.append(np.concatenate(columns.pop(0)))
+        return made[0], made[1], made[2], made[3]
+
+
+@dataclass(eq=False, slots=True)
+class OpenCell:
+    """A cell while it is read.
+
+    key: its name or number.
+    names: {cell: number} of those placed by name, from -2 down.
+    turns: {orientation: number}.
+    """
+
+    key: Child
+    held: PlacementSums
+    polygons: dict[LayerNumber, list[Array]] = field(default_factory=dict)
+    circles: dict[LayerNumber, list[tuple[int, int, int]]] = field(default_factory=dict)
+    names: dict[str, int] = field(default_factory=dict)
+    turns: dict[Orientation, int] = field(
+        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
+    )
+    texts: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def number(self, name: str) -> int:
+        """Number of a cell that is placed by its name."""
+        return self.names.setdefault(name, -2 - len(self.names))
+
+    def place(
+        self, child: int | Array, x: Array, y: Array, turn: Orientation = QUARTERS[0]
+    ) -> None:
+        """Take in placements of a cell, or of (n,) cells, in one orientation.
+
+        Args:
+            child: number or numbers.
+            x: (n,) places.
+            y: (n,) places.
+            turn: of all.
+        """
+        number = self.turns.setdefault(turn, len(self.turns))
+        children = np.broadcast_to(child, len(x)).astype(np.int32)
+        turns = np.full(len(x), number, np.uint8 if number < 256 else np.int32)
+        self.held.add(children, x.astype(np.int32), y.astype(np.int32), turns)
+
+    def close(self, name: str, table: Mapping[int, str] | Sequence[str]) -> MaskCell:
+        """The finished cell.
+
+        Args:
+            name: of the cell.
+            table: names of the reference numbers.
+
+        Raises:
+            KeyError: a reference number without a name.
+        """
+        own = {number: child for child, number in self.names.items()}
+
+        def named(numbers: Array) -> tuple[str, ...]:
+            return tuple(own[k] if k < 0 else table[k] for k in numbers.tolist())
+
+        placed, sums, digest = NOTHING, None, self.held.digest
+        if digest is not None:
+            placed = dataclasses.replace(NOTHING, children=named(digest.children))
+            sums = digest.of(digest.children)
+        elif self.held.count:
+            child, x, y, turn = self.held.columns()
+            used, index = _numbered(child)
+            turns = tuple(self.turns)
+            placed = CellPlacements(named(used), index, x, y, turn, turns)
+        return MaskCell(
+            name, self.polygons, self.circles, placed, self.texts, sums, self.skipped
+        )
+
+
+def _numbered(child: Array) -> tuple[Array, Array]:
+    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it
+    is changed in place.
+    """
+    low, high = int(child.min()), int(child.max())
+    if high - low >= 1 << 22:
+        used, index = np.unique(child, return_inverse=True)
+        return used, index.astype(np.int32)
+    occurs = np.zeros(high - low + 1, bool)
+    pieces = [
+        child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
+    ]  # numpy widens what it indexes by
+    for some in pieces:
+        some -= low
+        occurs[some] = True
+    lookup = np.cumsum(occurs, dtype=np.int32) - 1
+    for some in pieces:
+        some[:] = lookup[some]
+    return np.flatnonzero(occurs) + low, child
