@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from metalens.core import lock, report
+from metalens.core import report
 from metalens.core.errors import (
     ConfigError,
     FitRefused,
@@ -233,12 +233,11 @@ def _prepare() -> None:
 
 def _guarded(words: list[str], *, debug: bool) -> int:
     """Run the command; its exit status, with one line for whatever stopped it."""
-    from metalens.core import reading
+    from metalens.core import store
 
-    told = lock.COMMAND.set(" ".join(words))
+    told = store.COMMAND.set(" ".join(words))
     try:
-        with reading.remember_inputs():
-            return _shown(words) if debug else _dispatch(words[0], words[1:])
+        return _shown(words) if debug else _dispatch(words[0], words[1:])
     except FitRefused as error:
         return _refuse(_said(error), FAILED_CHECK)
     except (MetalensError, OSError) as error:
@@ -265,7 +264,7 @@ def _guarded(words: list[str], *, debug: bool) -> int:
             signal.setitimer(
                 signal.ITIMER_REAL, 0
             )  # an interrupt that was dropped and came otherwise comes no more
-        lock.COMMAND.reset(told)
+        store.COMMAND.reset(told)
 
 
 def _shown(words: list[str]) -> int:

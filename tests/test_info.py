@@ -14,11 +14,11 @@ import torch
 from codesign.train import checkpoint
 from codesign.train.inner import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.core import manifest, store
+from metalens.core import store, transaction
 from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
-SAVES = ("store.save", "records.save_record")
+SAVES = ("store.save", "store.save_record")
 PACKAGES = ("metalens", "layout", "characterize", "codesign")
 
 
@@ -132,7 +132,7 @@ def test_a_file_of_a_folder_is_told_by_its_manifest_as_long_as_it_is_as_written(
     tmp_path, capsys
 ):
     (tmp_path / "report.html").write_text("<p>as made</p>", encoding="utf-8")
-    manifest.write_manifest(tmp_path, "layout lens.h5 -o mask")
+    transaction.write_manifest(tmp_path, "layout lens.h5 -o mask")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     assert main(["info", str(tmp_path / "report.html")]) == SUCCESS
     assert (

@@ -19,7 +19,7 @@ import numpy as np
 from characterize.captures import axes, folder, png, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
 from characterize.captures.colour import ColourChannels
-from metalens.core import manifest, reading, store
+from metalens.core import reading, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, MetalensError
 
@@ -110,7 +110,6 @@ def load(path: str | Path) -> Capture:
         CaptureError: nothing there, lossy or truncated images, frames of different
             size, non-finite values,
             stage rows that do not match the frames; file, row and frame are named.
-            StoreError: changed while read.
     """
     path = Path(path)
     if not path.exists():
@@ -121,8 +120,7 @@ def load(path: str | Path) -> Capture:
         logging.CRITICAL
     )  # what it makes of a damaged file is said in one error
     try:
-        with reading.refuse_changes(path):
-            return _load_folder(path) if path.is_dir() else _load_file(path)
+        return _load_folder(path) if path.is_dir() else _load_file(path)
     except MetalensError:
         raise
     except (
@@ -257,7 +255,7 @@ def _load_file(path: Path) -> Capture:
 
 
 def _load_folder(at: Path) -> Capture:
-    manifest.check_manifest(at)
+    transaction.check_manifest(at)
     about = stage.read_about(at)
     rows = stage.read_stage(at)
     files = folder.list_images(at, TIFF + PNG + HDF5 + LOSSY)
@@ -390,7 +388,10 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
 
 def _read_hdf5(path: Path) -> Array:
     try:
-        return reading.read_hdf5(path, lambda file: _frames_of(path, file))
+        if not path.is_file():  # a pipe would be waited for
+            raise CaptureError(f"{path}: {reading.missing_reason(path)}")
+        with h5py.File(path, "r") as file:
+            return _frames_of(path, file)
     except MetalensError:
         raise
     except store.DAMAGE as error:

@@ -19,7 +19,7 @@ from characterize.inference import FitOptions as FitOptions
 from characterize.model import KnownValue
 from characterize.pupil import PupilFit, PupilSpec, fit_pupil, save
 from metalens import lens as lenses
-from metalens.core import config, reading, store, transaction
+from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
 
 
@@ -113,7 +113,7 @@ def _provenance(options: Options, *sources: Path) -> store.Provenance:
         if p is not None
     ]
     return store.Provenance(
-        config="\n".join(texts), inputs={p.name: reading.sha256(p) for p in files}
+        config="\n".join(texts), inputs={p.name: store.sha256(p) for p in files}
     )
 
 

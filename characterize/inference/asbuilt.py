@@ -20,10 +20,9 @@ from characterize.model import (
     usual_parameters,
 )
 from metalens import psf as psfs
-from metalens.core import records, store
+from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.reading import typed_reader
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.fabrication import Sensitivity
 from metalens.lens import DiameterMap, Lens
 
@@ -343,7 +342,7 @@ def save(path: str | Path, result: AsBuilt) -> None:
         path: the file to write.
         result: the as-built lens.
     """
-    arrays, attributes = records.flatten_record(result)
+    arrays, attributes = store.flatten_record(result)
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
     store.save(
         path, "asbuilt", arrays, attributes=attributes, provenance=result.provenance
@@ -360,4 +359,4 @@ def load(path: str | Path) -> AsBuilt:
     Raises:
         StoreError: not an as-built file.
     """
-    return records.load_record(path, "asbuilt", AsBuilt)
+    return store.load_record(path, "asbuilt", AsBuilt)

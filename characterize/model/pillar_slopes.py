@@ -16,7 +16,7 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import solving
 from metalens.cell import Cell, index
-from metalens.core import records
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
@@ -162,7 +162,7 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
     ]
     media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
     indices = [index(medium, lens.wavelength_um) for medium in media]
-    arrays, numbers = records.flatten_record(lens.proxy)
+    arrays, numbers = store.flatten_record(lens.proxy)
     proxy = numbers | {name: array.tolist() for name, array in arrays.items()}
     return repr(
         (

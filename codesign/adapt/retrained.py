@@ -16,7 +16,7 @@ from codesign.adapt.source import FinishedRun, is_retraining, lens_file
 from codesign.optics import MadeLens
 from codesign.train import RunConfig, checkpoint
 from metalens import lens as lenses
-from metalens.core import config, manifest, reading
+from metalens.core import config, store, transaction
 from metalens.core.errors import TrainingError
 
 RECIPE, RESULT = "retrain.toml", "result.json"
@@ -96,42 +96,37 @@ def load_retrained(path: Path) -> FinishedRun:
     if not is_retraining(folder):
         return retraining.load_finished_run(path)
     job = "retrained" if path == folder else path.stem
-    with reading.refuse_changes(folder):
-        manifest.check_manifest(folder)
-        recipe, places = config.load(folder / RECIPE, RetrainingRecipe), _places(folder)
-        for name, sha in (
-            ("run", recipe.weights),
-            ("asbuilt", recipe.asbuilt),
-            ("truth", recipe.truth),
-        ):
-            _unchanged(folder, name, places[name], sha)
-        source = retraining.load_finished_run(
-            _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
+    transaction.check_manifest(folder)
+    recipe, places = config.load(folder / RECIPE, RetrainingRecipe), _places(folder)
+    for name, sha in (
+        ("run", recipe.weights),
+        ("asbuilt", recipe.asbuilt),
+        ("truth", recipe.truth),
+    ):
+        _unchanged(folder, name, places[name], sha)
+    source = retraining.load_finished_run(
+        _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
+    )
+    built = asbuilt.load(_known(places["asbuilt"]))
+    truth = (
+        None if places["truth"] is None else config.load(places["truth"], HiddenLens)
+    )
+    run_dir, budget = _known(places["run"]), source.row["budget_mmacs"]
+    design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
+    made = MadeLens(design, source.settings.optics, response=built.response)
+    found = retraining.lens_psfs(made, built, recipe.settings, truth)
+    if (
+        job not in retraining.available_jobs(found)
+        or not (folder / f"{job}.safetensors").is_file()
+    ):
+        have = ", ".join(
+            f"{name}.safetensors" for name in retraining.available_jobs(found)
         )
-        built = asbuilt.load(_known(places["asbuilt"]))
-        truth = (
-            None
-            if places["truth"] is None
-            else config.load(places["truth"], HiddenLens)
-        )
-        run_dir, budget = _known(places["run"]), source.row["budget_mmacs"]
-        design = lenses.load_plain(lens_file(run_dir, source.settings, budget))
-        made = MadeLens(design, source.settings.optics, response=built.response)
-        found = retraining.lens_psfs(made, built, recipe.settings, truth)
-        if (
-            job not in retraining.available_jobs(found)
-            or not (folder / f"{job}.safetensors").is_file()
-        ):
-            have = ", ".join(
-                f"{name}.safetensors" for name in retraining.available_jobs(found)
-            )
-            raise TrainingError(
-                f"{path}: no network of this retraining; it holds {have}"
-            )
-        going = retraining.make_job(source, recipe.settings, found, job)
-        going.restore(
-            checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"]
-        )
+        raise TrainingError(f"{path}: no network of this retraining; it holds {have}")
+    going = retraining.make_job(source, recipe.settings, found, job)
+    going.restore(
+        checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"]
+    )
     shown = found.judges[0] if found.known else found.best
     return replace(source, run=replace(source.run, trainer=going), made=shown)
 
@@ -185,7 +180,7 @@ def _unchanged(folder: Path, name: str, path: Path | None, sha: str) -> None:
         raise TrainingError(
             f"{folder}: its {name} is no longer at {path}; put it back, or retrain from where it is"
         )
-    if reading.sha256(file) != sha:
+    if store.sha256(file) != sha:
         raise TrainingError(
             f"{folder}: {file} is not what it was retrained from; give it back, or retrain"
         )

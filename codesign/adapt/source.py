@@ -15,7 +15,7 @@ from codesign.network import Architecture, check_architecture, subnet
 from codesign.optics import PixelPsfStack
 from codesign.train import CodesignRun, RunConfig, checkpoint
 from codesign.train import run as runs
-from metalens.core import manifest, reading
+from metalens.core import transaction
 from metalens.core.errors import FitError, TrainingError
 from metalens.lens import Lens
 
@@ -65,11 +65,10 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
             f"{folder} is a half-written run: {', '.join(missing)} missing; finish it with "
             f"`metalens codesign RUN.toml -o {folder} --resume`"
         )
-    with reading.refuse_changes(folder):
-        manifest.check_manifest(folder)
-        settings = runs.load_run_settings(folder / "run.toml")
-        made = runs.resume_run(folder / "checkpoint.safetensors", settings)
-        rows = rows_of(folder)
+    transaction.check_manifest(folder)
+    settings = runs.load_run_settings(folder / "run.toml")
+    made = runs.resume_run(folder / "checkpoint.safetensors", settings)
+    rows = rows_of(folder)
     found = (
         [r for r in rows if r["budget_mmacs"] == budget_mmacs]
         if budget_mmacs
@@ -81,8 +80,7 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
         )
     architecture = architecture_of(found[0]["architecture"], made, folder)
-    with reading.refuse_changes(folder):
-        restore_weights(made, found[0], folder)
+    restore_weights(made, found[0], folder)
     return FinishedRun(made, architecture, found[0])
 
 
@@ -155,7 +153,7 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
         TrainingError: the file is missing, cut short or of another version.
     """
     _no_retraining(folder)
-    manifest.check_manifest(folder)
+    transaction.check_manifest(folder)
     path = folder / "result.json"
     if not path.is_file():
         raise TrainingError(f"{path} is missing: no finished run; resume the run")

@@ -20,9 +20,9 @@ from codesign.evaluate.error_budget import (
     ErrorBudget,
 )
 from metalens import lens, library
-from metalens.core import reading, report, store
+from metalens.core import report, store
 from metalens.core.errors import ConfigError
-from metalens.core.reading import typed_reader
+from metalens.core.store import typed_reader
 from metalens.fabrication import of_process
 from metalens.psf import Source, spectrum
 
@@ -221,7 +221,7 @@ def _provenance(options: Options, given: BudgetInputs) -> store.Provenance:
     files = [options.lens, options.library, options.process, options.asbuilt, weights]
     return store.Provenance(
         config=f"fwhm_nm = {given.fwhm_nm}\n",
-        inputs={f.name: reading.sha256(f) for f in files if f is not None},
+        inputs={f.name: store.sha256(f) for f in files if f is not None},
     )
 
 

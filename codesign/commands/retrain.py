@@ -27,7 +27,7 @@ from codesign.train import (
     place_on_device,
 )
 from metalens import __version__, lens
-from metalens.core import config, reading, store
+from metalens.core import config, store
 from metalens.core.errors import TrainingError
 from metalens.core.transaction import OutputDraft
 from metalens.fabrication import Bias
@@ -154,10 +154,10 @@ def _story(
 def _recipe(options: Options, source: FinishedRun) -> RetrainingRecipe:
     return RetrainingRecipe(
         options.settings,
-        reading.sha256(options.asbuilt),
-        reading.sha256(options.run_dir / "checkpoint.safetensors"),
+        store.sha256(options.asbuilt),
+        store.sha256(options.run_dir / "checkpoint.safetensors"),
         source.settings,
-        reading.sha256(options.truth) if options.truth else "",
+        store.sha256(options.truth) if options.truth else "",
     )
 
 

@@ -19,7 +19,7 @@ from codesign.eye import (
     landmarks,
 )
 from metalens import lens as lenses
-from metalens.core import config, reading, store, transaction
+from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
 from metalens.core.store import Provenance
 from metalens.image import scene
@@ -144,7 +144,7 @@ def run(options: Options) -> int:
             )
             about = Provenance(
                 config.dumps(settings),
-                {options.lens.name: reading.sha256(options.lens)},
+                {options.lens.name: store.sha256(options.lens)},
                 settings.seed,
             )
             found = _imaged(settings, lens, options.fwhm_nm)

@@ -16,8 +16,7 @@ from codesign.eye.renderer import PinholeCamera, RenderedFrames, render
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
-from metalens.core.reading import typed_reader
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.image import Frames
 
 

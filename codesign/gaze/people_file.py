@@ -13,7 +13,7 @@ import numpy as np
 from codesign.gaze.shared import MixedModel, PopulationPrior
 from metalens.core import store
 from metalens.core.errors import StoreError
-from metalens.core.reading import typed_reader
+from metalens.core.store import typed_reader
 
 KIND = "people"
 SHAPES = {

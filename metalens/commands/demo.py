@@ -17,7 +17,7 @@ from metalens.cli import main as run_verb
 from metalens.commands import chain
 from metalens.commands.chain import ChainFiles, ChainStage
 from metalens.commands.common import CommonOptions
-from metalens.core import manifest, report, store
+from metalens.core import report, store, transaction
 from metalens.core.errors import ConfigError, MetalensError
 
 OUTCOMES = "outcomes.jsonl"
@@ -78,7 +78,7 @@ def run(options: Options) -> int:
                 raise ConfigError(
                     f"{options.output} was begun with other settings; start over with --force"
                 )
-            manifest.empty_folder(folder)
+            transaction.empty_folder(folder)
             laid.write(folder)
         outcomes: list[StageOutcome] = []
         for outcome in _chain(folder, laid.files):

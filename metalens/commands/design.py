@@ -14,7 +14,7 @@ import tyro
 from metalens import design, lens, library
 from metalens.cell import Cell, describe_order_loss
 from metalens.commands.common import CommonOptions, Output
-from metalens.core import config, reading, store, transaction
+from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
 from metalens.core.report import Console
 from metalens.core.store import write_bytes
@@ -283,7 +283,7 @@ def _design_two_sizes(
 ) -> _Outcome:
     """A lens of pillars of two sizes, for light along x and along y."""
     path = options.config.parent / (wanted.library or "")
-    pillars, inputs = axes.load(path), {path.name: reading.sha256(path)}
+    pillars, inputs = axes.load(path), {path.name: store.sha256(path)}
     wanted = wanted.at(pillars.wavelength_um.tolist())
     pillars.at(wanted.focus.wavelength_um)
     wanted = _fill_limits(wanted, options, pillars.cell, inputs)
@@ -333,7 +333,7 @@ def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _
     proxy.at(wanted.focus.wavelength_um)  # refused here, not after the search
     wanted = _fill_limits(wanted, options, cell, inputs)
     if wanted.profile == "map" and wanted.map and (folder / wanted.map.file).is_file():
-        inputs[wanted.map.file.name] = reading.sha256(folder / wanted.map.file)
+        inputs[wanted.map.file.name] = store.sha256(folder / wanted.map.file)
     phase, focus, values = _find_phase(wanted, options, draft)
     about = _common(wanted, inputs)
     rotated = pillars.turned is not None
@@ -436,11 +436,11 @@ def _fill_limits(
     """The limits of a process file (by a package above this one that the command line
     names), the gap behind the pillars filled by the cover; notes the files read.
     """
-    inputs[options.config.name] = reading.sha256(options.config)
+    inputs[options.config.name] = store.sha256(options.config)
     layers = wanted.layers.covered_by(cell.cover)
     if options.process is None:
         return replace(wanted, layers=layers)
-    inputs[options.process.name] = reading.sha256(options.process)
+    inputs[options.process.name] = store.sha256(options.process)
     thinnest, gap = importlib.import_module(OBJECTIVES["process"]).printable_limits(
         options.process, pitch_um=cell.pitch_um, height_um=cell.height_um
     )
@@ -454,7 +454,7 @@ def _pillars(
     """The library of the pillars, and the hash of its file if there is one."""
     if wanted.library is not None:
         path = folder / wanted.library
-        return library.load(path), {path.name: reading.sha256(path)}
+        return library.load(path), {path.name: store.sha256(path)}
     others = (1e-3 * one.wavelength_nm for one in wanted.wavelengths)
     waves = tuple(sorted((wanted.focus.wavelength_um, *others)))
     cell = wanted.cell or library.DEFAULT_CELL

@@ -13,7 +13,7 @@ import tyro
 from metalens.cell import Cell, Incidence, Polarization
 from metalens.commands.common import CommonOptions, Output
 from metalens.commands.library import CellFile
-from metalens.core import config, reading, store
+from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import figure_png, make_figure
@@ -181,10 +181,7 @@ def run(options: Options) -> int:
         )
         files = (options.config, *workers.material_files(wanted.cell))
         save_near_field(
-            draft.path,
-            wanted,
-            found,
-            {file.name: reading.sha256(file) for file in files},
+            draft.path, wanted, found, {file.name: store.sha256(file) for file in files}
         )
         store.write_bytes(
             draft.path.with_suffix(".png"), near_field_picture(wanted, found)

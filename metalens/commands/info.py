@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from metalens.commands.common import MASKS, CommonOptions
-from metalens.core import manifest, store
+from metalens.core import store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import StoreError
 
@@ -100,7 +100,7 @@ def manifest_entry(path: Path) -> dict[str, Any] | None:
     Raises:
         StoreError: it is not as it was written.
     """
-    found = manifest.read_manifest(path.parent) if path.is_file() else None
+    found = transaction.read_manifest(path.parent) if path.is_file() else None
     listed = (found or {}).get("files", {}).get(path.name)
     if found is None or listed is None:
         return None
@@ -134,12 +134,12 @@ def folder_manifest(path: Path) -> dict[str, Any]:
     Raises:
         StoreError: no manifest, unfinished, or a file that is missing or differs.
     """
-    found = manifest.read_manifest(path)
+    found = transaction.read_manifest(path)
     if found is None:
         raise StoreError(
-            f"{path}: no {manifest.NAME} in it, not made by this toolchain; give a file, or a folder of ours"
+            f"{path}: no {transaction.NAME} in it, not made by this toolchain; give a file, or a folder of ours"
         )
-    manifest.check_manifest(path)
+    transaction.check_manifest(path)
     return {"folder": str(path), **found}
 
 

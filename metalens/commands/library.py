@@ -22,7 +22,7 @@ from metalens.cell import (
 )
 from metalens.commands import axes_library
 from metalens.commands.common import DistributedOptions, Output
-from metalens.core import config, reading, store
+from metalens.core import config, store
 from metalens.core.errors import DomainError
 from metalens.library import (
     DEFAULT_CELL,
@@ -120,7 +120,7 @@ def _import_table(options: Options, cell_file: Path) -> int:
     )
     wanted = dataclasses.replace(wanted, sweep=made.sweep)
     inputs = _inputs(cell_file, wanted.cell) | {
-        options.config.name: reading.sha256(options.config)
+        options.config.name: store.sha256(options.config)
     }
     with options.claim(options.output, beside=(".png",)) as draft:
         return _finish(options, draft.path, made, wanted, inputs, 0.0)
@@ -160,8 +160,7 @@ def _finish(
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     """Hashes of the config and of the material tables that the cell names."""
     return {
-        file.name: reading.sha256(file)
-        for file in (path, *workers.material_files(cell))
+        file.name: store.sha256(file) for file in (path, *workers.material_files(cell))
     }
 
 

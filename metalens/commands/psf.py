@@ -19,7 +19,7 @@ from metalens.commands import far_field
 from metalens.commands import psf_words as words
 from metalens.commands.common import CommonOptions, MaybeOutput
 from metalens.commands.psf_settings import PsfSettings, read_psf_settings
-from metalens.core import config, reading, store, transaction
+from metalens.core import config, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
 from metalens.core.report import write_report
@@ -180,7 +180,7 @@ def _far(options: Options) -> int:
     made = lens.load(options.lens)
     wanted, inputs = (
         far_field.far_field_request(options, made),
-        {options.lens.name: reading.sha256(options.lens)},
+        {options.lens.name: store.sha256(options.lens)},
     )
     with options.claim(
         target,
@@ -353,7 +353,7 @@ def _of_design(
 def _provenance(path: Path, settings: PsfSettings) -> Provenance:
     files = [path, *(file for file in settings.spectrum if file.is_file())]
     return Provenance(
-        config.dumps(settings), {file.name: reading.sha256(file) for file in files}
+        config.dumps(settings), {file.name: store.sha256(file) for file in files}
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from metalens.commands.common import MASKS, CommonOptions, MaybeOutput
-from metalens.core import manifest, store
+from metalens.core import store, transaction
 from metalens.core.errors import ConfigError
 from metalens.view import Panel, write_page
 
@@ -152,7 +152,7 @@ def _inside(path: Path) -> list[Path]:
 def _about(path: Path) -> dict[str, object]:
     """Where an artefact comes from."""
     if path.is_dir() or path.suffix != ".h5":
-        found = manifest.read_manifest(path if path.is_dir() else path.parent) or {}
+        found = transaction.read_manifest(path if path.is_dir() else path.parent) or {}
         return {name: found[name] for name in found if name != "files"}
     made = store.load(path).provenance
     return {

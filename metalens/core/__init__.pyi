@@ -3,10 +3,7 @@ from . import config as config
 from . import errors as errors
 from . import executor as executor
 from . import legendre as legendre
-from . import lock as lock
-from . import manifest as manifest
 from . import reading as reading
-from . import records as records
 from . import report as report
 from . import store as store
 from . import threads as threads

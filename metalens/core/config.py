@@ -73,12 +73,11 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
     path = Path(path)
     try:
         with open(path, "rb") as file:
-            before, content = reading.file_stamp(path), file.read(_LARGEST + 1)
+            content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
             raise ConfigError(
                 f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})"
             )
-        reading.note_input(path, before, content)
         text = reading.decode_text(content)
     except FileNotFoundError:
         raise ConfigError(

@@ -1,32 +1,37 @@
-"""Artefact files: one HDF5 header checked when opened, written whole or not at all,
-same input same bytes.
-"""
+"""Files: artefacts in HDF5 and text, written whole or not at all."""
 
 import contextlib
+import dataclasses
 import fcntl
+import functools
 import hashlib
 import importlib.metadata
+import io
 import os
 import sys
-import tempfile
-from collections.abc import Collection, Iterator, Mapping
+import types
+import typing
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 
-from metalens.core import lock, reading
+from metalens.core import config, reading
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE as DAMAGE
-from metalens.core.errors import StoreError
+from metalens.core.errors import MetalensError, OutputError, StoreError
 
 Attribute = str | int | float | bool
-_FORMAT = (
-    "v110",
-    "v110",
-)  # of HDF5: every block of metadata carries a checksum, files can still be edited
+Record = TypeVar("Record")
+# words of the command line, for locks and manifests
+COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
+# of HDF5: every block of metadata carries a checksum, files can still be edited
+_FORMAT = ("v110", "v110")
 _UNITS = "um, rad"
 _MOST_BYTES = 1 << 36  # of all arrays of a file
 _DENSEST = 1040  # values' bytes for a byte in the file: what deflate can do at best
@@ -86,63 +91,78 @@ def sha256(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def replace_atomically(path: str | Path) -> Iterator[Path]:
-    """Give a scratch path beside ``path``; flush it and rename it over ``path`` only if
-    the block succeeds.
+    """Give a scratch path in the folder of ``path``; sync it and rename it over
+    ``path`` only if the block succeeds.
 
-    Whatever ends the block early (error, Ctrl-C, disk full), the old file stays and the
-    scratch file goes; what a
-    killed process left goes with the next writing of the same file. Writers at the same
-    time do not meet.
-    """
-    path = Path(path)
-    clear_scratch(path)
-    handle, part = _part(path)
-    try:
-        os.fchmod(handle, 0o666 & ~_umask())
-        yield part
-        with open(part, "rb+") as file:
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
-    finally:
-        os.close(handle)
-        part.unlink(missing_ok=True)
-
-
-def _part(path: Path) -> tuple[int, Path]:
-    """A scratch file beside ``path``, locked so that nobody clears it away."""
-    while True:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.name}.", suffix=".part", dir=path.parent
-        )
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_SH)
-        if os.path.exists(name):
-            return handle, Path(name)
-        os.close(handle)  # cleared away before it was locked
-
-
-def clear_scratch(path: Path) -> None:
-    """Remove scratch files of writers that are gone.
+    Whatever ends the block early (error, Ctrl-C, full disk, kill), the old file stays.
+    Writers of one file wait for each other; the next one overwrites a scratch file that
+    a killed process left.
 
     Args:
-        path: file to read or write.
+        path: file to write.
     """
-    start, end = f".{path.name}.", ".part"
-    for entry in os.scandir(path.parent):
-        if (
-            entry.name.startswith(start)
-            and entry.name.endswith(end)
-            and lock.is_free(Path(entry.path))
-        ):
-            os.unlink(entry.path)
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    with hold_lock(path, wait=True):
+        try:
+            yield part
+            sync_file(part)
+            part.replace(path)
+            sync_file(path.parent)
+        finally:
+            part.unlink(missing_ok=True)
 
 
-def _umask() -> int:
-    """The process's mask of file modes; it can only be read by setting it."""
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
+@contextlib.contextmanager
+def hold_lock(target: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold ``.NAME.lock`` in the folder of an output; the kernel frees it when its
+    owner dies.
+
+    Args:
+        target: the output; its folder exists.
+        wait: for another owner, in place of a refusal.
+
+    Raises:
+        OutputError: another process writes this output; the message names it.
+        OSError: the folder cannot be written.
+    """
+    path = target.with_name(f".{target.name}.lock")
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if os.path.exists(path) and os.path.samestat(
+                os.stat(path), os.fstat(handle)
+            ):
+                break
+        except BlockingIOError:
+            process, _, command = os.pread(handle, 4096, 0).decode().partition(" ")
+            owner = (
+                f"process {process} (metalens {command})" if process else "another one"
+            )
+            os.close(handle)
+            raise OutputError(
+                f"{target} is being written by {owner}; wait for it or give another name"
+            ) from None
+        os.close(handle)  # its last owner removed the file in between
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(
+            handle, reading.to_valid_utf8(f"{os.getpid()} {COMMAND.get()}").encode(), 0
+        )
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def sync_file(path: Path) -> None:
+    """Flush a file, or the names in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -167,17 +187,13 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 def append_line(path: Path, line: str) -> None:
     """Add a line to a journal, on the disk when this returns; a line that was cut short
-    before it is dropped.
-
-    Writers at the same time wait for each other: what one of them has half written is
-    no line that was cut short.
+    goes first.
 
     Args:
-        path: file to read or write.
+        path: of the journal.
+        line: text without a line break.
     """
     with open(path, "ab+") as file:
-        with contextlib.suppress(OSError):  # a file system without locks
-            fcntl.flock(file, fcntl.LOCK_EX)
         if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
             file.seek(0)
             file.truncate(file.read().rfind(b"\n") + 1)
@@ -187,15 +203,65 @@ def append_line(path: Path, line: str) -> None:
 
 
 def whole_lines(path: Path) -> list[str]:
-    """Lines of a journal; the last one is left out where it was cut short. None without
-    a file.
+    """Lines of a journal but one that was cut short; none without a file.
 
     Args:
-        path: file to read or write.
+        path: of the journal.
     """
     if not path.is_file():
         return []
     return path.read_text(encoding="utf-8", errors="replace").split("\n")[:-1]
+
+
+def open_journal(path: Path, title: str) -> list[str]:
+    """Whole lines of a journal after its title, its first line; the journal of other
+    work is begun afresh.
+
+    Args:
+        path: of the journal.
+        title: one line of JSON, a list that begins with the version.
+
+    Raises:
+        StoreError: a file that is no journal stands there.
+    """
+    lines = whole_lines(path)
+    if lines and lines[0] == title:
+        return lines[1:]
+    begun = path.read_bytes()[:2] if path.is_file() else b""
+    if path.is_dir() or begun not in (b"", b'["'):
+        raise StoreError(
+            f"{path} is in the way of what is kept for an interruption, and no journal of metalens; move it"
+        )
+    write_text(path, title + "\n")
+    return []
+
+
+class CheckedFile(io.FileIO):
+    """A file for the HDF5 library, which may crash the process where a write fails, as
+    on a full disk: the first refusal is kept for :meth:`check`, nothing is written
+    from then on.
+    """
+
+    refused: BaseException | None = None
+
+    def check(self) -> None:
+        """Raise what a write was refused with."""
+        if self.refused is not None:
+            raise self.refused
+
+    def write(self, content: Any) -> int:
+        """All of ``content``."""
+        view = memoryview(content)
+        try:
+            while view and self.refused is None:
+                view = view[super().write(view) :]
+        except (OSError, KeyboardInterrupt, SystemExit) as error:
+            self.refused = error
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size of what is still written."""
+        return 0 if self.refused is not None else super().truncate(size)
 
 
 def save(
@@ -220,7 +286,7 @@ def save(
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    with replace_atomically(path) as part, reading.CheckedFile(part, "wb+") as file:
+    with replace_atomically(path) as part, CheckedFile(part, "wb+") as file:
         _write(
             file,
             kind,
@@ -262,18 +328,16 @@ def load(
             f"{path}: {reading.missing_reason(path)}; need a {kind or 'toolchain'} file"
         )
     try:
-        return reading.read_hdf5(
-            path, lambda file: _read(path, file, kind, version, without)
-        )
+        with h5py.File(path, "r") as file:
+            return _read(path, file, kind, version, without)
     except StoreError:
         raise
     except DAMAGE as error:
-        if found := reading.foreign_format(path):
-            raise StoreError(
-                f"{path}: {found}, need an HDF5 file of this toolchain"
-            ) from error
+        found = reading.foreign_format(path)
         raise StoreError(
-            f"{path}: truncated or not an HDF5 file of this toolchain ({error})"
+            f"{path}: {found}, need an HDF5 file of this toolchain"
+            if found
+            else f"{path}: truncated or not an HDF5 file of this toolchain ({error})"
         ) from error
 
 
@@ -281,12 +345,13 @@ def kind_of(path: str | Path) -> str:
     """The kind that an artefact file says it is; '' for any other file.
 
     Args:
-        path: file to read or write.
+        path: of the file.
     """
+    if not os.path.isfile(path):
+        return ""
     try:
-        found, units = reading.read_hdf5(
-            path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")]
-        )
+        with h5py.File(path, "r") as file:
+            found, units = (_plain(file.attrs.get(k)) for k in ("kind", "units"))
     except DAMAGE:
         return ""
     return found if isinstance(found, str) and units == _UNITS else ""
@@ -391,7 +456,7 @@ class _Held(dict[str, Any]):
 
 
 def _write(
-    through: reading.CheckedFile,
+    through: CheckedFile,
     kind: str,
     version: int,
     attributes: Mapping[str, Attribute],
@@ -480,10 +545,210 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def sync_folder(folder: Path) -> None:
-    """Flush the names in a folder."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def save_record(path: str | Path, kind: str, record: Any) -> None:
+    """Write a record with its provenance as an artefact file.
+
+    Args:
+        path: target, replaced atomically.
+        kind: of the artefact, checked when it is read.
+        record: a dataclass with a field ``provenance``.
+    """
+    arrays, attributes = flatten_record(record)
+    save(path, kind, arrays, attributes=attributes, provenance=record.provenance)
+
+
+def load_record(path: str | Path, kind: str, record_type: type[Record]) -> Record:
+    """Read what :func:`save_record` wrote, as a ``record_type``.
+
+    Args:
+        path: of the file.
+        kind: of artefact that is needed.
+        record_type: the dataclass.
+
+    Raises:
+        StoreError: not such a file, or an entry is missing.
+    """
+    stored = load(path, kind)
+    return build_record(
+        record_type,
+        stored.arrays,
+        stored.attributes,
+        where=str(path),
+        provenance=stored.provenance,
+    )
+
+
+def flatten_record(
+    record: Any, group: str = ""
+) -> tuple[dict[str, Array], dict[str, Attribute]]:
+    """(arrays, attributes) of a record; fields that are None are left out.
+
+    Args:
+        record: a dataclass of arrays, numbers, text, tuples, dictionaries of arrays or
+            numbers, and other records.
+        group: stands before every name.
+    """
+    arrays: dict[str, Array] = {}
+    attributes: dict[str, Attribute] = {}
+    for entry in dataclasses.fields(record):
+        value, name = getattr(record, entry.name), group + entry.name
+        value = value.item() if isinstance(value, np.generic) else value
+        if not entry.init or isinstance(value, Provenance):
+            continue
+        if isinstance(value, bool | int | float | str):
+            attributes[name] = value
+        elif isinstance(value, tuple):
+            arrays[name] = np.array(value)
+        elif isinstance(value, Mapping):
+            arrays |= {f"{name}/{key}": np.array(one) for key, one in value.items()}
+        elif _holds_arrays(type(value)):
+            inner = flatten_record(value, _group(entry, group))
+            arrays |= inner[0]
+            attributes |= inner[1]
+        elif dataclasses.is_dataclass(value):
+            attributes[name] = config.dumps(value)
+        elif value is not None:
+            arrays[name] = value
+    return arrays, attributes
+
+
+def build_record(
+    record_type: type[Record],
+    arrays: Mapping[str, Array],
+    attributes: Mapping[str, Any],
+    *,
+    where: str,
+    group: str = "",
+    **given: Any,
+) -> Record:
+    """Inverse of :func:`flatten_record`.
+
+    Args:
+        record_type: the dataclass; a field without an entry takes its default.
+        arrays: by name.
+        attributes: by name.
+        where: names the file in errors.
+        group: stands before every name.
+        given: fields that do not come from the entries.
+
+    Raises:
+        StoreError: an entry is missing whose field has no default.
+    """
+    hints = typing.get_type_hints(record_type)
+    for entry in dataclasses.fields(record_type):  # type: ignore[arg-type]
+        name, kind = group + entry.name, _without_none(hints[entry.name])
+        if entry.name in given or not entry.init:
+            continue
+        if _holds_arrays(kind):
+            inner = _group(entry, group)
+            if any(n.startswith(inner) for n in (*arrays, *attributes)):
+                given[entry.name] = build_record(
+                    kind, arrays, attributes, where=where, group=inner
+                )
+        elif typing.get_origin(kind) is dict:
+            of_arrays = typing.get_args(kind)[1] is Array
+            given[entry.name] = {
+                n.removeprefix(f"{name}/"): array if of_arrays else array.item()
+                for n, array in arrays.items()
+                if n.startswith(f"{name}/")
+            }
+        elif name in attributes:
+            value = attributes[name]
+            settings = dataclasses.is_dataclass(kind)
+            given[entry.name] = (
+                config.loads(value, kind, where=f"{where}: {name}")
+                if settings
+                else value
+            )
+        elif name in arrays or _is_required(entry):
+            value = arrays[name]  # where it is missing, a refusal that names it
+            is_tuple = typing.get_origin(kind) is tuple
+            given[entry.name] = _to_tuple(value.tolist()) if is_tuple else value
+    return record_type(**given)
+
+
+def _group(field: dataclasses.Field[Any], group: str) -> str:
+    """What stands before the names of a record's entries."""
+    return group if field.metadata.get("flat") else f"{group}{field.name}/"
+
+
+def _holds_arrays(kind: Any) -> bool:
+    return dataclasses.is_dataclass(kind) and kind.__eq__ is object.__eq__
+
+
+def _without_none(hint: Any) -> Any:
+    """The type of ``X`` or ``X | None``."""
+    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+        return hint
+    return next(kind for kind in typing.get_args(hint) if kind is not type(None))
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return field.default is missing and field.default_factory is missing
+
+
+def _to_tuple(value: Any) -> Any:
+    """Nested lists as tuples, bytes as text."""
+    if isinstance(value, list):
+        return tuple(_to_tuple(one) for one in value)
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def typed_reader(load: Callable[..., Record]) -> Callable[..., Record]:
+    """A ``load(path, ...)`` whose every failure on a damaged or edited file is a
+    StoreError that names the file.
+    """
+
+    @functools.wraps(load)
+    def checked(path: str | Path, *more: Any, **about: Any) -> Record:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "error", np.exceptions.ComplexWarning
+                )  # complex numbers where real ones belong
+                made = load(path, *more, **about)
+            _check_types(made)
+        except MetalensError:
+            raise
+        except (
+            *DAMAGE,
+            IndexError,
+            ArithmeticError,
+            np.exceptions.ComplexWarning,
+        ) as error:
+            raise StoreError(
+                f"{path}: entries of the wrong kind ({error}); edited or damaged: make it again"
+            ) from None
+        return made
+
+    return checked
+
+
+def _check_types(record: Any) -> None:
+    """Numbers, words and arrays where the fields of a record say so.
+
+    Raises:
+        TypeError: naming the field.
+    """
+    if not dataclasses.is_dataclass(record):
+        return
+    hints = typing.get_type_hints(type(record))
+    needed = {
+        float: int | float | np.number,
+        int: int | np.integer,
+        str: str,
+        bool: bool | np.bool_,
+    }
+    for entry in dataclasses.fields(record):
+        value, hint = getattr(record, entry.name), hints[entry.name]
+        if hint in needed and (
+            not isinstance(value, needed[hint])
+            or (isinstance(value, bool) and hint is not bool)
+        ):
+            raise TypeError(
+                f"{entry.name} is {type(value).__name__}, need {hint.__name__}"
+            )
+        if isinstance(value, np.ndarray) and value.dtype.kind not in "biufcSU":
+            raise TypeError(f"{entry.name} holds {value.dtype}, need numbers")
+        _check_types(value)

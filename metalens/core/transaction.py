@@ -1,21 +1,43 @@
-"""Outputs appear whole or not at all: written beside their target, synced, renamed."""
+"""Outputs appear whole or not at all; folders carry a manifest of their files."""
 
 import contextlib
+import ctypes
+import json
 import os
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from metalens.core import lock, manifest, store
-from metalens.core.errors import OutputError
+from metalens.core import store
+from metalens.core.errors import OutputError, StoreError
 
 ROOM = 1 << 22  # bytes that every output may need
-UNFINISHED, JOURNAL = (
-    ".unfinished",
-    ".resume",
-)  # endings of what an interruption leaves for the next run
+# endings of what an interruption leaves for the next run
+UNFINISHED, JOURNAL = ".unfinished", ".resume"
+NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
+_LARGEST = 1 << 26  # bytes of a manifest
+_ENDS = 1 << 16  # bytes at either end of a file in which its mark is looked for
+_RENAME_EXCHANGE, _AT_FDCWD = 2, -100  # renameat2(2)
+# first bytes of a file, and what ours has in it
+_MARKS = (
+    (b"\x89PNG", b"Software\0metalens"),
+    (b"<!doctype html>", b'name="generator" content="metalens'),
+    (b"MATLAB 5.0 MAT-file, metalens", b""),
+    (b"file,depth_um,angle_deg,exposure_s", b""),
+    (
+        b'<?xml version="1.0" encoding="utf-8"?>\n<report-database>',
+        b"<generator>metalens",
+    ),
+    (b"PK", b"metalens"),  # NumPy's archive, with a comment
+    (b"II*\0", b"metalens"),  # TIFF, BigTIFF
+    (b"MM\0*", b"metalens"),
+    (b"II+\0", b"metalens"),
+    (b"MM\0+", b"metalens"),
+    (b"", b" 0 0 0\t \t\n"),  # Zemax grid phase: blanks end its first line
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +98,7 @@ def claim_file(
         new.mkdir()
         yield OutputDraft(new / target.name, target)
         made = sorted(p.name for p in new.iterdir())
-        manifest.sync_files(new)
+        sync_files(new)
         _refuse(target, {*names, *made} - {target.name}, terms, is_folder=False)
         companions = {*names, *made} - {target.name}
         for name in companions:  # a picture is missing after a kill, never another's
@@ -84,7 +106,7 @@ def claim_file(
         (new / target.name).replace(target)
         for name in companions & set(made):
             (new / name).replace(target.with_name(name))
-        store.sync_folder(target.parent)
+        store.sync_file(target.parent)
 
 
 @contextlib.contextmanager
@@ -203,7 +225,9 @@ def _followed(target: Path) -> Path:
 
 @contextlib.contextmanager
 def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path]:
-    """Lock an output and give a scratch folder beside it, which goes in the end."""
+    """Lock an output and give an empty scratch folder in its folder, which goes in the
+    end; that of a killed owner goes first.
+    """
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(
             f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write"
@@ -215,6 +239,13 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
     missing = [one for one in target.parents if not one.exists()] * terms.parents
     if terms.parents:
         target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.parent.is_dir():
+        how = (
+            "is a file: give"
+            if target.parent.exists()
+            else "does not exist; make it or give"
+        )
+        raise OutputError(f"{target}: folder {target.parent} {how} another name")
     try:
         with _scratch(target) as scratch:
             yield scratch
@@ -229,23 +260,13 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
 
 @contextlib.contextmanager
 def _scratch(target: Path) -> Iterator[Path]:
-    """The lock, and a scratch folder; that of dead owners goes first."""
-    if not target.parent.is_dir():
-        how = (
-            "is a file: give"
-            if target.parent.exists()
-            else "does not exist; make it or give"
-        )
-        raise OutputError(f"{target}: folder {target.parent} {how} another name")
+    scratch = target.with_name(f".{target.name}.new")
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(lock.hold_lock(target))
-            for left in target.parent.glob(".*.part-*"):
-                if left.name[1:].rpartition(".part-")[0] == target.name:
-                    shutil.rmtree(left, ignore_errors=True)
-            store.clear_scratch(target.with_name(target.name + JOURNAL))
-            prefix = f".{target.name}.part-"
-            scratch = Path(tempfile.mkdtemp(prefix=prefix, dir=target.parent))
+            stack.enter_context(store.hold_lock(target))
+            if scratch.exists():
+                shutil.rmtree(scratch)
+            scratch.mkdir()
         except OSError as error:
             raise OutputError(
                 f"{target}: its folder cannot be written ({error.strerror}); give another"
@@ -289,7 +310,7 @@ def _refuse(
             continue
         if not terms.force:
             raise OutputError(f"{path} exists; give --force to overwrite it")
-        why = manifest.foreign_reason(path)
+        why = foreign_reason(path)
         if why:
             raise OutputError(
                 f"{path} {why}: not overwritten, not even with --force; move it or give another name"
@@ -306,22 +327,33 @@ def _is_taken(path: Path) -> bool:
 
 def _finish(folder: Path) -> None:
     """Give a folder its manifest, and sync all that is in it."""
-    begun = manifest.read_manifest(folder)
+    begun = read_manifest(folder)
     others = begun["others"] if begun else ()
-    manifest.write_manifest(folder, lock.COMMAND.get(), others=others)
-    manifest.sync_files(folder)
+    write_manifest(folder, store.COMMAND.get(), others=others)
+    sync_files(folder)
 
 
 def _put(scratch: Path, new: Path, target: Path) -> None:
     """Exchange a finished folder with what stands."""
     if not target.exists():
         new.rename(target)
-    elif lock.exchange_names(new, target):
+    elif _exchange_names(new, target):
         new.rename(scratch / "old")
     else:
         target.rename(scratch / "old")
         new.rename(target)
-    store.sync_folder(target.parent)
+    store.sync_file(target.parent)
+
+
+def _exchange_names(one: Path, other: Path) -> bool:
+    """Swap two names in one step; False where the system cannot."""
+    if not sys.platform.startswith("linux"):
+        return False
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    names = os.fsencode(one.absolute()), os.fsencode(other.absolute())
+    return call is not None and not call(
+        _AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE
+    )
 
 
 def _open_work(
@@ -329,7 +361,7 @@ def _open_work(
 ) -> bool:
     """Make or find the folder of unfinished work; whether it holds some already."""
     work = unfinished_path(target)
-    found = manifest.read_manifest(work) if work.is_dir() else None
+    found = read_manifest(work) if work.is_dir() else None
     if work.exists() and found is None:
         raise OutputError(
             f"{work} is in the way and was not made by metalens; move it or give another name"
@@ -345,16 +377,194 @@ def _open_work(
     fresh = scratch / "work"
     copied, others = resume and _is_taken(target), set[str]()
     if copied:
-        others = manifest.unlisted_files(target)
-        if others and manifest.read_manifest(target) is None:
+        others = unlisted_files(target)
+        if others and read_manifest(target) is None:
             raise OutputError(
-                f"{target} holds {min(others)} and no {manifest.NAME}: not made by metalens"
+                f"{target} holds {min(others)} and no {NAME}: not made by metalens"
             )
         if not grow:
-            manifest.check_manifest(target)
+            check_manifest(target)
         shutil.copytree(target, fresh, symlinks=True)
     else:
         fresh.mkdir()
-    manifest.write_manifest(fresh, lock.COMMAND.get(), finished=False, others=others)
+    write_manifest(fresh, store.COMMAND.get(), finished=False, others=others)
     fresh.rename(work)
     return copied
+
+
+def write_manifest(
+    folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()
+) -> None:
+    """Write the manifest of everything in a folder but ``others``, which are not ours
+    and are named as such.
+
+    Unfinished: of a folder that is still being made.
+    """
+    listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
+              for name in (sorted({*iterate_files(folder)} - {*others}) if finished else ())}  # fmt: skip
+    about = {
+        "kind": KIND,
+        "version": VERSION,
+        "finished": finished,
+        "command": command,
+        "versions": dict(store.package_versions()),
+        "files": listed,
+        "others": sorted(others),
+    }
+    store.write_text(folder / NAME, json.dumps(about, indent=1) + "\n")
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """The manifest of a folder; None where it has none.
+
+    Raises:
+        StoreError: it is damaged or none of ours.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError("too large")
+        found: dict[str, Any] = json.loads(path.read_bytes())
+        if (found["kind"], found["version"]) != (KIND, VERSION):
+            raise ValueError(
+                f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}"
+            )
+        entries = {
+            str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])}
+            for n, e in found["files"].items()
+        }
+        others = [str(name) for name in found.get("others", ())]
+        plain = {"finished": bool(found["finished"]), "command": str(found["command"])}
+        return found | plain | {"files": entries, "others": others}
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise StoreError(
+            f"{path}: damaged or no manifest of a metalens folder ({error}); make it again"
+        ) from None
+
+
+def check_manifest(folder: Path) -> None:
+    """Refuse a folder of ours that is unfinished or no longer what was written; one
+    without a manifest passes.
+
+    Files that were added since are left alone.
+
+    Raises:
+        StoreError: what is missing or differs, and what to do.
+    """
+    found = read_manifest(folder)
+    if found is None:
+        return
+    if not found["finished"]:
+        raise StoreError(
+            f"{folder} is unfinished: go on with --resume, or make it again"
+        )
+    for name, entry in found["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise StoreError(
+                f"{path} is missing; {NAME} lists it: make the folder again"
+            )
+        if (
+            path.stat().st_size != entry["bytes"]
+            or store.sha256(path) != entry["sha256"]
+        ):
+            raise StoreError(
+                f"{path} is not what was written (SHA-256 differs): make the folder again, or remove {NAME} to use it "
+                "as it stands"
+            )
+
+
+def sync_files(folder: Path) -> None:
+    """Flush a folder and all that is in it."""
+    for place, _, names in os.walk(folder):
+        for path in (*(Path(place, name) for name in names), Path(place)):
+            store.sync_file(path)
+
+
+def iterate_files(folder: Path) -> Iterator[str]:
+    """Names of all files below a folder, the manifest aside; folders that hold nothing
+    end in a slash.
+    """
+    for place, folders, names in os.walk(folder):
+        here = Path(place).relative_to(folder)
+        yield from (
+            (here / n).as_posix() for n in names if (here / n).as_posix() != NAME
+        )
+        yield from (
+            (here / n).as_posix()
+            for n in folders
+            if os.path.islink(os.path.join(place, n))
+        )
+
+
+def empty_folder(folder: Path) -> None:
+    """Remove all that is in a folder but its manifest."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != NAME:
+            path.unlink()
+
+
+def foreign_reason(path: Path) -> str:
+    """Why a file or folder may not be replaced as one of ours; '' where it may.
+
+    A folder is ours with a manifest and no file beyond those that it lists; a file by
+    its kind or mark.
+
+    Args:
+        path: of what stands there.
+    """
+    if path.is_dir():
+        return _foreign_folder(path)
+    try:
+        with open(path, "rb") as file:
+            known = file.read(_ENDS)
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
+            known += file.read()
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    marked = any(known.startswith(first) and mark in known for first, mark in _MARKS)
+    return "" if marked or store.kind_of(path) else "was not made by metalens"
+
+
+def _foreign_folder(path: Path) -> str:
+    present = set(iterate_files(path))
+    if not present and not (path / NAME).exists():
+        return ""
+    try:
+        found = read_manifest(path)
+    except StoreError as error:
+        return str(error)
+    if found is None:
+        return f"holds {min(present)} and no {NAME}: not made by metalens"
+    others = present - found["files"].keys()
+    if found["finished"] and others:
+        return f"holds {min(others)}, which metalens did not make"
+    return ""
+
+
+def unlisted_files(folder: Path) -> set[str]:
+    """Files that neither the manifest of a folder lists nor that of a folder inside it.
+
+    Raises:
+        StoreError: a manifest is damaged.
+    """
+    present = set(iterate_files(folder))
+    for place in (folder, *(path.parent for path in folder.rglob(NAME))):
+        found, inside = read_manifest(place), place.relative_to(folder)
+        present -= (
+            {(inside / name).as_posix() for name in (*found["files"], NAME)}
+            if found
+            else set()
+        )
+    return present

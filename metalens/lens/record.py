@@ -11,11 +11,10 @@ import h5py
 import numpy as np
 
 from metalens.cell import Cell
-from metalens.core import records, store
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.core.reading import read_hdf5, typed_reader
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.lens.diameters import DiameterMap as DiameterMap
 from metalens.lens.neighbours import NeighbourRows
 from metalens.lens.pairs import TwoSizeTable
@@ -196,7 +195,7 @@ def save(path: str | Path, lens: Lens) -> None:
     Args:
         path: target, replaced atomically.
     """
-    records.save_record(path, "lens", lens)
+    store.save_record(path, "lens", lens)
 
 
 @typed_reader
@@ -209,7 +208,7 @@ def load(path: str | Path) -> Lens:
     Raises:
         StoreError: not a lens file; LensError: its diameters are invalid.
     """
-    return records.load_record(path, "lens", Lens)
+    return store.load_record(path, "lens", Lens)
 
 
 @typed_reader
@@ -250,13 +249,13 @@ def load_out_of_core(path: str | Path) -> Lens:
     """
     large = False
     if Path(path).is_file():  # what else it is tells the loader, and what is damaged
-        with contextlib.suppress(*store.DAMAGE):
-            large = read_hdf5(path, lambda f: f[_NAME].nbytes) > MOST_HELD_BYTES
+        with contextlib.suppress(*store.DAMAGE), h5py.File(path, "r") as file:
+            large = file[_NAME].nbytes > MOST_HELD_BYTES
     if not large:
         return load(path)
     stored = store.load(path, "lens", without=(_NAME,))
     file = h5py.File(path, "r", rdcc_nbytes=MOST_HELD_BYTES)
     arrays = {**stored.arrays, _NAME: file[_NAME]}
-    return records.build_record(
+    return store.build_record(
         Lens, arrays, stored.attributes, where=str(path), provenance=stored.provenance
     )

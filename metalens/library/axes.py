@@ -14,12 +14,11 @@ from scipy.ndimage import map_coordinates, maximum_filter
 
 from metalens.cell import Cell
 from metalens.cell.shapes import Ellipse, Rectangle
-from metalens.core import config, records
+from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
-from metalens.core.reading import typed_reader
 from metalens.core.report import Console
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.library import rational, workers
 from metalens.library.record import Sweep, check_light
 from metalens.library.workers import SweepJournal
@@ -208,7 +207,7 @@ def save(path: str | Path, library: AxesLibrary) -> None:
     Args:
         path: target, replaced atomically.
     """
-    records.save_record(path, KIND, library)
+    store.save_record(path, KIND, library)
 
 
 @typed_reader
@@ -221,7 +220,7 @@ def load(path: str | Path) -> AxesLibrary:
     Raises:
         StoreError: not such a file; DomainError: its arrays do not fit together.
     """
-    return records.load_record(path, KIND, AxesLibrary)
+    return store.load_record(path, KIND, AxesLibrary)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -12,11 +12,10 @@ from typing import Literal
 import numpy as np
 
 from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
-from metalens.core import records
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
-from metalens.core.reading import typed_reader
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.library.geometric_phase import GeometricPhase, check_geometric_phase
 from metalens.library.proxy import MOST_ERROR, Proxy
 
@@ -316,7 +315,7 @@ def save(path: str | Path, library: PillarLibrary) -> None:
     Args:
         path: target, replaced atomically.
     """
-    records.save_record(path, "library", library)
+    store.save_record(path, "library", library)
 
 
 @typed_reader
@@ -329,4 +328,4 @@ def load(path: str | Path) -> PillarLibrary:
     Raises:
         StoreError: not a library file; DomainError: its arrays do not fit together.
     """
-    return records.load_record(path, "library", PillarLibrary)
+    return store.load_record(path, "library", PillarLibrary)

@@ -12,7 +12,8 @@ import numpy as np
 
 from metalens import __version__
 from metalens.cell import Cell, Incidence, Response, materials
-from metalens.core import config, executor, manifest, reading, store
+from metalens.core import config, executor, store
+from metalens.core.errors import StoreError
 from metalens.core.report import Console
 from metalens.library import curve as reduced
 from metalens.library.curve import ResponseCurve, SolvedNodes
@@ -260,12 +261,12 @@ class SweepJournal:
     def __init__(self, path: Path | None, *about: Any) -> None:
         self._path = path
         self._known: dict[str, Result] = {}
-        self._read = {file: reading.file_stamp(file) for file in material_files(about)}
+        self._read = {file: store.sha256(file) for file in material_files(about)}
         if path is not None:
-            read = {str(file): reading.sha256(file) for file in self._read}
+            read = {str(file): digest for file, digest in self._read.items()}
             title = json.dumps([__version__, *map(config.dumps, about), read])
             self._known = dict(
-                filter(None, map(_entry, manifest.open_journal(path, title)))
+                filter(None, map(_entry, store.open_journal(path, title)))
             )
 
     def run(self, tasks: list[Task], console: Console, label: str) -> list[Result]:
@@ -283,7 +284,8 @@ class SweepJournal:
 
     def _keep(self, key: str, result: Result) -> None:
         for file, before in self._read.items():  # workers read them anew
-            reading.check_same(file, before)
+            if store.sha256(file) != before:
+                raise StoreError(f"{file} was changed or replaced: run again")
         self._known[key] = result
         if self._path is not None:
             store.append_line(self._path, json.dumps([key, result]))

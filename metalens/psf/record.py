@@ -11,8 +11,7 @@ import numpy as np
 
 from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.core.reading import typed_reader
-from metalens.core.store import Provenance
+from metalens.core.store import Provenance, typed_reader
 from metalens.propagate import axis_positions
 from metalens.psf.budget import Budget
 

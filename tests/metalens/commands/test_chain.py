@@ -11,7 +11,7 @@ import pytest
 from metalens.commands import chain, demo
 from metalens.commands.chain import ChainFiles
 from metalens.commands.design import DesignSettings
-from metalens.core import config, manifest
+from metalens.core import config, transaction
 from metalens.core.errors import ConfigError
 
 
@@ -323,7 +323,7 @@ def test_nothing_of_other_settings_stays_where_no_stage_was_finished(
         "design.toml",
         "process.toml",
         demo.OUTCOMES,
-        manifest.NAME,
+        transaction.NAME,
     }
 
 

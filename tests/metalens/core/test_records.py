@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from metalens.core import records, store
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import StoreError
 from metalens.core.store import Provenance
@@ -65,8 +65,8 @@ def whole(**changes):
 )
 def test_a_record_comes_back_from_its_file(tmp_path, changes):
     path, made = tmp_path / "a.h5", whole(**changes)
-    records.save_record(path, "whole", made)
-    back = records.load_record(path, "whole", Whole)
+    store.save_record(path, "whole", made)
+    back = store.load_record(path, "whole", Whole)
     for name in ("settings", "names", "pairs", "by_name", "count"):
         assert getattr(back, name) == getattr(made, name), name
     assert np.array_equal(back.part.values, made.part.values)
@@ -83,8 +83,8 @@ def test_a_record_comes_back_from_its_file(tmp_path, changes):
 
 
 def test_a_missing_entry_is_refused_by_name(tmp_path):
-    arrays, attributes = records.flatten_record(whole())
+    arrays, attributes = store.flatten_record(whole())
     del attributes["part/share"]
     store.save(tmp_path / "a.h5", "whole", arrays, attributes=attributes)
     with pytest.raises(StoreError, match="part/share"):
-        records.load_record(tmp_path / "a.h5", "whole", Whole)
+        store.load_record(tmp_path / "a.h5", "whole", Whole)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from metalens.core import manifest, store, transaction
+from metalens.core import store, transaction
 from metalens.core.errors import OutputError, StoreError
 from metalens.core.transaction import ClaimTerms
 
@@ -53,11 +53,11 @@ def test_a_folder_appears_whole_with_its_manifest(tmp_path):
         (draft.path / "sub").mkdir()
         (draft.path / "sub" / "b.txt").write_text("two")
         assert not (tmp_path / "out").exists()
-    found = manifest.read_manifest(tmp_path / "out")
+    found = transaction.read_manifest(tmp_path / "out")
     assert list(found["files"]) == ["sub/b.txt"]
     assert found["files"]["sub/b.txt"]["bytes"] == 3
     assert sorted(os.listdir(tmp_path)) == ["out"]
-    manifest.check_manifest(tmp_path / "out")
+    transaction.check_manifest(tmp_path / "out")
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
@@ -177,12 +177,12 @@ def test_long_work_survives_an_interruption_and_goes_on(tmp_path):
     assert "--resume" in stopped.value.__notes__[0]
     assert (target / "old").read_text() == "old"
     with pytest.raises(StoreError, match="unfinished"):
-        manifest.check_manifest(draft.path)
+        transaction.check_manifest(draft.path)
     with transaction.claim_long_work(target, keep=keep, resume=True) as draft:
         assert draft.resumed
         (draft.path / "end").write_text((draft.path / "check").read_text())
     assert sorted(os.listdir(tmp_path)) == ["run"]
-    assert sorted(manifest.read_manifest(target)["files"]) == ["check", "end"]
+    assert sorted(transaction.read_manifest(target)["files"]) == ["check", "end"]
 
 
 def test_long_work_without_anything_to_keep_leaves_nothing(tmp_path):
@@ -231,7 +231,7 @@ def test_what_others_put_into_a_folder_stays_theirs_when_the_work_on_it_goes_on(
             (draft.path / "more").write_text(str(turn))
             if turn == 1:
                 raise KeyboardInterrupt
-    found = manifest.read_manifest(target)
+    found = transaction.read_manifest(target)
     assert set(found["files"]) == {"ours", "more", "part/inner", "part/manifest.json"}
     assert found["others"] == ["notes.txt", "part/photo.jpg"]
     with pytest.raises(OutputError, match=r"notes\.txt, which metalens did not make"):
@@ -252,7 +252,7 @@ def test_a_folder_of_others_does_not_grow(tmp_path):
     put(tmp_path / "thesis" / "part", inner="ours")
     with transaction.claim_long_work(tmp_path / "thesis", keep=(), grow=True) as draft:
         (draft.path / "more").write_text("x")
-    assert set(manifest.read_manifest(tmp_path / "thesis")["files"]) == {
+    assert set(transaction.read_manifest(tmp_path / "thesis")["files"]) == {
         "more",
         "part/inner",
         "part/manifest.json",
@@ -262,24 +262,25 @@ def test_a_folder_of_others_does_not_grow(tmp_path):
 def test_a_changed_folder_is_refused_by_name(tmp_path):
     put(tmp_path / "out", a="1", b="2")
     (tmp_path / "out" / "added").write_text("a note")
-    manifest.check_manifest(tmp_path / "out")
+    transaction.check_manifest(tmp_path / "out")
     (tmp_path / "out" / "a").write_text("3")
     with pytest.raises(StoreError, match="a is not what was written"):
-        manifest.check_manifest(tmp_path / "out")
+        transaction.check_manifest(tmp_path / "out")
     (tmp_path / "out" / "a").unlink()
     with pytest.raises(StoreError, match="a is missing"):
-        manifest.check_manifest(tmp_path / "out")
+        transaction.check_manifest(tmp_path / "out")
     for text in ("{", "[]", json.dumps({"kind": "metalens folder"}), "[" * 100_000):
-        (tmp_path / "out" / manifest.NAME).write_text(text)
+        (tmp_path / "out" / transaction.NAME).write_text(text)
         with pytest.raises(StoreError, match="no manifest"):
-            manifest.check_manifest(tmp_path / "out")
+            transaction.check_manifest(tmp_path / "out")
 
 
 def test_scratch_files_of_the_dead_are_cleared_by_the_next_save(tmp_path):
-    (tmp_path / ".f.h5.abc.part").write_text("half")
-    (tmp_path / ".g.h5.abc.part").write_text("of another file")
+    (tmp_path / ".f.h5.part").write_text("half")
+    (tmp_path / ".f.h5.lock").write_text("1 psf lens.h5")
+    (tmp_path / ".g.h5.part").write_text("of another file")
     store.save(tmp_path / "f.h5", "lens", {})
-    assert sorted(os.listdir(tmp_path)) == [".g.h5.abc.part", "f.h5"]
+    assert sorted(os.listdir(tmp_path)) == [".g.h5.part", "f.h5"]
 
 
 CLEARED_HALF = """
@@ -339,13 +340,13 @@ def test_kills_at_random_moments_mix_nothing_and_leave_nothing(tmp_path, kind):
         child.wait()
         child.stdout.close()
         if kind == "folder" and (work / "out").exists():
-            manifest.check_manifest(work / "out")
+            transaction.check_manifest(work / "out")
             assert (
                 len(
                     {
                         p.read_text()
                         for p in (work / "out").iterdir()
-                        if p.name != manifest.NAME
+                        if p.name != transaction.NAME
                     }
                 )
                 == 1

@@ -5,7 +5,7 @@ polarisation, and nothing between.
 import numpy as np
 import pytest
 
-from metalens.core import records
+from metalens.core import store
 from metalens.core.errors import DomainError, LensError
 from metalens.lens.pairs import TwoSizeTable
 
@@ -67,8 +67,8 @@ def test_a_table_of_another_shape_or_not_finite_is_refused():
 
 
 def test_it_comes_back_from_arrays_and_stands_where_a_proxy_does():
-    back = records.build_record(
-        TwoSizeTable, *records.flatten_record(pairs()), where="a file"
+    back = store.build_record(
+        TwoSizeTable, *store.flatten_record(pairs()), where="a file"
     )
     assert back.focus_y_um == (210.0, 900.0)
     for name in ("wavelength_um", "x_um", "y_um", "t"):

@@ -11,7 +11,7 @@ import pytest
 from metalens import library, rcwa
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Square
-from metalens.core import records
+from metalens.core import store
 from metalens.core.errors import CellError, ConfigError
 from metalens.library import ProxyTolerances, Sweep, fit
 from metalens.library.geometric_phase import (
@@ -95,8 +95,8 @@ def test_shares_and_bars_are_those_worked_out_by_hand():
     )
     assert found.unconverted(-1.0)[0] == pytest.approx(0.05**2)
     assert found.model_error == pytest.approx(0.02)
-    again = records.build_record(
-        GeometricPhase, *records.flatten_record(found), where="a file"
+    again = store.build_record(
+        GeometricPhase, *store.flatten_record(found), where="a file"
     )
     assert (again.size_um, again.model_error) == (found.size_um, found.model_error)
     assert again.efficiency(1.0) == found.efficiency(1.0)

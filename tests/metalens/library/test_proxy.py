@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from metalens.core import records
+from metalens.core import store
 from metalens.core.errors import DomainError
 from metalens.library.proxy import Proxy
 
@@ -241,7 +241,7 @@ def test_inverse_refuses_what_has_no_single_answer():
 
 def test_store_round_trip():
     p = proxy(power=3)
-    q = records.build_record(Proxy, *records.flatten_record(p), where="a file")
+    q = store.build_record(Proxy, *store.flatten_record(p), where="a file")
     assert (q.domain_um, q.wavelengths_um, q.power) == (
         p.domain_um,
         p.wavelengths_um,
