@@ -56,9 +56,7 @@ def _curves() -> list[Row]:
         start = time.perf_counter()
         nodes = reduced.sample_adaptively(_exact, *SPAN, tolerance=tolerance)
         seconds = time.perf_counter() - start
-        silent = reduced.SolvedNodes(
-            nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, ""
-        )
+        silent = reduced.SolvedNodes(nodes.diameter_um, nodes.response, 0 * nodes.error)
         value, estimate = reduced.fit_response_curve(silent, tolerance=tolerance)(d)
         error = np.abs(value[:, 0] - exact)
         held = f"{int((error <= estimate).sum())} of {HELD_OUT} held-out diameters within their estimate"

@@ -12,12 +12,12 @@ from torch.autograd import forward_ad
 
 from metalens.core.arrays import Array
 from metalens.core.threads import run_split
-from metalens.lens import answers
+from metalens.lens import response
 from metalens.propagate import sincos_turns32
 
 # compiled loops know names of their own module
-PART: int = answers.PART
-put: Any = answers.evaluate_row  # type: ignore[has-type]
+PART: int = response.PART
+put: Any = response.evaluate_row  # type: ignore[has-type]
 
 
 def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
@@ -90,14 +90,14 @@ def _power(field, out):  # type: ignore[no-untyped-def]
 def cells(
     diameter_um: Array,
     ideal_rad: Array,
-    polynomials: answers.Polynomials,
+    polynomials: response.Polynomials,
     block: tuple[int, int, int],
 ) -> Array:
     """(3, cells y, cells x) float32 means over square cells of |T| cos(φ - ideal), |T| sin(φ - ideal), and of pillars.
 
     Args:
         ideal_rad: (y, x) float32. polynomials: of the diameters, by
-            :func:`metalens.lens.answers.response_polynomials`.
+            :func:`metalens.lens.response.response_polynomials`.
         block: pillars along a cell, and rows and columns of the first one that lie
             before the map.
     """
@@ -113,7 +113,7 @@ def cells(
     return out
 
 
-@numba.njit(cache=True, fastmath=answers.FASTMATH, nogil=True, error_model="numpy")
+@numba.njit(cache=True, fastmath=response.FASTMATH, nogil=True, error_model="numpy")
 def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped-def]
     """Some rows of cells; sums of a row of them are held in float64."""
     side, top, left = block

@@ -16,7 +16,7 @@ from metalens.core.errors import SceneError
 from metalens.design import Focus
 from metalens.image import compiled
 from metalens.image.compiled import is_plain_value
-from metalens.lens import Lens, answers
+from metalens.lens import Lens, response
 from metalens.optics import Layers, Media, interpolant, media
 from metalens.psf import among
 
@@ -257,7 +257,7 @@ class PillarWave:
         open_ = (d > 0).to(torch.float32)
         if is_plain_value(d):
             phases, levels = torch.empty(2, *d.shape)
-            answers.fill_response_of(
+            response.fill_response_of(
                 proxy,
                 d.detach().numpy(),
                 (wavelength_um, tilt),
@@ -283,7 +283,7 @@ class PillarWave:
         if self.lens.neighbours is None and is_plain_value(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
-            known = answers.response_polynomials(self.lens.proxy, sizes, at)
+            known = response.response_polynomials(self.lens.proxy, sizes, at)
             mean = torch.from_numpy(
                 compiled.cells(sizes, self._ideal.numpy(), known, block)
             )

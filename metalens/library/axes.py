@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import map_coordinates, maximum_filter
 
-from metalens.cell import Cell
+from metalens.cell import Cell, Incidence
 from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.core import config, store
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError, DomainError
 from metalens.core.report import Console
 from metalens.core.store import Provenance, typed_reader
-from metalens.library import rational, workers
+from metalens.library import rational
 from metalens.library.record import Sweep, check_light
-from metalens.library.workers import SweepJournal
+from metalens.library.workers import SweepJournal, Task
 
 KIND = "axes-library"
 FLOOR_SHARE = 0.05  # of the tolerance: in every doubt, for what neither order shows
@@ -337,21 +337,23 @@ class _Nodes:
                 if self._first(pair) not in self._known
             )
         )
+        light = (Incidence(self._wavelength),)
         tasks = [
-            workers.jones_task(
+            Task(
+                "jones",
                 cell_of_sizes(self._cell, x, y),
-                x,
-                self._wavelength,
-                tolerance=self._tolerance,
-                reach=self._reach,
+                light,
+                (x,),
+                self._tolerance,
+                harmonics=self._reach,
             )
             for x, y in left
         ]
-        for pair, result in zip(
+        for pair, (made,) in zip(
             left, self._journal.run(tasks, console, label), strict=True
         ):
-            t = (np.array(result["t"]) @ (1, 1j)).reshape(2, 2)
-            self._known[pair] = SolvedPillar(t, max(result["error"]))
+            t = made.response[:, 0].reshape(2, 2)
+            self._known[pair] = SolvedPillar(t, float(made.error.max()))
         self.solves += len(left)
         return [self._of(pair) for pair in pairs]
 

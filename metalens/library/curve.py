@@ -4,6 +4,7 @@ dozen exact solves.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,7 @@ FINEST_UM = 2e-5
 class SolvedNodes:
     """Exact solves of one curve, in the order they were made.
 
-    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver. energy:
-        (n,).
+    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver.
     converged: whether the last nodes were predicted within the tolerance; reason: why
         the search stopped.
     """
@@ -39,9 +39,26 @@ class SolvedNodes:
     diameter_um: Array
     response: Array
     error: Array
-    energy: Array
-    converged: bool
-    reason: str
+    converged: bool = True
+    reason: str = ""
+
+    def to_json(self) -> list[Any]:
+        """Lists of numbers, whose text gives the same numbers back."""
+        columns = self.diameter_um, self.response.view(float), self.error
+        return [*(one.tolist() for one in columns), self.converged, self.reason]
+
+    @classmethod
+    def from_json(cls, row: list[Any]) -> "SolvedNodes":
+        """Inverse of :meth:`to_json`.
+
+        Raises:
+            ValueError: columns of different lengths.
+        """
+        diameters, parts, errors, converged, reason = row
+        if not len(diameters) == len(parts) == len(errors):
+            raise ValueError("columns of different lengths")
+        response = np.array(parts).view(complex)
+        return cls(np.array(diameters), response, np.array(errors), converged, reason)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,13 +227,8 @@ def sample_adaptively(
         if calm == CALM
         else f"{most} solves do not meet {tolerance:g}"
     )
-    errors, energies = (
-        np.array([m.t_error for m in made]),
-        np.array([m.energy for m in made]),
-    )
-    return SolvedNodes(
-        np.array(x), _responses(made), errors, energies, calm == CALM, reason
-    )
+    errors = np.array([m.t_error for m in made])
+    return SolvedNodes(np.array(x), _responses(made), errors, calm == CALM, reason)
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:

@@ -4,6 +4,7 @@ diameter.
 
 import functools
 import importlib
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -54,9 +55,7 @@ def solve_to_tolerance(
         light: plane wave that comes.
         engine: auto, rcwa or modal.
     """
-    if engine == "modal":
-        return functools.partial(_solve, "modal", cell, light, {"tolerance": tolerance})
-    return functools.partial(_solve, "rcwa", cell, light, {"tolerance": tolerance})
+    return functools.partial(_solve, engine, cell, light, {"tolerance": tolerance})
 
 
 def solver_at_fixed_discretization(
@@ -123,7 +122,7 @@ def solvers_at_common_discretization(
     probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
     allowed = 1 if engine == "modal" else 0
     for place, level in enumerate(levels[:-1]):
-        if all(_failing(at, probes, allowed) <= allowed for at in level):
+        if all(_meets(at, probes, allowed) for at in level):
             taken = levels[place : place + MESHES] if engine == "modal" else [level]
             return [_first_converged(meshes) for meshes in zip(*taken, strict=True)]
     return list(levels[-1])
@@ -151,16 +150,12 @@ def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> 
     return not cell.round and bool(errors[PROBES].max() > tolerance)
 
 
-def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:
-    """How many probes miss the tolerance, counted no further than one more than are
-    allowed.
+def _meets(at: Callable[[float], Response], probes: list[float], allowed: int) -> bool:
+    """Whether no more probes than are allowed miss the tolerance; no more are solved
+    than it takes to know.
     """
-    failing = 0
-    for diameter_um in probes:
-        failing += not at(diameter_um).converged
-        if failing > allowed:
-            break
-    return failing
+    missing = (probe for probe in probes if not at(probe).converged)
+    return next(itertools.islice(missing, allowed, None), None) is None
 
 
 def _first_converged(

@@ -13,12 +13,12 @@ from metalens.cell import Blend, Cell, Incidence, Material, index, materials
 from metalens.core.arrays import Array
 from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import Console
-from metalens.library import engines, workers
+from metalens.library import engines
 from metalens.library.curve import ResponseCurve
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
 from metalens.library.stretch import REACH, UNKNOWN
-from metalens.library.workers import SweepJournal
+from metalens.library.workers import SweepJournal, Task, fit_curves
 
 TURN = 2 * math.pi
 SAMPLES = 600
@@ -198,24 +198,22 @@ def _judged(
     console: Console,
 ) -> list[CellVerdict]:
     """One rational curve t(D) a case, on all cores."""
-    tasks = []
-    for cell, wavelength in cases:
-        span = _span(study, cell)
-        engine = engines.choose_engine(cell)
-        tasks.append(
-            workers.curves_task(
-                cell,
-                [Incidence(wavelength)],
-                span,
-                tolerance=study.tolerance,
-                engine=engine,
-            )
+    tasks = [
+        Task(
+            "curves",
+            cell,
+            (Incidence(wavelength),),
+            _span(study, cell),
+            study.tolerance,
+            engines.choose_engine(cell),
         )
-    found = journal.run(tasks, console, "cells")
-    made = [workers.solve_curves(one, tolerance=study.tolerance)[0] for one in found]
-    return [
-        judge_cell(study, *case, curve) for case, curve in zip(cases, made, strict=True)
+        for cell, wavelength in cases
     ]
+    verdicts = []
+    for case, solved in zip(cases, journal.run(tasks, console, "cells"), strict=True):
+        (curve,) = fit_curves(solved, tolerance=study.tolerance)
+        verdicts.append(judge_cell(study, *case, curve))
+    return verdicts
 
 
 def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:

@@ -1,38 +1,39 @@
-"""Run a library sweep: one rational curve t(D) for every wavelength, angle and
-polarisation, on all cores.
+"""Run a library sweep: rational curves t(D) at a few wavelengths and angles, polynomials
+between them, single solves where neither meets the tolerance.
 """
 
 import dataclasses
-import itertools
 import math
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
-from metalens.cell import Cell, Incidence
+from metalens.cell import Cell, Incidence, Polarization
 from metalens.core import config
 from metalens.core.arrays import Array
 from metalens.core.report import Console
 from metalens.core.store import Provenance
-from metalens.library import engines, few_nodes, workers
+from metalens.library import engines, workers
 from metalens.library.curve import ResponseCurve
-from metalens.library.few_nodes import Rows
 from metalens.library.geometric_phase import solve_rotations
 from metalens.library.record import PillarLibrary, Sweep, check_sweep
-from metalens.library.workers import Result, SweepJournal, Task
+from metalens.library.workers import SweepJournal, Task
 
-AROUND = (
-    -3.0,
-    -1.0,
-    -0.3,
-    0.3,
-    1.0,
-    3.0,
-)  # half-widths from a resonance where diameters are added
+Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
+# half-widths from a resonance at which diameters are added
+AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)
 FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
 MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
 WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
+ALL_UP_TO = 6  # values of an axis that are all solved
+NODES = 5  # to begin with where there are more
+# half-width of a resonance that may lie between two nodes and show at neither
+NARROW_UM = 0.005
+MOVES_UM = 0.02  # how far it may move between two nodes
+NEIGHBOURS = 4  # diameters on either side whose changes count
+SAFETY = 3.0  # on the extrapolated error of a polynomial
 
 
 def sweep(
@@ -59,98 +60,183 @@ def sweep(
     if wavelengths_um is not None:
         settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
     check_sweep(cell, settings)
-    settings = settings.settled(cell)
-    return _run(cell, settings, console=console, checkpoint=checkpoint)
+    work = _SweepRun(cell, settings.settled(cell), console, checkpoint)
+    return work.library()
 
 
-def _run(
-    cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path | None
-) -> PillarLibrary:
-    """The library of a sweep that was checked.
+class _SweepRun:
+    """The curves of a sweep that was checked, by plane wave."""
 
-    Curves are solved at a few wavelengths and angles first; those that polynomials
-    between them do not give within the tolerance are solved too, and single entries
-    that are still above it one by one.
-    """
-    console = console or Console(quiet=True)
-    engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
-    journal = SweepJournal(checkpoint, cell, sweep)
-    span = sweep.span_um(cell)
-    normal = few_nodes.ALIKE if cell.alike else few_nodes.UNLIKE
+    def __init__(
+        self, cell: Cell, sweep: Sweep, console: Console | None, checkpoint: Path | None
+    ) -> None:
+        self.cell, self.sweep, self.span = cell, sweep, sweep.span_um(cell)
+        self.console = console or Console(quiet=True)
+        self.engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
+        self.journal = SweepJournal(checkpoint, cell, sweep)
+        self.curves: dict[Incidence, ResponseCurve] = {}
 
-    def solved(lights: list[Incidence], label: str) -> dict[Incidence, ResponseCurve]:
-        groups = _together(lights, engines.has_upright_walls(cell, engine))
+    def library(self) -> PillarLibrary:
+        """Curves are solved at a few wavelengths and angles first; those that
+        polynomials between them do not give within the tolerance are solved too, and
+        single entries that are still above it one by one.
+        """
+        sweep = self.sweep
+        nodes = pick_nodes(sweep.wavelengths_um), pick_nodes(sweep.angles_deg)
+        self.solve(
+            [
+                self.wave(wavelength, angle, polarization)
+                for angle in nodes[1]
+                for polarization in sweep.polarizations
+                for wavelength in nodes[0]
+            ],
+            "curves",
+        )
+        diameters = _diameters(self.span, sweep.samples, list(self.curves.values()))
+        rows = self.rows(diameters)
+        weak = [
+            light
+            for light, row in rows.items()
+            if light not in self.curves and self.misses(row).sum() > WORTH_A_CURVE
+        ]
+        if weak:
+            self.solve(weak, "more curves")
+            rows = self.rows(diameters)
+        points = self.points(diameters, rows)
+        solved = self.journal.run(points, self.console, "entries one by one")
+        for task, (made,) in zip(points, solved, strict=True):
+            row, place = (
+                rows[task.lights[0]],
+                np.searchsorted(diameters, made.diameter_um),
+            )
+            better = made.error < row[2, place].real
+            values = np.concatenate([made.response.T, made.error[None]])
+            row[:, place[better]] = values[:, better]
+        count = sum(len(one.nodes.diameter_um) for one in self.curves.values())
+        count += sum(len(task.sizes_um) for task in points)
+        found = self.record(diameters, rows, count)
+        self.journal.finish()
+        return found
+
+    def wave(
+        self, wavelength_um: float, angle_deg: float, polarization: Polarization
+    ) -> Incidence:
+        """The plane wave of an entry. At normal incidence s and p are x and y: of cells
+        that are alike for both x alone, of others s is y (the plane of incidence is
+        along x).
+        """
+        if not angle_deg and polarization in ("s", "p"):
+            along_y = polarization == "s" and not self.cell.alike
+            polarization = "y" if along_y else "x"
+        return Incidence(wavelength_um, math.radians(angle_deg), polarization)
+
+    def solve(self, lights: list[Incidence], label: str) -> None:
+        """Add the curves of some plane waves.
+
+        Those of one wavelength and direction share their work in one task where the
+        solver can. Oblique light comes first: it takes several times as long as normal
+        incidence, which then fills the end.
+        """
+        share = engines.has_upright_walls(self.cell, self.engine)
+        groups: dict[object, list[Incidence]] = {}
+        for one in sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad):
+            key = (one.wavelength_um, one.angle_rad) if share else one
+            groups.setdefault(key, []).append(one)
+        about = self.sweep.bar, self.engine
         tasks = [
-            workers.curves_task(cell, some, span, tolerance=sweep.bar, engine=engine)
-            for some in groups
+            Task("curves", self.cell, tuple(group), self.span, *about)
+            for group in groups.values()
         ]
-        results = journal.run(tasks, console, label)
-        made = [
-            curve
-            for one in results
-            for curve in workers.solve_curves(one, tolerance=sweep.bar)
-        ]
-        return dict(zip(itertools.chain(*groups), made, strict=True))
+        for task, solved in zip(
+            tasks, self.journal.run(tasks, self.console, label), strict=True
+        ):
+            made = workers.fit_curves(solved, tolerance=self.sweep.bar)
+            self.curves |= dict(zip(task.lights, made, strict=True))
 
-    first = few_nodes.sweep_plane_waves(
-        sweep,
-        few_nodes.pick_nodes(sweep.wavelengths_um),
-        few_nodes.pick_nodes(sweep.angles_deg),
-        normal,
-    )
-    curves = solved(first, "curves")
-    diameters = _diameters(span, sweep.samples, list(curves.values()))
-    rows = {light: _evaluate(curve, diameters) for light, curve in curves.items()}
-    full = few_nodes.complete_sweep(sweep, rows, _poles(curves), diameters, normal)
-    weak = [
-        light
-        for light, row in full.items()
-        if light not in curves and _misses(row, sweep).sum() > WORTH_A_CURVE
-    ]
-    if weak:
-        more = solved(weak, "more curves")
-        curves |= more
-        rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
-        full = few_nodes.complete_sweep(sweep, rows, _poles(curves), diameters, normal)
-    extra = _points(cell, sweep, engine, diameters, full, curves)
-    for task, result in zip(
-        extra, journal.run(extra, console, "entries one by one"), strict=True
-    ):
-        _replace(full[Incidence(*task["lights"][0])], diameters, result)
-    solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(
-        len(t["diameters_um"]) for t in extra
-    )
-    made = _library(cell, sweep, (engine, solves), diameters, curves, full, normal)
-    journal.finish()
-    return made
+    def misses(self, row: Array) -> Array:
+        """Entries of a row whose error is above the tolerance."""
+        return np.asarray(row[2].real > self.sweep.bar)
 
+    def rows(self, diameters: Array) -> Rows:
+        """All rows of the sweep: those of the curves, then between wavelengths, then
+        between angles.
+        """
+        rows: Rows = {}
+        sharp = {}
+        for light, curve in self.curves.items():
+            value, error = curve(diameters)
+            rows[light] = np.stack([value[:, 0], value[:, 1], error])
+            sharp[light] = curve.resonances(NARROW_UM)
+        sweep = self.sweep
+        for polarization in sweep.polarizations:
+            for angle in sweep.angles_deg:
+                family = {
+                    w: self.wave(w, angle, polarization) for w in sweep.wavelengths_um
+                }
+                _interpolate_family(rows, family, sharp, diameters)
+            for wavelength in sweep.wavelengths_um:
+                family = {
+                    math.sin(math.radians(a)) ** 2: self.wave(
+                        wavelength, a, polarization
+                    )
+                    for a in sweep.angles_deg
+                }
+                _interpolate_family(rows, family, sharp, diameters)
+        return rows
 
-def _together(lights: list[Incidence], share: bool) -> list[list[Incidence]]:
-    """Where lights of one wavelength and direction share their work, these in one task,
-    else each in its own.
+    def points(self, diameters: Array, rows: Rows) -> list[Task]:
+        """Tasks for the entries whose error bar is above the tolerance, but where a
+        solve by itself is no better.
+        """
+        tasks = []
+        for light, row in rows.items():
+            misses, bar = self.misses(row), self.sweep.bar
+            curve = self.curves.get(light)
+            if curve and engines.is_at_finest_discretization(
+                self.cell, curve.nodes.error, bar * workers.SOLVE_SHARE
+            ):
+                misses &= curve.solver_error(diameters) <= bar
+            bad = diameters[misses].tolist()
+            for start in range(0, len(bad), POINTS):
+                some = tuple(bad[start : start + POINTS])
+                tasks.append(
+                    Task("points", self.cell, (light,), some, bar, self.engine)
+                )
+        return tasks
 
-    Oblique light comes first: it takes several times as long as normal incidence, which
-    then fills the end.
-    """
-    groups: dict[object, list[Incidence]] = {}
-    for one in sorted(lights, key=lambda light: -light.angle_rad):
-        groups.setdefault(
-            (one.wavelength_um, one.angle_rad) if share else one, []
-        ).append(one)
-    return list(groups.values())
-
-
-def _poles(curves: dict[Incidence, ResponseCurve]) -> dict[Incidence, Array]:
-    return {light: curve.resonances() for light, curve in curves.items()}
-
-
-def _misses(row: Array, sweep: Sweep) -> Array:
-    return np.asarray(row[2].real > sweep.bar)
-
-
-def _evaluate(curve: ResponseCurve, diameters: Array) -> Array:
-    value, error = curve(diameters)
-    return np.stack([value[:, 0], value[:, 1], error])
+    def record(self, diameters: Array, rows: Rows, solves: int) -> PillarLibrary:
+        """The library of all rows."""
+        sweep = self.sweep
+        axes = sweep.polarizations, sweep.angles_deg, sweep.wavelengths_um
+        shape = (*map(len, axes), len(diameters))
+        table = np.empty((3, *shape), complex)
+        resonances: list[tuple[float, ...]] = []
+        for i, j, k in np.ndindex(*shape[:3]):
+            light = self.wave(axes[2][k], axes[1][j], axes[0][i])
+            table[:, i, j, k] = rows[light]
+            if light in self.curves:
+                resonances += [
+                    (i, light.angle_rad, light.wavelength_um, *pole)
+                    for pole in self.curves[light].resonances()
+                ]
+        t, r = table[0], table[1]
+        text = config.dumps(self.cell) + "\n" + config.dumps(sweep)
+        return PillarLibrary(
+            self.cell,
+            sweep,
+            sweep.polarizations,
+            np.radians(sweep.angles_deg),
+            np.array(sweep.wavelengths_um),
+            diameters,
+            t,
+            r,
+            table[2].real.copy(),
+            np.abs(t) ** 2 + np.abs(r) ** 2,
+            np.array(resonances, float).reshape(-1, 5),
+            self.engine,
+            solves,
+            provenance=Provenance(config=text),
+        )
 
 
 def _diameters(
@@ -171,89 +257,117 @@ def _diameters(
     )
 
 
-def _points(
-    cell: Cell,
-    sweep: Sweep,
-    engine: str,
-    diameters: Array,
-    full: Rows,
-    curves: dict[Incidence, ResponseCurve],
-) -> list[Task]:
-    """Tasks for the entries whose error bar is above the tolerance, but where a solve
-    by itself is no better.
+def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
+    """The values to solve first: all of a few, else five Leja points.
+
+    Each is where the product of the distances to those before it is largest, which
+    keeps that product, the factor of the error of the polynomial through them, small
+    everywhere.
     """
-    tasks = []
-    for light, row in full.items():
-        misses = _misses(row, sweep)
-        if light in curves and engines.is_at_finest_discretization(
-            cell, curves[light].nodes.error, sweep.bar * workers.SOLVE_SHARE
-        ):
-            misses &= curves[light].solver_error(diameters) <= sweep.bar
-        bad = diameters[misses].tolist()
-        for start in range(0, len(bad), POINTS):
-            some = bad[start : start + POINTS]
-            tasks.append(
-                workers.points_task(
-                    cell, light, some, tolerance=sweep.bar, engine=engine
-                )
-            )
-    return tasks
+    if len(values) <= ALL_UP_TO:
+        return values
+    x = np.array(values)
+    chosen = [0, len(x) - 1]
+    while len(chosen) < NODES:
+        chosen.append(int(np.argmax(np.prod(np.abs(x[:, None] - x[chosen]), axis=1))))
+    return tuple(values[i] for i in sorted(chosen))
 
 
-def _replace(row: Array, diameters: Array, result: Result) -> None:
-    """Put single solves in place of the curve's values where their error is less."""
-    places: list[int] = np.searchsorted(
-        diameters, np.array(result["diameter_um"])
-    ).tolist()
-    for place, t, r, error in zip(
-        places, result["t"], result["r"], result["error"], strict=True
-    ):
-        if error < row[2, place].real:
-            row[:, place] = complex(*t), complex(*r), error
-
-
-def _library(
-    cell: Cell,
-    sweep: Sweep,
-    effort: tuple[str, int],
+def _interpolate_family(
+    rows: Rows,
+    family: dict[float, Incidence],
+    sharp: dict[Incidence, Array],
     diameters: Array,
-    curves: dict[Incidence, ResponseCurve],
-    full: Rows,
-    normal: few_nodes.Normal,
-) -> PillarLibrary:
-    shape = (
-        len(sweep.polarizations),
-        len(sweep.angles_deg),
-        len(sweep.wavelengths_um),
-        len(diameters),
+) -> None:
+    """Add the rows of a family (position: light) that are missing, where at least five
+    are there.
+
+    Where a narrow resonance moves from one node to the next, the diameters it passes
+    have an error of 1: they must be solved.
+    """
+    have = {x: wave for x, wave in family.items() if wave in rows}
+    if len(have) < NODES:
+        return
+    nodes, table = (
+        np.array(list(have)),
+        np.stack([rows[wave] for wave in have.values()]),
     )
-    t, r, error = np.empty(shape, complex), np.empty(shape, complex), np.empty(shape)
-    resonances = []
-    for i, j, k in np.ndindex(*shape[:3]):
-        light = few_nodes.plane_wave(
-            sweep.wavelengths_um[k], sweep.angles_deg[j], sweep.polarizations[i], normal
-        )
-        row = full[light]
-        t[i, j, k], r[i, j, k], error[i, j, k] = row[0], row[1], row[2].real
-        if light in curves:
-            poles = curves[light].resonances()
-            resonances += [
-                (i, light.angle_rad, light.wavelength_um, *pole) for pole in poles
-            ]
-    return PillarLibrary(
-        cell,
-        sweep,
-        sweep.polarizations,
-        np.radians(sweep.angles_deg),
-        np.array(sweep.wavelengths_um),
-        diameters,
-        t,
-        r,
-        error,
-        np.abs(t) ** 2 + np.abs(r) ** 2,
-        np.array(resonances, float).reshape(-1, 5),
-        *effort,
-        provenance=Provenance(config=config.dumps(cell) + "\n" + config.dumps(sweep)),
+    for x, wave in family.items():
+        if wave not in rows:
+            row = interpolate_row(nodes, table, x)
+            right = int(np.searchsorted(nodes, x))
+            first, second = (
+                sharp.get(have[float(nodes[i])], np.empty((0, 2)))
+                for i in (right - 1, right)
+            )
+            passed = _passed(first, second, diameters)
+            row[2] = np.where(passed, 1.0, row[2])
+            rows[wave] = row
+
+
+def _passed(first: Array, second: Array, diameters: Array) -> Array:
+    """Mask of the diameters that narrow resonances may pass between two neighbouring
+    nodes.
+    """
+    mask = np.zeros(len(diameters), bool)
+    for here, there in ((first, second), (second, first)):
+        for centre, width in here:
+            gap = np.abs(there[:, 0] - centre)
+            end = (
+                float(there[np.argmin(gap), 0])
+                if gap.size and gap.min() < MOVES_UM
+                else None
+            )
+            low, high = (
+                (centre - MOVES_UM, centre + MOVES_UM)
+                if end is None
+                else sorted((centre, end))
+            )
+            mask |= (diameters >= low - 4 * width) & (diameters <= high + 4 * width)
+    return mask
+
+
+def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
+    """(3, diameter) row at ``x`` by the polynomial through all nodes.
+
+    The error is extrapolated. Leaving out one node changes the row by the error of the
+    next lower degree, leaving out two by that of the degree below; where the second is
+    less than the first by some factor, the polynomial through all nodes is better by
+    that factor again. Changes are taken as the largest of neighbouring diameters, as
+    any one may vanish by chance; the result is trebled, and the errors of the nodes are
+    added as they enter.
+
+    nodes: (m,). table: (m, 3, diameter).
+    """
+    weights = lagrange_weights(nodes, x)
+    row: Array = np.tensordot(weights, table, 1)
+    one, two = np.zeros(table.shape[2]), np.zeros(table.shape[2])
+    for k in range(len(nodes)):
+        keep = np.arange(len(nodes)) != k
+        without = np.tensordot(lagrange_weights(nodes[keep], x), table[keep, 0], 1)
+        one = np.maximum(one, np.abs(without - row[0]))
+        for j in range(k):
+            fewer = keep & (np.arange(len(nodes)) != j)
+            two = np.maximum(
+                two,
+                np.abs(
+                    np.tensordot(lagrange_weights(nodes[fewer], x), table[fewer, 0], 1)
+                    - without
+                ),
+            )
+    one, two = (maximum_filter1d(change, 2 * NEIGHBOURS + 1) for change in (one, two))
+    gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
+    row[2] = SAFETY * gain * one + np.abs(weights) @ table[:, 2].real
+    return row
+
+
+def lagrange_weights(nodes: Array, x: float) -> Array:
+    """(m,) weights of the values at the nodes in the polynomial through them at ``x``."""
+    ratio = (x - nodes[None, :]) / (
+        nodes[:, None] - nodes[None, :] + np.eye(len(nodes))
+    )
+    return np.asarray(
+        np.prod(np.where(np.eye(len(nodes), dtype=bool), 1.0, ratio), axis=1)
     )
 
 

@@ -13,7 +13,7 @@ from metalens import propagate
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.store import Provenance
-from metalens.lens import Lens, answers
+from metalens.lens import Lens, response
 from metalens.optics import media
 from metalens.propagate import paths
 from metalens.psf import among
@@ -517,7 +517,7 @@ def all_maps(
     for wave, one, other in zip(
         nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True
     ):
-        answers.fill_response(
+        response.fill_response(
             lens, (float(wave), library_incidence(lens, angle_rad)), one, other
         )
     if lens.neighbours is None:

@@ -7,7 +7,7 @@ import pytest
 
 from metalens.core import store
 from metalens.core.errors import DomainError, LensError
-from metalens.lens.pairs import TwoSizeTable
+from metalens.lens.record import TwoSizeTable
 
 DRAW = np.random.default_rng(19)
 WAVES, X, Y = (

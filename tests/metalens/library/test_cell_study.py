@@ -10,10 +10,12 @@ import pytest
 from metalens import cli
 from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
+from metalens.core import executor
 from metalens.core.errors import CellError, ConfigError, MetalensError, StoreError
 from metalens.core.report import Console
 from metalens.library import plots, workers
 from metalens.library import study as cell_study
+from metalens.library.curve import SolvedNodes
 from metalens.library.study import CellStudy
 
 SMALL = CellStudy(
@@ -135,7 +137,9 @@ def test_what_cannot_be_solved_is_refused_before_any_cell_is(
     cell, others, says, monkeypatch
 ):
     monkeypatch.setattr(
-        workers, "run_tasks", lambda tasks: pytest.fail("cells were solved first")
+        executor,
+        "run_parallel",
+        lambda work, tasks: pytest.fail("cells were solved first"),
     )
     with pytest.raises(MetalensError, match=says):
         cell_study.run_study(dataclasses.replace(SMALL, cell=cell, others=others))
@@ -201,6 +205,7 @@ def test_the_page_says_what_is_printable_of_any_shape():
     )
 
 
+SOLVED = SolvedNodes(np.array([0.1]), np.array([[1 + 0.5j, 0.1j]]), np.array([0.2]))
 TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"
 
 
@@ -212,28 +217,27 @@ def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     solved, answers = [], {}
 
-    def run(tasks):  # in this process, each once
+    def run(work, tasks):  # in this process, each once
         for i, task in enumerate(tasks):
-            key = json.dumps(task)
-            answers[key] = answers.get(key) or workers.run_task(task)
-            yield i, answers[key]
+            answers[task] = answers.get(task) or work(task)
+            yield i, answers[task]
 
-    def stopped(tasks):
-        yield next(run(tasks))
+    def stopped(work, tasks):
+        yield next(run(work, tasks))
         raise KeyboardInterrupt
 
-    def counted(tasks):
+    def counted(work, tasks):
         solved.append(len(tasks))
-        return run(tasks)
+        return run(work, tasks)
 
-    monkeypatch.setattr(workers, "run_tasks", stopped)
+    monkeypatch.setattr(executor, "run_parallel", stopped)
     assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.INTERRUPTED
     assert not (tmp_path / "out").exists()
     journal = tmp_path / "out.resume"
     assert len(journal.read_text().splitlines()) == 2
     with open(journal, "ab") as file:
         file.write(b'["cut sho')
-    monkeypatch.setattr(workers, "run_tasks", counted)
+    monkeypatch.setattr(executor, "run_parallel", counted)
     assert cli.main(["study", "study.toml", "-o", "out", "--quiet"]) == cli.SUCCESS
     assert solved == [1, 1]  # the other cell, and the chosen one of another material
     assert not journal.exists()
@@ -257,28 +261,19 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
     study, solved = CellStudy(pillar=str(table)), []
 
-    def told(tasks):
+    def told(work, tasks):
         solved.append(tasks)
         for i, _ in enumerate(tasks):
-            yield (
-                i,
-                {
-                    "diameter_um": [0.1],
-                    "t": [[1.0, 0.5]],
-                    "r": [[0.0, 0.1]],
-                    "error": [0.2],
-                    "energy": [1.0],
-                },
-            )
+            yield i, [SOLVED]
 
     def done(settings):
         solved.clear()
         workers.SweepJournal(path, settings).run(
-            [{"kind": "curve"}], Console(quiet=True), "cells"
+            ["curve"], Console(quiet=True), "cells"
         )
         return any(solved)
 
-    monkeypatch.setattr(workers, "run_tasks", told)
+    monkeypatch.setattr(executor, "run_parallel", told)
     assert [done(study), done(study)] == [True, False]
     assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [
         True,
@@ -298,24 +293,15 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
     study = CellStudy(pillar=str(table))
 
-    def told(tasks):
+    def told(work, tasks):
         for i, _ in enumerate(tasks):
-            yield (
-                i,
-                {
-                    "diameter_um": [0.1],
-                    "t": [[1.0, 0.5]],
-                    "r": [[0.0, 0.1]],
-                    "error": [0.2],
-                    "energy": [1.0],
-                },
-            )
+            yield i, [SOLVED]
             table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
 
-    monkeypatch.setattr(workers, "run_tasks", told)
+    monkeypatch.setattr(executor, "run_parallel", told)
     with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
         workers.SweepJournal(path, study).run(
-            [{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells"
+            ["curve", "other"], Console(quiet=True), "cells"
         )
     assert len(path.read_text().splitlines()) == 2  # its title and the first
 
@@ -323,7 +309,7 @@ def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_
 def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp_path):
     path = tmp_path / "out.resume"
     title = workers.SweepJournal(path, SMALL) and path.read_text()
-    path.write_text(title + '["task", {"diameter_um": [0.1]}]\n')
+    path.write_text(title + '["task", [[[0.1], [], [0.2], true, ""]]]\n')
     assert workers.SweepJournal(path, SMALL)._known == {}
     path.write_text("pages of a thesis\n")
     with pytest.raises(

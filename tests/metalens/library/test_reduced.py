@@ -31,12 +31,7 @@ def explored(tolerance: float) -> reduced.ResponseCurve:
         nodes.error
     )  # so that the estimate of the interpolation stands alone
     nodes = reduced.SolvedNodes(
-        nodes.diameter_um,
-        nodes.response,
-        silent,
-        nodes.energy,
-        nodes.converged,
-        nodes.reason,
+        nodes.diameter_um, nodes.response, silent, nodes.converged, nodes.reason
     )
     return reduced.fit_response_curve(nodes, tolerance=tolerance)
 
@@ -83,9 +78,7 @@ def test_cheaper_diameters_are_taken_where_they_serve_and_the_estimate_holds_as_
         taken = np.isin(nodes.diameter_um, cheaper)
         assert taken.sum() >= 8
         assert (~taken).sum() <= len(plain) - 8
-        silent = reduced.SolvedNodes(
-            nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, ""
-        )
+        silent = reduced.SolvedNodes(nodes.diameter_um, nodes.response, 0 * nodes.error)
         wrong, error, _ = violations(
             reduced.fit_response_curve(silent, tolerance=1e-3), 400
         )

@@ -272,7 +272,7 @@ def test_polychromatic_psf_converges_with_the_nodes():
 
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
-    from metalens.lens import DiameterMap, Lens, answers
+    from metalens.lens import DiameterMap, Lens, response
     from metalens.library import Proxy
     from metalens.psf.of_lens import library_incidence
 
@@ -286,7 +286,7 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
         DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map"
     )
     phase, level = np.empty((2, 2)), np.empty((2, 2))
-    answers.fill_response(
+    response.fill_response(
         lens, (0.94, library_incidence(lens, (0.17, -0.31))), phase, level
     )
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
@@ -302,7 +302,7 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
         angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
     )  # a library of normal incidence alone
     flat = dataclasses.replace(lens, proxy=upright)
-    answers.fill_response(
+    response.fill_response(
         flat, (0.94, library_incidence(flat, (0.17, -0.31))), phase, level
     )
     assert level == pytest.approx(3 * sizes)

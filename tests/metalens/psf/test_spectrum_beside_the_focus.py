@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index
-from metalens.lens import DiameterMap, Lens, answers
+from metalens.lens import DiameterMap, Lens, response
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
 from metalens.psf.of_lens import PILOT, light_shares, paths_um
@@ -127,9 +127,9 @@ def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light
     try of nearly as many.
     """
     made, waves = lens(241, 42.0), []
-    plain = answers.fill_response
+    plain = response.fill_response
     monkeypatch.setattr(
-        answers,
+        response,
         "fill_response",
         lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)),
     )

@@ -13,8 +13,8 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.core.errors import DomainError
 from metalens.image import compiled
-from metalens.lens import DiameterMap, Lens, answers
-from metalens.lens.pairs import TwoSizeTable
+from metalens.lens import DiameterMap, Lens, response
+from metalens.lens.record import TwoSizeTable
 from metalens.library import Proxy
 
 DRAW = np.random.default_rng(17)
@@ -63,7 +63,7 @@ def test_phase_and_transmission_are_the_series_wrapped(dtype, most):
     made = lens()
     d = made.diameters.diameter_um
     phase, level = (np.full(d.shape, 7.7, dtype) for _ in range(2))
-    answers.fill_response(made, (WAVE, TILT), phase, level)
+    response.fill_response(made, (WAVE, TILT), phase, level)
     lit = d > 0
     want = np.exp(1j * series(SERIES, d))
     assert np.abs(np.exp(1j * phase.astype(float)) - want)[lit].max() < most
@@ -88,7 +88,7 @@ def test_turned_pillars_add_twice_their_turn():
         hand="left",
     )
     phase, level = np.empty(sizes.shape), np.empty(sizes.shape)
-    answers.fill_response(made, (WAVE, TILT), phase, level)
+    response.fill_response(made, (WAVE, TILT), phase, level)
     want = np.where(sizes > 0, np.exp(1j * (series(SERIES, sizes) - 2 * turn)), 1)
     assert np.exp(1j * phase) == pytest.approx(want, abs=1e-13)
 
@@ -116,7 +116,7 @@ def test_pillars_of_two_sizes_have_the_entries_of_their_table():
         pairs=table,
     )
     phase, level = np.empty((4, 5)), np.empty((4, 5))
-    answers.fill_response(made, (WAVE, 0.0), phase, level)
+    response.fill_response(made, (WAVE, 0.0), phase, level)
     want = np.where(sizes > 0, t[0, row, column, 0], 0)
     assert level * np.exp(1j * phase) == pytest.approx(want, abs=1e-12)
     assert np.abs(phase).max() <= np.pi
@@ -126,11 +126,11 @@ def test_what_a_proxy_does_not_know_is_refused_by_name():
     made, out = lens(2, 3), [np.empty((2, 3)) for _ in range(2)]
     for at, word in (((0.79, TILT), "wavelength"), ((WAVE, 0.41), "angle")):
         with pytest.raises(DomainError, match=word):
-            answers.fill_response(made, at, *out)
+            response.fill_response(made, at, *out)
     thin = made.diameters.diameter_um.copy()
     thin[1, 2] = 0.085
     with pytest.raises(DomainError, match=r"diameters run from 0\.085"):
-        answers.fill_response(
+        response.fill_response(
             replace(made, diameters=replace(made.diameters, diameter_um=thin)),
             (WAVE, TILT),
             *out,
@@ -139,14 +139,14 @@ def test_what_a_proxy_does_not_know_is_refused_by_name():
 
 def test_sites_without_a_pillar_ask_nothing_of_the_proxy_and_the_thickest_does():
     sizes = np.zeros((3, 4))
-    whole = answers.response_polynomials(PROXY, np.full((3, 4), 0.2), (WAVE, TILT))
+    whole = response.response_polynomials(PROXY, np.full((3, 4), 0.2), (WAVE, TILT))
     for one, other in zip(
-        answers.response_polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True
+        response.response_polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True
     ):
         assert np.array_equal(one, other)
     sizes[2, 1] = 0.315
     with pytest.raises(DomainError, match=r"0\.315"):
-        answers.response_polynomials(PROXY, sizes, (WAVE, TILT))
+        response.response_polynomials(PROXY, sizes, (WAVE, TILT))
 
 
 def test_a_transmission_that_rounding_takes_above_1_is_1():
@@ -162,7 +162,7 @@ def test_a_transmission_that_rounding_takes_above_1_is_1():
     phase, level = (
         np.empty(made.diameters.diameter_um.shape, np.float32) for _ in range(2)
     )
-    answers.fill_response(made, (WAVE, 0.0), phase, level)
+    response.fill_response(made, (WAVE, 0.0), phase, level)
     assert level.max() <= 1
 
 
@@ -176,7 +176,7 @@ def test_cells_hold_the_mean_of_their_pillars_less_the_carrier():
     found = compiled.cells(
         d,
         ideal,
-        answers.response_polynomials(PROXY, d, (WAVE, TILT)),
+        response.response_polynomials(PROXY, d, (WAVE, TILT)),
         (side, top, left),
     )
     t = np.where(d > 0, series(LEVEL, d) * np.exp(1j * (series(SERIES, d) - ideal)), 0)
