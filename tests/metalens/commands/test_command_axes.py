@@ -11,7 +11,7 @@ import pytest
 from metalens import rcwa
 from metalens.cell import Cell
 from metalens.cli import main
-from metalens.commands import axes_library
+from metalens.commands import library as library_command
 from metalens.library import Sweep, axes
 from metalens.view import artefacts
 
@@ -79,12 +79,14 @@ def test_bars_above_the_tolerance_fail_and_a_ratio_is_refused(tmp_path, capsys):
     found = axes.AxesLibrary(
         Cell(0.3), sweep, np.array([0.7]), axis, axis, t, bars, held, 9, 5
     )
-    assert [line.split(":")[0] for line in axes_library.library_failures(found)] == [
+    assert [
+        line.split(":")[0] for line in library_command.two_size_failures(found)
+    ] == [
         "error bars of 67% of the pairs of sizes are above the tolerance 0.03 (median 0.04)",
         "1 of 2 pairs held out lie above their error bar",
     ]
     assert (
-        axes_library.library_failures(
+        library_command.two_size_failures(
             dataclasses.replace(found, t_error=bars / 2, held_out=held[1:])
         )
         == []
