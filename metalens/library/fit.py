@@ -1,5 +1,5 @@
-"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least
-coefficients in tolerance.
+"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances that
+polynomials follow within the tolerances.
 """
 
 import contextlib
@@ -15,27 +15,22 @@ from metalens.core.errors import DomainError
 from metalens.library import polynomial
 from metalens.library.proxy import Proxy
 from metalens.library.record import PillarLibrary
-from metalens.library.stretch import (
-    LEAST_ENTRIES,
-    MonotonicBranch,
-    longest_monotonic_branch,
-)
 
 TURN = 2 * math.pi
+LEAST_ENTRIES = 12  # of a domain
+REACH = 2.0  # half-widths from a narrow resonance that are cut with it
+UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
 # of the largest conversion, to which the domain reaches unless the tolerance ends it
 NEAREST_SHARE = 0.85
-FOLLOWED, KNOWN_SHARE = (
-    1e-3,
-    0.5,
-)  # deviation from entries where none is stated, and that of the entries' own bars
-EXCLUDED = (
-    0.1  # of the phase that a domain may lose beside a resonance for its tolerances
-)
+# deviation from entries where none is stated, and that of the entries' own bars
+FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
+# of the phase that a domain may lose beside a resonance for its tolerances
+EXCLUDED = 0.1
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
-TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
 MOST_NODES = 5  # coefficients in the wavelength, and in the angle
+TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,23 +112,182 @@ class ProxyFit:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FitData:
-    """What is fitted: phase and |T| (angle, wavelength, diameter), and the coordinates."""
+class MonotonicBranch:
+    """Consecutive diameters without resonance.
+
+    phase: (angle, wavelength, diameter) rad, unwrapped along every axis.
+    level: |t|, as phase.
+    diameter_um, wavelength_um, angle_rad: the axes.
+    notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
+        their mean.
+    gaps_um: (least, largest) diameters inside the stretch around narrow resonances,
+        which no pillar of a lens should have.
+    """
 
     phase: Array
     level: Array
-    diameter: Array
-    wavelength: Array
-    angle: Array
+    diameter_um: Array
+    wavelength_um: Array
+    angle_rad: Array
+    notes: tuple[str, ...] = ()
+    polarization_spread: float = 0.0
+    gaps_um: tuple[tuple[float, float], ...] = ()
 
-    def part(self, some: slice) -> "FitData":
+    def part(self, some: slice) -> "MonotonicBranch":
         """The same of some diameters."""
         return dataclasses.replace(
             self,
             phase=self.phase[..., some],
             level=self.level[..., some],
-            diameter=self.diameter[some],
+            diameter_um=self.diameter_um[some],
         )
+
+    @property
+    def turns(self) -> float:
+        """Covered at every wavelength and angle."""
+        return float(abs(self.phase[..., -1] - self.phase[..., 0]).min() / TURN)
+
+
+def longest_monotonic_branch(
+    library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool = False
+) -> MonotonicBranch:
+    """The stretch of most phase over which, at all wavelengths, angles and
+    polarisations, |t| stays above ``least_transmission``, the phase rises (of openings,
+    which leave less film the wider they are, falls), and no resonance is narrower than
+    ``least_half_width_um`` and no error bar above half of |t|.
+
+    Args:
+        library: the swept cell.
+        wanted: limits of the stretch.
+        across_resonances: it goes on behind narrow resonances, without the entries
+            nearer to one than ``least_half_width_um`` or two half-widths.
+
+    Raises:
+        DomainError: fewer than 12 entries in any such stretch; the message says what is
+            in the way.
+    """
+    low, high = wanted.within_um or (0.0, np.inf)
+    d = library.diameter_um
+    inside = (d >= low - 1e-9) & (d <= high + 1e-9)
+    sharp = [
+        (angle, wavelength, centre, width)
+        for _, angle, wavelength, centre, width in library.resonances.tolist()
+        if width < wanted.least_half_width_um
+        and inside.any()
+        and d[inside][0] <= centre <= d[inside][-1]
+    ]
+    gaps = _gaps(sharp, wanted.least_half_width_um) if across_resonances else ()
+    for least, largest in gaps:
+        inside &= (d < least) | (d > largest)
+    d, t, bars = d[inside], library.t[..., inside], library.t_error[..., inside]
+    faults = _faults(library, d, t, bars, wanted.least_transmission)
+    faults += [] if gaps else [_near_resonance(d, *one) for one in sharp]
+    bad = np.any([mask for mask, _ in faults], axis=0)
+    runs = [run for run in _runs(~bad) if run.stop - run.start >= LEAST_ENTRIES]
+    if not runs:
+        reasons = "; ".join(text for mask, text in faults if mask.any())
+        raise DomainError(
+            f"no {LEAST_ENTRIES} diameters in a row are free of resonances ({reasons}): choose another pitch, height "
+            "or material, fewer wavelengths or angles, or sweep with more samples"
+        )
+    phase = np.unwrap(np.angle(t), axis=-1)
+
+    def covered(run: slice) -> float:
+        return float(abs(phase[..., run.stop - 1] - phase[..., run.start]).min())
+
+    best = max(runs, key=covered)
+    mean = t.mean(axis=0)[..., best]
+    words = [
+        f"passes over a narrow resonance between {a:.4f} and {b:.4f} um"
+        for a, b in gaps
+    ]
+    return MonotonicBranch(
+        _unwrapped(np.angle(mean)),
+        np.abs(mean),
+        d[best],
+        library.wavelength_um,
+        library.angle_rad,
+        (*_ends(best, d, faults), *words),
+        float(np.abs(t[0] - t[-1])[..., best].max()) / 2,
+        tuple((a, b) for a, b in gaps if a < d[best][-1] and b > d[best][0]),
+    )
+
+
+def _gaps(
+    sharp: list[tuple[float, ...]], half_width: float
+) -> tuple[tuple[float, float], ...]:
+    """Diameters too near to a narrow resonance, joined where they overlap."""
+    gaps: list[tuple[float, float]] = []
+    for _, _, centre, width in sorted(sharp, key=lambda one: one[2]):
+        reach = max(half_width, REACH * width)
+        low, high = centre - reach, centre + reach
+        if gaps and low <= gaps[-1][1]:
+            low, high = gaps[-1][0], max(high, gaps.pop()[1])
+        gaps.append((low, high))
+    return tuple(gaps)
+
+
+def _faults(
+    library: PillarLibrary, d: Array, t: Array, bars: Array, least: float
+) -> list[tuple[Array, str]]:
+    """(mask over the diameters, what is wrong there)."""
+    level, phase = np.abs(t), np.unwrap(np.angle(t), axis=-1)
+    hole = library.cell.shape.hole
+    dark = np.asarray((level < least).any(axis=(0, 1, 2)))
+    unknown = np.asarray((bars > UNKNOWN * level).any(axis=(0, 1, 2)))
+    turns = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
+    back = np.zeros(len(d), bool)
+    back[1:] |= turns
+    back[:-1] |= turns
+    wrong = (
+        "the phase rises with the size of the opening"
+        if hole
+        else "the phase falls with the diameter"
+    )
+    return [
+        (dark, f"|t| falls to {level.min():.2f}, below {least:g}"),
+        (unknown, f"error bars reach {bars.max():.2g}, above half of |t|"),
+        (back, wrong),
+    ]
+
+
+def _near_resonance(
+    d: Array, angle: float, wavelength: float, centre: float, width: float
+) -> tuple[Array, str]:
+    """As :func:`_faults`, of a narrow resonance: the diameters near it, and those on
+    either side.
+    """
+    near = np.abs(d - centre) <= REACH * width
+    after = int(np.searchsorted(d, centre))
+    near[[max(0, after - 1), after]] = True
+    text = f"resonance at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({wavelength:g} um"
+    return near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")
+
+
+def _runs(good: Array) -> list[slice]:
+    """Runs of True."""
+    edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _ends(run: slice, d: Array, faults: list[tuple[Array, str]]) -> tuple[str, ...]:
+    notes = []
+    for place, edge in ((run.start - 1, run.start), (run.stop, run.stop - 1)):
+        if 0 <= place < len(d):
+            why = "; ".join(text for mask, text in faults if mask[place])
+            notes.append(f"cut at {d[edge]:.4f} um: {why}")
+    return tuple(notes)
+
+
+def _unwrapped(phase: Array) -> Array:
+    """Unwrapped along the diameter, then neighbouring wavelengths and angles at the
+    thinnest pillar.
+    """
+    phase = np.unwrap(phase, axis=-1)
+    for axis in (1, 0):
+        start = phase[..., :1]
+        phase = phase + (np.unwrap(start, axis=axis) - start)
+    return phase
 
 
 def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
@@ -168,36 +322,29 @@ def _fitted(
     library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool
 ) -> ProxyFit:
     """The proxy on one side of all narrow resonances, or across them."""
-    smooth = longest_monotonic_branch(
-        library,
-        least_transmission=wanted.least_transmission,
-        least_half_width_um=wanted.least_half_width_um,
-        within_um=wanted.within_um,
-        across_resonances=across_resonances,
+    data = longest_monotonic_branch(
+        library, wanted, across_resonances=across_resonances
     )
-    wanted = wanted.settled(entry_error(library, smooth.diameter_um))
-    data = FitData(
-        smooth.phase,
-        smooth.level,
-        smooth.diameter_um,
-        library.wavelength_um,
-        library.angle_rad,
-    )
+    wanted = wanted.settled(entry_error(library, data.diameter_um))
     kept, proxy, terms = _followed(data, wanted)
     low, high = proxy.domain_um
     proxy = dataclasses.replace(
         proxy,
-        entry_error=entry_error(library, kept.diameter),
-        gaps_um=tuple((a, b) for a, b in smooth.gaps_um if low < a and b < high),
+        entry_error=entry_error(library, kept.diameter_um),
+        gaps_um=tuple((a, b) for a, b in data.gaps_um if low < a and b < high),
     )
     counts = range(4, max(18, 2 * terms + 5), 2)
     trials = (
         _trial(kept, proxy.power, count)
         for count in counts
-        if count // 2 < len(kept.diameter) // 3
+        if count // 2 < len(kept.diameter_um) // 3
     )
-    table = tuple(trial for trial in trials if trial is not None)
-    notes = _notes(smooth, data, kept, terms)
+    notes = data.notes
+    if len(kept.diameter_um) < len(data.diameter_um):
+        notes += (
+            f"cut at {kept.diameter_um[-1]:.4f} um: up to {data.diameter_um[-1]:.4f} um the phase is smooth, but "
+            f"{2 * terms} coefficients do not describe it within the tolerances",
+        )
     short = (
         TURNS_BACK
         if math.isinf(_cost(proxy, wanted))
@@ -206,11 +353,11 @@ def _fitted(
     return ProxyFit(
         proxy,
         notes,
-        table,
-        _turns(kept),
-        smooth.polarization_spread,
+        tuple(trial for trial in trials if trial is not None),
+        kept.turns,
+        data.polarization_spread,
         short,
-        _turns(data),
+        data.turns,
     )
 
 
@@ -227,20 +374,24 @@ def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
     )
 
 
-def _followed(data: FitData, wanted: ProxyTolerances) -> tuple[FitData, Proxy, int]:
+def _followed(
+    data: MonotonicBranch, wanted: ProxyTolerances
+) -> tuple[MonotonicBranch, Proxy, int]:
     """The domain that a proxy follows, and its number of coefficients: those wanted;
     more where a full turn takes them; fewer where so few entries let those wanted swing
     between them.
     """
-    terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
+    terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter_um) // 3)
     kept, proxy = _longest(data, wanted, terms)
-    while more < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
+    while more < MOST_TERMS and kept.turns < 1 <= data.turns:
         more += 2
         with contextlib.suppress(
             DomainError
         ):  # more coefficients than so few entries bear: those before stand
             longer, better = _longest(data, wanted, more)
-            if _cost(better, wanted) <= 1 and len(longer.diameter) > len(kept.diameter):
+            if _cost(better, wanted) <= 1 and len(longer.diameter_um) > len(
+                kept.diameter_um
+            ):
                 kept, proxy, terms = longer, better, more
     for fewer in range(terms - 1, 1, -1) if _cost(proxy, wanted) > 1 else ():
         other = _best(kept, wanted, fewer)
@@ -251,15 +402,15 @@ def _followed(data: FitData, wanted: ProxyTolerances) -> tuple[FitData, Proxy, i
 
 
 def _shorter(
-    data: FitData, wanted: ProxyTolerances, terms: int
-) -> tuple[FitData, Proxy, int] | None:
+    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+) -> tuple[MonotonicBranch, Proxy, int] | None:
     """Without the last diameters, beside what bounds the domain, where the tolerances
     are met so; they are excluded as the resonance is, up to a tenth of the phase. None
     where that is not enough.
     """
-    for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
+    for count in range(len(data.diameter_um) - 1, LEAST_ENTRIES - 1, -1):
         some = data.part(slice(count))
-        if _turns(some) < (1 - EXCLUDED) * _turns(data):
+        if some.turns < (1 - EXCLUDED) * data.turns:
             return None
         fewer = min(terms, count // 3)
         other = _best(some, wanted, fewer)
@@ -288,21 +439,21 @@ def proxy_of(library: PillarLibrary) -> Proxy:
 
 
 def _longest(
-    data: FitData, wanted: ProxyTolerances, terms: int
-) -> tuple[FitData, Proxy]:
+    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+) -> tuple[MonotonicBranch, Proxy]:
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
     tolerances.
     """
-    good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
+    good, bad = min(len(data.diameter_um), 3 * terms), len(data.diameter_um) + 1
     best = _best(data.part(slice(good)), wanted, terms)
     if best is None:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
-            f"{data.diameter[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+            f"{data.diameter_um[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
         )
     while bad - good > 1:
         middle = (
-            (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
+            (good + bad + 1) // 2 if bad > len(data.diameter_um) else (good + bad) // 2
         )
         trial = _best(data.part(slice(middle)), wanted, terms)
         if trial is not None and _cost(trial, wanted) <= 1:
@@ -340,7 +491,7 @@ def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 
-def _best(data: FitData, wanted: ProxyTolerances, terms: int) -> Proxy | None:
+def _best(data: MonotonicBranch, wanted: ProxyTolerances, terms: int) -> Proxy | None:
     """Of the powers of the diameter, the one with the least error in units of the
     tolerances; None where each takes |T| below 0 between the entries.
     """
@@ -362,7 +513,7 @@ def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
     return tolerance_ratio(proxy, wanted) if monotone else math.inf
 
 
-def fit_terms(data: FitData, power: int, terms: int) -> Proxy:
+def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
     """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
     many for |T|.
 
@@ -381,26 +532,26 @@ def fit_terms(data: FitData, power: int, terms: int) -> Proxy:
         float(np.abs(_evaluate(axes, c) - values).max())
         for c, values in ((phase, data.phase), (level, data.level))
     ]
-    flat = len(data.angle) == 1
+    flat = len(data.angle_rad) == 1
     return Proxy(
         phase[0] if flat else phase,
         level[0] if flat else level,
-        (float(data.diameter[0]), float(data.diameter[-1])),
-        (float(data.wavelength[0]), float(data.wavelength[-1])),
+        (float(data.diameter_um[0]), float(data.diameter_um[-1])),
+        (float(data.wavelength_um[0]), float(data.wavelength_um[-1])),
         errors[0],
         errors[1],
         power,
-        0.0 if flat else float(data.angle[-1]),
+        0.0 if flat else float(data.angle_rad[-1]),
     )
 
 
-def _axes(data: FitData, power: int) -> tuple[Array, Array, Array]:
+def _axes(data: MonotonicBranch, power: int) -> tuple[Array, Array, Array]:
     """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
-    sine = np.sin(data.angle) ** 2
+    sine = np.sin(data.angle_rad) ** 2
     return (
         2 * sine / sine[-1] - 1 if len(sine) > 1 else np.zeros(1),
-        _unit(data.wavelength) if len(data.wavelength) > 1 else np.zeros(1),
-        _unit(data.diameter**power),
+        _unit(data.wavelength_um) if len(data.wavelength_um) > 1 else np.zeros(1),
+        _unit(data.diameter_um**power),
     )
 
 
@@ -458,7 +609,7 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     return best
 
 
-def _trial(data: FitData, power: int, coefficients: int) -> FitTrial | None:
+def _trial(data: MonotonicBranch, power: int, coefficients: int) -> FitTrial | None:
     """One line of the table; None where |T| falls below 0 between the entries."""
     try:
         proxy = fit_terms(data, power, coefficients // 2)
@@ -466,22 +617,6 @@ def _trial(data: FitData, power: int, coefficients: int) -> FitTrial | None:
         return None
     return FitTrial(
         coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error
-    )
-
-
-def _turns(data: FitData) -> float:
-    return float(abs(data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
-
-
-def _notes(
-    smooth: MonotonicBranch, data: FitData, kept: FitData, terms: int
-) -> tuple[str, ...]:
-    if len(kept.diameter) == len(data.diameter):
-        return smooth.notes
-    return (
-        *smooth.notes,
-        f"cut at {kept.diameter[-1]:.4f} um: up to {data.diameter[-1]:.4f} um the phase is smooth, but {2 * terms} "
-        "coefficients do not describe it within the tolerances",
     )
 
 
@@ -519,14 +654,14 @@ def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
     phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[
         :, None
     ]
-    kept = FitData(
+    kept = MonotonicBranch(
         phase[None],
         np.abs(t[:, run])[None],
         d[run],
         library.wavelength_um,
         library.angle_rad,
     )
-    wanted = wanted.settled(entry_error(library, kept.diameter))
+    wanted = wanted.settled(entry_error(library, kept.diameter_um))
     proxy = _widest(kept, middle - run.start, wanted)
     inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
@@ -547,15 +682,15 @@ def _sharp(library: PillarLibrary, least_half_width_um: float) -> Array:
     return near
 
 
-def _widest(data: FitData, middle: int, wanted: ProxyTolerances) -> Proxy:
+def _widest(data: MonotonicBranch, middle: int, wanted: ProxyTolerances) -> Proxy:
     """The widest run about ``middle`` on which as many coefficients as are wanted meet
     the tolerances.
     """
-    reach = max(middle, len(data.diameter) - 1 - middle)
+    reach = max(middle, len(data.diameter_um) - 1 - middle)
     while True:
         part = slice(max(0, middle - reach), middle + reach + 1)
         some = data.part(part)
-        count = len(some.diameter)
+        count = len(some.diameter_um)
         proxy = fit_terms(some, 1, min(max(2, wanted.coefficients // 2), count // 3))
         if tolerance_ratio(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
             return proxy

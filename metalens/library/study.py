@@ -15,9 +15,9 @@ from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import Console
 from metalens.library import engines
 from metalens.library.curve import ResponseCurve
+from metalens.library.fit import REACH, UNKNOWN
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
-from metalens.library.stretch import REACH, UNKNOWN
 from metalens.library.workers import SweepJournal, Task, fit_curves
 
 TURN = 2 * math.pi

@@ -11,7 +11,6 @@ from metalens.cell.record import Cell, Index
 from metalens.cell.shapes import Circle
 from metalens.core.errors import DomainError
 from metalens.library import fit as proxy_fit
-from metalens.library import stretch as smooth
 from metalens.library.fit import ProxyTolerances
 from metalens.library.record import PillarLibrary, Sweep
 
@@ -260,10 +259,8 @@ def test_an_entry_whose_bar_is_above_half_of_its_light_cuts_the_domain():
     bars = made.t_error.copy()
     bars[..., 130] = 0.51 * np.abs(made.t[..., 130])
     bars[..., 20] = 0.49 * np.abs(made.t[..., 20])
-    found = smooth.longest_monotonic_branch(
-        dataclasses.replace(made, t_error=bars),
-        least_transmission=0.7,
-        least_half_width_um=0.005,
+    found = proxy_fit.longest_monotonic_branch(
+        dataclasses.replace(made, t_error=bars), ProxyTolerances()
     )
     assert (found.diameter_um[0], found.diameter_um[-1]) == (
         made.diameter_um[0],
@@ -333,8 +330,8 @@ def test_polarisations_are_averaged_and_their_spread_is_told():
 
 def test_phase_is_continuous_over_wavelength_and_angle():
     waves, angles = (0.83, 0.85, 0.87), (0.0, 20.0)
-    stretch = smooth.longest_monotonic_branch(
-        synthetic(waves, angles), least_transmission=0.7, least_half_width_um=0.005
+    stretch = proxy_fit.longest_monotonic_branch(
+        synthetic(waves, angles), ProxyTolerances()
     )
     d, w, a = (
         stretch.diameter_um,
