@@ -15,7 +15,7 @@ import pytest
 
 from metalens import cli
 from metalens.cli import BAD_INPUT, SUCCESS, main
-from metalens.core import lock, transaction
+from metalens.core import store, transaction
 from metalens.core.errors import OutputError
 
 ROOT = Path(__file__).parents[1]
@@ -88,7 +88,7 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing_but_its_journal(tmp_p
             stderr=said,
             stdout=subprocess.DEVNULL,
         )
-    while child.poll() is None and not list(tmp_path.glob(".out.part-*")):
+    while child.poll() is None and not list(tmp_path.glob(".out.new")):
         time.sleep(0.05)
     child.send_signal(signal.SIGHUP)
     child.wait()
@@ -269,6 +269,6 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(
         ),
         (inside, "out.h5: folder .*library.h5 is a file: give another name"),
     ):
-        monkeypatch.setattr(lock, "hold_lock", refused)
+        monkeypatch.setattr(store, "hold_lock", refused)
         with pytest.raises(OutputError, match=found), transaction.claim_file(target):
             pass

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from metalens.core import reading, store
+from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, LensError
 
@@ -37,7 +37,8 @@ def read_matlab(path: Path) -> dict[str, Array]:
     try:
         content = path.read_bytes()
         if b"\x89HDF\r\n\x1a\n" in content[:4096]:
-            return reading.read_hdf5(path, lambda file: _level_7(path, file))
+            with h5py.File(path, "r") as file:
+                return _level_7(path, file)
         order = {b"IM": "<", b"MI": ">"}.get(content[126:128], "")
         if order and 0 not in content[:4]:
             return dict(_level_5(content[128:], order))

@@ -5,6 +5,7 @@ polynomials follow within the tolerances.
 import contextlib
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -214,7 +215,7 @@ def longest_monotonic_branch(
 
 
 def _gaps(
-    sharp: list[tuple[float, ...]], half_width: float
+    sharp: Sequence[tuple[float, ...]], half_width: float
 ) -> tuple[tuple[float, float], ...]:
     """Diameters too near to a narrow resonance, joined where they overlap."""
     gaps: list[tuple[float, float]] = []
