@@ -28,8 +28,6 @@ _BACKSLASH = (
     "a backslash in double quotes begins an escape: write a path of Windows in single "
     "quotes ('C:\\maps\\a.npy') or with /"
 )
-_LONGEST = 500  # characters of what a record says of its values
-_TEXT = 160  # characters of what a key means, in a refusal
 _KEY = re.compile(r"(?<!\S)((?:\w+,\s+)*\w+):\s")  # in the docstring of a record
 _EITHER_SIGN = ("_rad", "_deg", "_offset")
 _MOST, _LARGE = (
@@ -208,7 +206,7 @@ def _meaning(record: type[Any], key: str) -> Iterator[None]:
         raise
     except ConfigError as error:
         text = textwrap.shorten(
-            describe_fields(record).get(key, ""), _TEXT, placeholder=" ..."
+            describe_fields(record).get(key, ""), 160, placeholder=" ..."
         )
         raise _Meant(f"{error} ({key}: {text})" if text else str(error)) from None
 
@@ -250,7 +248,7 @@ def _culprit(record: Any, values: dict[str, Any], prefix: str, said: str) -> str
     content, unless it names the key.
     """
     required = {f.name for f in dataclasses.fields(record) if _required(f)}
-    said = said if len(said) <= _LONGEST else said[:_LONGEST] + " ..."
+    said = said if len(said) <= 500 else said[:500] + " ..."
     fitting = [
         k
         for k in values

@@ -31,7 +31,6 @@ _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
 _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = (
     "1e15"  # what a large lens takes is no leak to end a worker for
 )
-_MOST = 1024  # processes of one machine
 
 
 def usable_cores() -> int:
@@ -58,8 +57,8 @@ def run_on(processes: int | None = None) -> Iterator[None]:
     if processes is None:
         yield
         return
-    if not 1 <= processes <= _MOST:
-        raise ConfigError(f"{processes} workers: need 1 to {_MOST}")
+    if not 1 <= processes <= 1024:
+        raise ConfigError(f"{processes} workers: need 1 to 1024")
     with _pool(processes) as pool:
         token = _PLACE.set(functools.partial(_here, pool))
         try:

@@ -104,10 +104,6 @@ class KeyFigure:
     good: bool | None = None
 
 
-PLAIN = 1e7  # up to here a number is written without a power of ten
-# what is smaller in the units of this toolchain (um, rad, shares, electrons) is
-# rounding
-ROUNDING = 1e-12
 UNITS = {
     "um": "µm",
     "nm": "nm",
@@ -187,9 +183,10 @@ def in_figures(value: Any, digits: int = 4) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         shown = f"{value:.{digits}g}"
-        if 10**digits <= abs(value) < PLAIN:
+        if 10**digits <= abs(value) < 1e7:
             return f"{float(shown):.0f}"
-        return "0" if abs(value) < ROUNDING else shown
+        # what is smaller in um, rad, shares or electrons is rounding
+        return "0" if abs(value) < 1e-12 else shown
     return str(value)
 
 

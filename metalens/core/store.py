@@ -34,7 +34,6 @@ COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
 _FORMAT = ("v110", "v110")
 _UNITS = "um, rad"
 _MOST_BYTES = 1 << 36  # of all arrays of a file
-_DENSEST = 1040  # values' bytes for a byte in the file: what deflate can do at best
 # bytes of an array that is kept in its header, under the checksum of the header
 _SMALL = 4096
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
@@ -435,7 +434,8 @@ def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
         raise StoreError(
             f"{path}: {name!r} lies in other files; need a file that holds all of its values"
         )
-    if item.nbytes > _DENSEST * item.id.get_storage_size() + _SMALL:
+    # deflate packs 1040 bytes into one at best
+    if item.nbytes > 1040 * item.id.get_storage_size() + _SMALL:
         raise StoreError(
             f"{path}: {name!r} claims {item.nbytes:g} bytes of shape {item.shape}, the file holds "
             f"{item.id.get_storage_size()} of them: damaged"

@@ -20,7 +20,6 @@ from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_MOST = 16  # items side by side, each with memory of its own
 _BESIDE = threading.local()  # stop: set for a thread that works beside others
 
 
@@ -42,7 +41,7 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
         items: what is computed one by one.
     """
     items = list(items)
-    count = min(thread_count(), len(items), _MOST)
+    count = min(thread_count(), len(items), 16)  # each has memory of its own
     if count <= 1:
         return [work(item) for item in items]
     stop = threading.Event()

@@ -18,9 +18,7 @@ ROOM = 1 << 22  # bytes that every output may need
 # endings of what an interruption leaves for the next run
 UNFINISHED, JOURNAL = ".unfinished", ".resume"
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
-_LARGEST = 1 << 26  # bytes of a manifest
 _ENDS = 1 << 16  # bytes at either end of a file in which its mark is looked for
-_RENAME_EXCHANGE, _AT_FDCWD = 2, -100  # renameat2(2)
 # first bytes of a file, and what ours has in it
 _MARKS = (
     (b"\x89PNG", b"Software\0metalens"),
@@ -350,10 +348,9 @@ def _exchange_names(one: Path, other: Path) -> bool:
     if not sys.platform.startswith("linux"):
         return False
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    names = os.fsencode(one.absolute()), os.fsencode(other.absolute())
-    return call is not None and not call(
-        _AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE
-    )
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    first, second = os.fsencode(one.absolute()), os.fsencode(other.absolute())
+    return call is not None and not call(here, first, here, second, exchange)
 
 
 def _open_work(
@@ -424,7 +421,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        if path.stat().st_size > _LARGEST:
+        if path.stat().st_size > 1 << 26:
             raise ValueError("too large")
         found: dict[str, Any] = json.loads(path.read_bytes())
         if (found["kind"], found["version"]) != (KIND, VERSION):

@@ -12,9 +12,6 @@ from metalens.core.arrays import Array
 from metalens.lens.record import Lens
 from metalens.library.axes import cell_of_sizes
 
-_PIXELS = 420  # along the longer side of the phase picture
-_ZOOM = 28  # pillars along the side of the zoom
-
 
 def lens_picture(lens: Lens) -> bytes:
     """PNG: wrapped phase at the design wavelength, and single pillars halfway to the rim.
@@ -41,7 +38,7 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
     least = (
         2 if d.lattice.centred else 1
     )  # every other site of the map is none of the lattice
-    field = mean_field(lens, max(least, -(-max(d.diameter_um.shape) // _PIXELS)))
+    field = mean_field(lens, max(least, -(-max(d.diameter_um.shape) // 420)))
     colour = colormaps["twilight"](np.mod(np.angle(field), 2 * np.pi) / (2 * np.pi))
     colour[..., 3] = np.minimum(1, np.abs(field))
     edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
@@ -95,8 +92,9 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
 
     d = lens.diameters
     ny, nx = d.diameter_um.shape
-    row, column = ny // 2 - _ZOOM // 2, min(nx * 3 // 4, max(nx - _ZOOM, 0))
-    rows, columns = slice(max(row, 0), row + _ZOOM), slice(column, column + _ZOOM)
+    side = 28  # pillars along the side of the picture
+    row, column = ny // 2 - side // 2, min(nx * 3 // 4, max(nx - side, 0))
+    rows, columns = slice(max(row, 0), row + side), slice(column, column + side)
     part = d.diameter_um[rows, columns]
     x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
     there = part > 0

@@ -8,15 +8,6 @@ from dataclasses import dataclass, field
 from metalens.lens.record import Lens
 from metalens.optics.layers import Layers
 
-# at the rim, at both ends of the range: the blur is then 3.5 wavelength / NA in radius
-DEFOCUS_WAVES = 1.75
-STEP_WAVES = 0.115  # at the rim, between two depths whose images are told apart
-# radius of the disc that holds a spot whose depth can be told, in wavelength / NA
-ENCIRCLED = 5.3
-SAMPLE = 0.86  # of the coarsest sampling of the intensity
-PIXEL = 0.88  # of a pixel that shows most of what a spot tells, in wavelength / NA
-BLURS = 8.0  # width of a window, in radii of the blur
-
 
 @dataclass(frozen=True, slots=True)
 class ApertureSummary:
@@ -85,7 +76,7 @@ def window_um(
         depths_um: distances of sources, um.
     """
     blur = max(blur_um(lens, depth) for depth in depths_um)
-    return _rounded(max(airy * diffraction_um(lens), BLURS * blur), 3)
+    return _rounded(max(airy * diffraction_um(lens), 8 * blur), 3)
 
 
 def disc_um(lens: Lens | ApertureSummary) -> float:
@@ -95,7 +86,7 @@ def disc_um(lens: Lens | ApertureSummary) -> float:
     Args:
         lens: the lens.
     """
-    return _rounded(ENCIRCLED * diffraction_um(lens), 2)
+    return _rounded(5.3 * diffraction_um(lens), 2)
 
 
 def pixel_um(lens: Lens | ApertureSummary) -> float:
@@ -105,7 +96,7 @@ def pixel_um(lens: Lens | ApertureSummary) -> float:
     Args:
         lens: the lens.
     """
-    return _rounded(PIXEL * diffraction_um(lens), 2)
+    return _rounded(0.88 * diffraction_um(lens), 2)
 
 
 def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
@@ -119,12 +110,7 @@ def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
         lens: the lens.
         depth_um: distance of the source, um.
     """
-    step = (
-        2
-        * STEP_WAVES
-        * lens.wavelength_um
-        * (_reduced(lens, depth_um) / _widest(lens)) ** 2
-    )
+    step = 0.23 * lens.wavelength_um * (_reduced(lens, depth_um) / _widest(lens)) ** 2
     return _rounded(min(step, 0.02 * depth_um), 2)
 
 
@@ -137,7 +123,7 @@ def sample_um(lens: Lens | ApertureSummary, pixel_um: float) -> float:
         pixel_um: pitch of the pixels, um.
     """
     sine = math.sin(math.atan(_widest(lens) / sensor_reach_um(lens)))
-    return _rounded(min(SAMPLE * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
+    return _rounded(min(0.86 * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
 
 
 def depth_range_um(
@@ -153,7 +139,7 @@ def depth_range_um(
     A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
     """
     radius = _widest(lens)
-    most = 2 * DEFOCUS_WAVES * lens.wavelength_um / radius**2
+    most = 3.5 * lens.wavelength_um / radius**2
     focus, films = _reduced(lens, lens.source_distance_um), _thinner(lens)
     near = max(1 / (1 / focus + most), min(2 * radius, focus))
     far = 1 / max(1 / focus - most, 0.1 / near)

@@ -24,32 +24,11 @@ from metalens.library.record import Sweep, check_light
 from metalens.library.workers import SweepJournal, Task
 
 KIND = "axes-library"
-FLOOR_SHARE = 0.05  # of the tolerance: in every doubt, for what neither order shows
 FIT_SHARE = 0.1  # of the tolerance: residual of the rational fits
 
 
-FIRST, MOST, ADDED = (
-    7,
-    19,
-    2,
-)  # nodes along an axis: to begin with, at most, and more a round
-COARSEST = 5  # orders of the truncation
-MOST_ERROR = 2.0  # of an amplitude within 1
-LOOK = 61  # places along an axis where the interpolations are compared in between
-# of the pairs that may stay above the tolerance (resonances) when the search ends
-LEFT_OUT = 0.03
+FIRST, MOST = 7, 19  # nodes along an axis: to begin with, and at most
 SOLVER_SHARE = 0.6  # of the tolerance, for the solver
-HELD_OUT = (
-    24  # pairs; the bars are scaled by what half of them show, the other half judges
-)
-SPREAD, LEAST_WIDE = (
-    2.0,
-    0.5,
-)  # of the scale: over the largest error to bar of twelve pairs; the least that it may be
-_GOLDEN = (
-    0.7548776662466927,
-    0.5698402909980532,
-)  # of the plane: 1/g, 1/g², g³ = g + 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -257,9 +236,7 @@ def interpolate_table(
     apart = np.maximum(apart, np.abs(rival - (first + second) / 2).max(axis=-1))
     reach = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
     apart = maximum_filter(apart, size=[2 * n + 1 for n in reach], mode="nearest")
-    return InterpolatedTable(
-        (first + second) / 2, np.asarray(apart + FLOOR_SHARE * tolerance)
-    )
+    return InterpolatedTable((first + second) / 2, np.asarray(apart + 0.05 * tolerance))
 
 
 def _fewer(count: int) -> Array:
@@ -415,9 +392,10 @@ def sweep_two_sizes(
         values, bars = nodes.grid(x, y, console, "pillars")
         made = interpolate_table((x, y), values, places, tolerance=settings.bar)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
-        wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
+        # half of the pairs held out scale the bars, the other half judges them
+        wide = max(0.5, 2 * float((judged[::2, 2] / judged[::2, 3]).max()))
         bar = np.minimum(
-            wide * made.doubt + _carried((x, y), bars, places, made.value), MOST_ERROR
+            wide * made.doubt + _carried((x, y), bars, places, made.value), 2.0
         )
         row, column = _spread(places)
         judged[:, 3] = bar[row, column]
@@ -463,7 +441,7 @@ def _reach(cell: Cell, sweep: Sweep) -> int:
     shares = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
     most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
-    for reach in range(min(COARSEST, most), most):
+    for reach in range(min(5, most), most):
         wanted = SOLVER_SHARE * sweep.bar
         about = {"tolerance": wanted, "harmonics": reach}
         if all(
@@ -482,7 +460,7 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
     spans = size_ranges(sweep)
     angle = np.pi * np.arange(FIRST) / (FIRST - 1)
     lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
-    look = np.linspace(*spans[0], LOOK), np.linspace(*spans[1], LOOK)
+    look = np.linspace(*spans[0], 61), np.linspace(*spans[1], 61)
     for made, span in zip(lines, spans, strict=True):
         made[[0, -1]] = span
     while True:
@@ -490,7 +468,8 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
         values, _ = nodes.grid(x, y, console, "pillars")
         doubt = interpolate_table((x, y), values, look, tolerance=sweep.bar).doubt
         above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
-        if above <= LEFT_OUT or len(x) >= MOST:
+        # a few pairs in a hundred may lie beside resonances
+        if above <= 0.03 or len(x) >= MOST:
             return x, y
         some = np.minimum(doubt, 10 * sweep.bar)  # a resonance is not chased for ever
         profiles = [some.mean(axis=1), some.mean(axis=0)]
@@ -501,7 +480,7 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
 
 def _more(lines: Array, look: Array, profile: Array) -> Array:
     """Nodes with some more, in the gaps over which the doubt adds up to most."""
-    for _ in range(ADDED):
+    for _ in range(2):
         gaps = [
             float(profile[(look > a) & (look < b)].sum())
             for a, b in itertools.pairwise(lines)
@@ -533,7 +512,9 @@ def _held_out(
 
 def _spread(places: tuple[Array, Array]) -> tuple[Array, Array]:
     """Entries that spread over the plane (Roberts's sequence)."""
-    shares = np.mod(np.outer(np.arange(1, HELD_OUT + 1), _GOLDEN) + 0.5, 1)
+    growth = 1.324717957244746  # its cube is itself plus one
+    steps = np.outer(np.arange(1, 25), [1 / growth, 1 / growth**2])
+    shares = np.mod(steps + 0.5, 1)
     row, column = (
         np.minimum((shares[:, k] * len(places[k])).astype(int), len(places[k]) - 1)
         for k in (0, 1)

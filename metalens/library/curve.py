@@ -16,11 +16,7 @@ from metalens.library.rational import RationalFunction
 
 Solver = Callable[[float], Response]
 FIT_SHARE = 0.2  # of the tolerance: residual of the rational fit
-FLOOR_SHARE = 0.1  # of the tolerance: added to every estimate, for what no rival shows
-DOUBT_SHARE = 0.5  # of the tolerance: disagreement of the fits at which the search ends
-CHEAP_SHARE = 0.5  # of the largest disagreement: what a cheaper diameter has to show
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
-SCAN = 1200  # places where the fits are compared
 FIRST = 13  # Chebyshev points that a search begins with
 # no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles
 # no better
@@ -127,7 +123,8 @@ class ResponseCurve:
         doubt = np.max(
             [np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0
         )
-        return np.asarray(doubt + self.best.residual + FLOOR_SHARE * self.tolerance)
+        floor = 0.1 * self.tolerance  # for what no rival shows
+        return np.asarray(doubt + self.best.residual + floor)
 
     def _steepness(self, d: Array) -> Array:
         """|dt/dD| and what a curve without features would have, 1/um."""
@@ -214,7 +211,7 @@ def sample_adaptively(
         enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(
             simpler.support
         )
-        still = enough and doubt < DOUBT_SHARE * tolerance
+        still = enough and doubt < tolerance / 2
         where = _widest_gap(x, cheaper) if still and calm == 0 else where
         response = solve(where)
         missed = np.abs(fit(np.array([where]))[0] - (response.t, response.r)).max()
@@ -275,7 +272,7 @@ def _suspect(
     ]
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
     even, near = (
-        np.concatenate([np.linspace(low, high, SCAN + 1), cheaper]),
+        np.concatenate([np.linspace(low, high, 1201), cheaper]),
         np.concatenate(around),
     )
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
@@ -284,9 +281,7 @@ def _suspect(
     value = fit(places)[:, 0]
     doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)
     worst = int(np.argmax(doubt))
-    cheap = np.flatnonzero(
-        np.isin(places, cheaper) & (doubt >= CHEAP_SHARE * doubt[worst])
-    )
+    cheap = np.flatnonzero(np.isin(places, cheaper) & (doubt >= doubt[worst] / 2))
     chosen = cheap[np.argmax(doubt[cheap])] if len(cheap) else worst
     return float(places[chosen]), float(doubt[worst])
 

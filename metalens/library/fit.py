@@ -21,16 +21,9 @@ TURN = 2 * math.pi
 LEAST_ENTRIES = 12  # of a domain
 REACH = 2.0  # half-widths from a narrow resonance that are cut with it
 UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
-# of the largest conversion, to which the domain reaches unless the tolerance ends it
-NEAREST_SHARE = 0.85
 # deviation from entries where none is stated, and that of the entries' own bars
 FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
-# of the phase that a domain may lose beside a resonance for its tolerances
-EXCLUDED = 0.1
-POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
-MOST_TERMS = 24  # coefficients in the diameter of one curve
-MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
 
 
@@ -384,7 +377,7 @@ def _followed(
     """
     terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter_um) // 3)
     kept, proxy = _longest(data, wanted, terms)
-    while more < MOST_TERMS and kept.turns < 1 <= data.turns:
+    while more < 24 and kept.turns < 1 <= data.turns:
         more += 2
         with contextlib.suppress(
             DomainError
@@ -411,7 +404,7 @@ def _shorter(
     """
     for count in range(len(data.diameter_um) - 1, LEAST_ENTRIES - 1, -1):
         some = data.part(slice(count))
-        if some.turns < (1 - EXCLUDED) * data.turns:
+        if some.turns < 0.9 * data.turns:
             return None
         fewer = min(terms, count // 3)
         other = _best(some, wanted, fewer)
@@ -497,7 +490,7 @@ def _best(data: MonotonicBranch, wanted: ProxyTolerances, terms: int) -> Proxy |
     tolerances; None where each takes |T| below 0 between the entries.
     """
     found = []
-    for power in POWERS:
+    for power in (3, 2, 1):
         with contextlib.suppress(DomainError):
             found.append(fit_terms(data, power, terms))
     return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
@@ -579,7 +572,7 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
     """
     curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
     for axis in (0, 1):
-        basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), MOST_NODES) - 1)
+        basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), 5) - 1)
         curves = np.moveaxis(
             np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis
         )
@@ -633,7 +626,7 @@ def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
     """
     t, d = library.cross_polarized, library.diameter_um
     middle = int(np.searchsorted(d, library.best_converting_um))
-    least = NEAREST_SHARE * np.abs(t[:, middle]).min()
+    least = 0.85 * np.abs(t[:, middle]).min()  # of the largest conversion
     good = (np.abs(t).min(axis=0) >= least) & ~_sharp(
         library, wanted.least_half_width_um
     )

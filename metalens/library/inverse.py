@@ -15,12 +15,6 @@ from metalens.library.polynomial import ChebyshevCurve
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
 TABLE, DENSE = 4096, 16  # entries of the table, and points of the curve for each
-# what is left of the phase: far below the 1e-10 that is promised, above rounding of 100
-# rad
-SOLVED_RAD = 1e-12
-# Newton's steps at most: each halves the error at least, where a curve is flat at one
-# end, and a double has 53 bits
-MOST_STEPS = 54
 TURN = 2 * math.pi
 
 
@@ -125,13 +119,14 @@ def _newton(
     place -= index
     d = table[index]
     d += place * np.diff(table)[index]
-    for _ in range(MOST_STEPS):
+    for _ in range(54):  # a double has 53 bits
         missed = (
             polynomial.evaluate_horner(p.monomials, polynomial.to_unit_interval(p, d))
             - start
             - target
         )
-        if np.abs(missed).max(initial=0.0) < SOLVED_RAD:
+        # far below the 1e-10 that is promised, above rounding of 100 rad
+        if np.abs(missed).max(initial=0.0) < 1e-12:
             break
         rise = polynomial.slope_of(p, d)
         d -= np.divide(missed, rise, out=np.zeros_like(d), where=rise != 0)

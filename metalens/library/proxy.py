@@ -15,7 +15,6 @@ from metalens.core.errors import DomainError
 from metalens.library import inverse, polynomial
 from metalens.library.inverse import Values, is_tensor
 
-AVERAGED = 65  # diameters over which |t| is averaged
 # of t: the largest tolerance of a library; pillars known less well (root mean square)
 # make no lens
 MOST_ERROR = 0.1
@@ -176,7 +175,7 @@ class Proxy:
         entries, and the entries' own.
         """
         level = np.asarray(
-            self.transmission(np.linspace(*self.domain_um, AVERAGED), wavelength_um)
+            self.transmission(np.linspace(*self.domain_um, 65), wavelength_um)
         ).mean()
         return math.hypot(
             self.max_phase_error_rad,

@@ -21,7 +21,6 @@ from metalens.library.record import PLAIN, Sweep, check_light
 from metalens.library.workers import SweepJournal, Task, fit_curves
 
 TURN = 2 * math.pi
-SAMPLES = 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,9 +243,8 @@ def judge_cell(
         cell: unit cell with its materials, shape and lattice.
         wavelength_um: of the curve, um.
     """
-    d = np.linspace(
-        curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES
-    )
+    nodes = curve.nodes.diameter_um
+    d = np.linspace(nodes.min(), nodes.max(), 600)
     value, error = curve(d)
     hole = (
         cell.shape.hole
@@ -261,12 +259,12 @@ def judge_cell(
         back: np.diff(phase, append=np.inf) < 0,
     }
     faults["an error bar above half of |t|"] = error > UNKNOWN * level
-    sharp = np.zeros(SAMPLES, bool)
+    sharp = np.zeros(len(d), bool)
     for centre, width in curve.resonances(study.least_half_width_um):
         sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
     faults["a narrow resonance"] = sharp
     start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
-    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or [
+    why = [name for name, mask in faults.items() if stop < len(d) and mask[stop]] or [
         "the printable range"
     ]
     run = slice(start, stop)

@@ -21,19 +21,8 @@ from metalens.library.record import PillarLibrary, Sweep, check_sweep
 from metalens.library.workers import SweepJournal, Task
 
 Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
-# half-widths from a resonance at which diameters are added
-AROUND = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)
-FINEST_UM = 1e-4  # resonances narrower than this cannot be printed, and are not sampled
-MOST_ADDED = 400
 POINTS = 8  # entries a task when solved one by one
-WORTH_A_CURVE = 20  # entries above the tolerance: a curve takes about as many solves
-ALL_UP_TO = 6  # values of an axis that are all solved
-NODES = 5  # to begin with where there are more
-# half-width of a resonance that may lie between two nodes and show at neither
-NARROW_UM = 0.005
-MOVES_UM = 0.02  # how far it may move between two nodes
-NEIGHBOURS = 4  # diameters on either side whose changes count
-SAFETY = 3.0  # on the extrapolated error of a polynomial
+NODES = 5  # values of an axis that are solved first, where it has more than six
 
 
 def sweep(
@@ -94,10 +83,10 @@ class _SweepRun:
         )
         diameters = _diameters(self.span, sweep.samples, list(self.curves.values()))
         rows = self.rows(diameters)
-        weak = [
+        weak = [  # a curve takes some twenty solves
             light
             for light, row in rows.items()
-            if light not in self.curves and self.misses(row).sum() > WORTH_A_CURVE
+            if light not in self.curves and self.misses(row).sum() > 20
         ]
         if weak:
             self.solve(weak, "more curves")
@@ -166,7 +155,7 @@ class _SweepRun:
         for light, curve in self.curves.items():
             value, error = curve(diameters)
             rows[light] = np.stack([value[:, 0], value[:, 1], error])
-            sharp[light] = curve.resonances(NARROW_UM)
+            sharp[light] = curve.resonances(0.005)  # between nodes it shows at neither
         sweep = self.sweep
         for polarization in sweep.polarizations:
             for angle in sweep.angles_deg:
@@ -246,14 +235,17 @@ def _diameters(
     scale.
     """
     low, high = span
+    most = 400  # diameters that are added
     even = np.linspace(low, high, samples)
     sharp = np.concatenate([curve.resonances() for curve in curves])
     wide = 3 * (even[1] - even[0])  # well sampled already
-    sharp = sharp[(sharp[:, 1] > FINEST_UM) & (sharp[:, 1] < wide)]
-    added = (sharp[:, :1] + np.array(AROUND) * sharp[:, 1:]).ravel()
+    # resonances narrower than 0.1 nm cannot be printed, and are not sampled
+    sharp = sharp[(sharp[:, 1] > 1e-4) & (sharp[:, 1] < wide)]
+    half_widths = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])
+    added = (sharp[:, :1] + half_widths * sharp[:, 1:]).ravel()
     added = np.unique(np.round(added[(added > low) & (added < high)], 6))
     return np.unique(
-        np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]])
+        np.concatenate([even, added[:: max(1, math.ceil(len(added) / most))]])
     )
 
 
@@ -264,7 +256,7 @@ def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
     keeps that product, the factor of the error of the polynomial through them, small
     everywhere.
     """
-    if len(values) <= ALL_UP_TO:
+    if len(values) <= NODES + 1:
         return values
     x = np.array(values)
     chosen = [0, len(x) - 1]
@@ -310,16 +302,17 @@ def _passed(first: Array, second: Array, diameters: Array) -> Array:
     nodes.
     """
     mask = np.zeros(len(diameters), bool)
+    moves_um = 0.02  # at most, from one node to the next
     for here, there in ((first, second), (second, first)):
         for centre, width in here:
             gap = np.abs(there[:, 0] - centre)
             end = (
                 float(there[np.argmin(gap), 0])
-                if gap.size and gap.min() < MOVES_UM
+                if gap.size and gap.min() < moves_um
                 else None
             )
             low, high = (
-                (centre - MOVES_UM, centre + MOVES_UM)
+                (centre - moves_um, centre + moves_um)
                 if end is None
                 else sorted((centre, end))
             )
@@ -355,9 +348,9 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
                     - without
                 ),
             )
-    one, two = (maximum_filter1d(change, 2 * NEIGHBOURS + 1) for change in (one, two))
+    one, two = (maximum_filter1d(change, 9) for change in (one, two))
     gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
-    row[2] = SAFETY * gain * one + np.abs(weights) @ table[:, 2].real
+    row[2] = 3 * gain * one + np.abs(weights) @ table[:, 2].real
     return row
 
 
