@@ -266,7 +266,7 @@ class PupilModel:
         turn -= k * np.outer(parts["drift_y"] @ self.drift_basis, along_y)
         amplitude = dipoles * np.exp(parts["amplitude"] @ self.amplitude_basis)
         pupil = self._on_square((self.mask * np.exp(1j * turn))[:, None] * amplitude)
-        field = to_y @ (pupil @ to_x)
+        field = self._transform(pupil, to_y, to_x)
         intensity = (field.real**2 + field.imag**2).sum(1)
 
         sample = 2 * spec.numerical_aperture * spec.pixel_um / spec.wavelength_um
@@ -280,27 +280,30 @@ class PupilModel:
 
         out = np.zeros((len(x), *images.shape))
         into, planes = self.unpack(out), np.arange(len(images))
-        ways = 1j * k * np.stack([-along_x, -along_y, along_z])
+        staged = bool(self.sizes["stage"])
+        ways = 1j * k * np.stack([-along_x, -along_y, along_z])[: 2 + staged]
         columns = np.concatenate(
             [self._columns, self._on_square(ways.astype(np.complex64))]
         )
+        slopes = np.empty((len(columns), *images.shape), np.float32)
         pupil, field, to_y, to_x = (
             a.astype(np.complex64) for a in (pupil, field, to_y, to_x)
         )
-        slopes, block = [], max(1, _BLOCK // field.size)
+        block = max(1, _BLOCK // field.size)
         for first in range(0, len(columns), block):
             changed = pupil * columns[first : first + block, None, None]
-            rows = changed.reshape(-1, self.nodes) @ to_x
-            change = to_y @ rows.reshape(*changed.shape[:-1], -1)
+            change = self._transform(changed, to_y, to_x)
             both = field.view(np.float32) * change.view(np.float32)
             slope = 2 * (both[..., ::2] + both[..., 1::2]).sum(2)
-            slopes += list(scale * (slope if sharp else grid.sample(slope, transfer)))
-        *fixed, by_x, by_y, by_z = slopes
-        out[: len(fixed)] = fixed
-        drift = self.drift_basis[:, :, None, None]
-        into["drift_x"][:], into["drift_y"][:] = drift * by_x, drift * by_y
-        if self.sizes["stage"]:
-            into["stage"][planes, planes] = by_z
+            slopes[first : first + block] = (
+                slope if sharp else grid.sample(slope, transfer)
+            )
+        count, drift = len(self._columns), self.drift_basis[:, :, None, None] * scale
+        np.multiply(slopes[:count], scale, out=out[:count])
+        np.multiply(drift, slopes[count], out=into["drift_x"])
+        np.multiply(drift, slopes[count + 1], out=into["drift_y"])
+        if staged:
+            into["stage"][planes, planes] = scale * slopes[-1]
         if not sharp:
             into["blur"][:] = scale * grid.sample(intensity, by_blur)
         into["gain"][planes, planes] = light
@@ -338,6 +341,11 @@ class PupilModel:
             fixed = fixed * detector.pixel_transfer(fy, fx, grid.pixel_um)
         blur, slope = detector.gaussian_transfer(fy, fx, blur_um)
         return fixed * blur, fixed * slope
+
+    def _transform(self, pupil: Array, to_y: Array, to_x: Array) -> Array:
+        """(..., nodes, nodes) to (..., y, x): field by one product along each axis."""
+        rows = pupil.reshape(-1, self.nodes) @ to_x
+        return np.asarray(to_y @ rows.reshape(*pupil.shape[:-1], -1))
 
     def _on_square(self, values: Array) -> Array:
         """(..., inside) to (..., nodes, nodes), 0 outside the pupil."""
