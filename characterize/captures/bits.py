@@ -8,8 +8,6 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError
 
 _DEPTHS = (8, 10, 12, 14, 16)
-# different counts that all lie as stretched ones do: by chance one of 14 bits in 4**32
-_LEAST_KINDS = 32
 _WRAPPED = -(1 << 14)  # below what is left of counts that a dark frame was taken off
 _ROUNDING = 0.01  # counts: float32 keeps a share of 65535 to 0.004
 
@@ -17,148 +15,103 @@ _ROUNDING = 0.01  # counts: float32 keeps a share of 65535 to 0.004
 def right_align(
     images: Array, bits: int | None, where: str, *, beside: Sequence[Array] = ()
 ) -> tuple[Array, int, str, tuple[Array, ...]]:
-    """Undo a left shift or a stretch of 8 to 14-bit counts in 16-bit words and find the
-    depth of the converter.
+    """Undo a left shift of counts in 16-bit words, and what is stated as ``bits``: a
+    stretch over them, or shares of full scale.
+
+    Counts are stretched where they are multiplied by 65535 / (2**bits - 1) and rounded,
+    as image programs save them. Real numbers that are whole are counts; real numbers up
+    to 1 are shares of full scale, 2**bits - 1 or 2**bits, where bits are stated.
 
     Args:
-        bits: as stated with the capture; None finds it from the counts.
-        beside: other images of the same camera (dark, flat). All tell of both together
-            and are shifted alike: a dark
-            frame by itself fits into the bits that its shift takes. Averages (real
-            numbers) are divided.
-
-    Counts are stretched where their highest bits are repeated in the lowest, or where
-    they are multiplied by
-    65535 / (2**b - 1) and rounded, as image programs save them: gaps between levels are
-    then no noise of the camera.
-
-    Frames of real numbers that are whole are counts. Real numbers up to 1, where bits
-    are stated or
-    other images lie beside, are shares of full scale: multiplied by the least of 2**b -
-    1 and 2**b that makes counts of
-    them.
+        images: (n, y, x) frames.
+        bits: of the converter, as stated; None: enough for the counts.
+        where: file or folder, for messages.
+        beside: dark and flat. All tell of their shift together and are shifted alike: a
+            dark frame by itself fits into the bits that its shift takes.
 
     Returns:
         (counts, bits, note in words, counts of those beside).
 
     Raises:
         CaptureError: the counts lie neither in the lowest of the stated bits nor in the
-            highest of 16, or are real and
-            above the stated bits; shares of full scale of which no counts can be made;
-            unsigned words of 16 bits that
-            were written as signed ones.
+            highest of 16, or are real and above the stated bits; shares of full scale
+            of which no counts can be made; unsigned words saved as signed ones.
     """
-    _check_signs((images, *beside), where)
-    scale = _full_scale(images, where) if bits is not None or beside else 1
-    images = _whole(images * scale if scale > 1 else images)
-    others = [
-        a * scale if scale > 1 and a.dtype.kind == "f" and a.max() <= 1 else a
-        for a in beside
-    ]
-    images, depth, note, rest = _aligned(images, bits, where, others)
-    return (
-        images,
-        depth,
-        f"shares of full scale multiplied by {scale}; {note}" if scale > 1 else note,
-        rest,
-    )
-
-
-def _aligned(
-    images: Array, bits: int | None, where: str, beside: Sequence[Array]
-) -> tuple[Array, int, str, tuple[Array, ...]]:
-    """As :func:`right_align`, of counts."""
-    every = (images, *beside)
-    whole = [a for a in every if a.dtype.kind != "f" and a.min() >= 0]
-    if not whole or whole[0] is not images:
+    every = [images, *beside]
+    _check_signs(every, where)
+    note = ""
+    if bits is not None and _is_share(images):
+        scale = _full_scale(images, bits, where)
+        every = [a * scale if _is_share(a) else a for a in every]
+        note = f"shares of full scale multiplied by {scale}; "
+    counts = [_whole(a) for a in every]
+    whole = [a for a in counts if a.dtype.kind != "f" and a.min() >= 0]
+    if not whole or whole[0] is not counts[0]:
         if bits is not None and images.max() >= 1 << bits:
             raise CaptureError(
-                f"{where}: counts are real numbers up to {images.max():.6g}, the capture states {bits} bits (at most "
-                f"{(1 << bits) - 1}); correct bits, or divide by the shift"
+                f"{where}: counts are real numbers up to {images.max():.6g}, the "
+                f"capture states {bits} bits (at most {(1 << bits) - 1}); correct bits, "
+                "or divide by the shift"
             )
-        return (
-            images,
-            bits or 16,
-            "counts are real numbers: taken as they are",
-            tuple(beside),
-        )
-    if depth := _stretched(whole, bits):
-        share = ((1 << depth) - 1) / 65_535
-        back = [
-            np.rint(a * share).astype(a.dtype)
-            if any(a is w for w in whole)
-            else a * share
-            for a in every
+        note += "counts are real numbers: taken as they are"
+        return counts[0], bits or 16, note, tuple(counts[1:])
+    factor, depth, said = _stretch(whole, bits)
+    if not said:
+        shift, depth, said = _alignment(whole, bits, where)
+        factor = 0.5**shift
+    if factor < 1:
+        counts = [
+            np.rint(a * factor).astype(a.dtype)
+            if a.dtype.kind != "f" and a.min() >= 0
+            else a * factor
+            for a in counts
         ]
-        return (
-            back[0],
-            depth,
-            f"{depth}-bit counts were stretched over 16 bits: taken back",
-            tuple(back[1:]),
-        )
-    used = int(
-        np.bitwise_or.reduce(
-            [np.bitwise_or.reduce(a.astype(np.int64), axis=None) for a in whole]
-        )
-    )
-    shift, depth, note = _alignment(used, bits, images.dtype.itemsize, where)
-    if not shift:
-        return images, depth, note, tuple(beside)
-    rest = tuple(
-        a >> shift if any(a is w for w in whole) else a / 2**shift for a in beside
-    )
-    return images >> shift, depth, note, rest
+    return counts[0], depth, note + said, tuple(counts[1:])
 
 
 def _alignment(
-    used: int, bits: int | None, item_bytes: int, where: str
+    whole: Sequence[Array], bits: int | None, where: str
 ) -> tuple[int, int, str]:
-    """(shift to undo, bits of the converter, note in words) of counts whose bits
-    together are ``used``.
-    """
+    """(shift to undo, bits of the converter, note in words) of whole counts."""
+    used = 0
+    for a in whole:
+        used |= int(np.bitwise_or.reduce(a.astype(np.int64), axis=None))
     shift = (used & -used).bit_length() - 1  # -1 where all is dark
-    width = used.bit_length()
+    width, item_bytes = used.bit_length(), whole[0].dtype.itemsize
     if bits is not None and width <= bits:
         return 0, bits, f"{bits} bits as stated"
     if bits is not None and not 16 - bits <= shift < width <= 16:
         raise CaptureError(
-            f"{where}: counts use {width - shift} bits above the lowest {shift}, the capture states {bits}; correct "
-            "bits, or the bit shift"
+            f"{where}: counts use {width - shift} bits above the lowest {shift}, the "
+            f"capture states {bits}; correct bits, or the bit shift"
         )
     if bits is not None:
-        return (
-            16 - bits,
-            bits,
-            f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back",
-        )
-    if shift and width > 12 and item_bytes == 2:
-        return (
-            shift,
-            16 - shift,
-            f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back",
-        )
+        said = f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
+        return 16 - bits, bits, said
+    if shift > 0 and width > 12 and item_bytes == 2:
+        said = f"lowest {shift} bits never used: {16 - shift}-bit counts shifted back"
+        return shift, 16 - shift, said
     depth = next((d for d in _DEPTHS if width <= d), 16) if item_bytes > 1 else 8
     return 0, depth, f"counts of {width} bits: taken as a {depth}-bit converter"
 
 
-def _stretched(whole: Sequence[Array], bits: int | None) -> int:
-    """Depth of counts that are stretched over words of 16 bits; 0 where they are not."""
-    if any(a.dtype.itemsize != 2 for a in whole):
-        return 0
-    met = np.zeros(1 << 16, bool)
-    for a in whole:
-        met[a] = True
-    found = np.flatnonzero(met)
-    if len(found) < _LEAST_KINDS or found[-1] < 1 << (bits or 12):
-        return 0
-    for depth in _DEPTHS[:-1] if bits is None else (min(bits, 16),):
-        free, full = 16 - depth, (1 << depth) - 1
-        count = found >> free
-        repeated = (count << free) | (count >> max(depth - free, 0))
-        scaled = np.rint(np.rint(found * (full / 65_535)) * (65_535 / full))
-        if free and (np.array_equal(found, repeated) or np.array_equal(found, scaled)):
-            return depth
-    return 0
+def _stretch(whole: Sequence[Array], bits: int | None) -> tuple[float, int, str]:
+    """(factor that undoes it, bits, note in words) of counts that are stretched from
+    the stated bits over words of 16; no note where they are not.
+    """
+    if bits is None or bits >= 16 or any(a.dtype.itemsize != 2 for a in whole):
+        return 1.0, 0, ""
+    levels = np.unique(np.concatenate([np.unique(a) for a in whole]))
+    step = 65_535 / ((1 << bits) - 1)
+    count = levels >> (16 - bits)
+    repeated = (count << (16 - bits)) | (count >> max(2 * bits - 16, 0))
+    scaled = np.rint(np.rint(levels / step) * step)
+    over = levels[-1] >= 1 << bits
+    if not over or not (
+        np.array_equal(levels, repeated) or np.array_equal(levels, scaled)
+    ):
+        return 1.0, 0, ""
+    return 1 / step, bits, f"{bits}-bit counts were stretched over 16 bits: taken back"
 
 
 def _check_signs(every: Sequence[Array], where: str) -> None:
@@ -171,8 +124,9 @@ def _check_signs(every: Sequence[Array], where: str) -> None:
     )
     if least < _WRAPPED:
         raise CaptureError(
-            f"{where}: signed counts down to {least}: words of 16 bits without a sign that were saved as signed, or "
-            "with 32768 taken off; save them as unsigned (uint16)"
+            f"{where}: signed counts down to {least}: words of 16 bits without a sign "
+            "that were saved as signed, or with 32768 taken off; save them as unsigned "
+            "(uint16)"
         )
 
 
@@ -187,28 +141,27 @@ def _whole(image: Array) -> Array:
     ):
         return image
     counts = np.rint(image)
-    return (
-        counts.astype(np.uint16) if np.abs(image - counts).max() < _ROUNDING else image
+    near = np.abs(image - counts).max() < _ROUNDING
+    return counts.astype(np.uint16) if near else image
+
+
+def _is_share(image: Array) -> bool:
+    """Whether real numbers are shares of full scale: up to 1, and not all 0 or 1."""
+    return bool(
+        image.dtype.kind == "f"
+        and 0 < image.max() <= 1
+        and not np.array_equal(image, np.rint(image))
     )
 
 
-def _full_scale(images: Array, where: str) -> int:
-    """What shares of full scale are to be multiplied by; 1 for counts."""
-    if (
-        images.dtype.kind != "f"
-        or not 0 < images.max() <= 1
-        or np.array_equal(images, np.rint(images))
-    ):
-        return 1
+def _full_scale(images: Array, bits: int, where: str) -> int:
+    """What shares of full scale are to be multiplied by."""
     shares = np.asarray(images, float)
-    full = (scale for depth in _DEPTHS for scale in ((1 << depth) - 1, 1 << depth))
-    found = next(
-        (s for s in full if np.abs(shares * s - np.rint(shares * s)).max() < _ROUNDING),
-        None,
+    for scale in ((1 << bits) - 1, 1 << bits):
+        if np.abs(shares * scale - np.rint(shares * scale)).max() < _ROUNDING:
+            return scale
+    raise CaptureError(
+        f"{where}: real numbers up to {images.max():.3g}, no counts over the full scale "
+        f"of {bits} bits; save counts as they come from the camera, or multiply frames, "
+        "dark and flat by the full scale in counts"
     )
-    if found is None:
-        raise CaptureError(
-            f"{where}: real numbers up to {images.max():.3g}, no counts over the full scale of a converter; save "
-            "counts as they come from the camera, or multiply frames, dark and flat by the full scale in counts"
-        )
-    return found

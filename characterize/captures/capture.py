@@ -148,18 +148,13 @@ def read_images(path: Path) -> Array:
 
 
 def _stack(
-    path: Path,
-    colours: ColourChannels,
-    order: str | None,
-    *,
-    count: int | None = None,
-    pages: int = 0,
+    path: Path, colours: ColourChannels, order: str | None, *, count: int | None = None
 ) -> Stack:
     """Frames of one file and what to say of their axes."""
     images = read_all(path, colours)
     if order is None and path.suffix.lower() in TIFF:
         order = tiff_pages.page_order(path)
-    images, note = axes.frames_first(images, path, order, count=count, pages=pages)
+    images, note = axes.frames_first(images, path, order, count=count)
     return check_images(colours.pick(images, path, grey=False), path), note
 
 
@@ -355,9 +350,7 @@ def _listed_frames(
             )
         if name not in stacks:
             count = rows_of[name] if stated is None else None
-            stacks[name] = _stack(
-                path, colours, order, count=count, pages=rows.pages(name)
-            )
+            stacks[name] = _stack(path, colours, order, count=count)
         stack = stacks[name][0]
         page = min(met[name], len(stack) - 1) if stated is None else stated
         met[name] += 1

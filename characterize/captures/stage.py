@@ -88,17 +88,6 @@ class StageRows:
     exposure_s: Array
     source: str
 
-    def pages(self, name: str) -> int:
-        """How many pages of a file are listed, from the first on without a gap; 0 where
-        they are not.
-        """
-        listed = {
-            page
-            for file, page in zip(self.files, self.page, strict=True)
-            if file == name and page is not None
-        }
-        return len(listed) if listed == set(range(len(listed))) else 0
-
     @classmethod
     def unknown(cls, names: tuple[str, ...]) -> "StageRows":
         """Rows for frames of which nothing but the name is known."""

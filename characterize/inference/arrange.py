@@ -35,6 +35,7 @@ _TWIN = 0.05
 # of the likeness: by ten times less errors of a made lens were seen to exchange two
 # orientations
 _NEAR = 0.02
+_TWINS = 5e-3  # of the likeness of a twin, within which the plainest is taken
 _TOLD = 40.0  # chi-square between orientations from which on fits may tell them apart
 _SURE = 0.9  # likeness from which on the nominal lens explains the frames
 _ZEROS = 17
@@ -254,11 +255,14 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
     order, reordered, seen = _order(light, expected[0], noise, frames.model)
     orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
     alike, shifts = _ways(frames, expected, orders)
-    orientation, clearly = _orientation(light, expected, noise)
-    if (
-        reordered and clearly
-    ):  # a twin: images that twist with depth look mirrored when reversed
-        reordered, clearly = _plainest(light, expected, noise, order, orientation)
+    stated = np.array([alike[False, k] for k in _EVERY])
+    orientation, clearly = _plainest_turn(stated)
+    if reordered and clearly:
+        # a twin: images that twist with depth look mirrored when reversed
+        twins = (True, 0), (False, orientation), (True, orientation)
+        best = max(alike[way] for way in twins)
+        way = next(way for way in twins if alike[way] > best - _TWINS)
+        reordered, clearly = way[0], way[1] > 0
     chosen = reordered, orientation if clearly else 0
     apart = {k: _apart(k, expected, light, noise) for k in _EVERY}
     found = FrameArrangement(
@@ -364,10 +368,6 @@ def _compare(
     ]
 
 
-def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
-    return float(np.mean([score for score, _ in _compare(light, expected, noise)]))
-
-
 def _order(
     light: Array, expected: Array, noise: Array, model: ForwardModel
 ) -> tuple[Array, bool, bool]:
@@ -408,38 +408,6 @@ def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift that makes them most alike."""
     _, (dy, dx) = normalized_cross_correlation(a, b, 0.0)
     return float(((a - shift_frames(b, (int(dy), int(dx)))) ** 2).sum())
-
-
-def _plainest(
-    light: Array, expected: Both, noise: Array, order: Array, orientation: int
-) -> tuple[bool, bool]:
-    """(reordered, turned): the least that explains the frames, of reordering, turning
-    and both.
-    """
-    turned = orient_frames(light, orientation)
-    ways = {
-        (True, False): light[order],
-        (False, True): turned,
-        (True, True): turned[order],
-    }
-    seen = {way: expected[orientation % 2 if way[1] else 0] for way in ways}
-    scores = {
-        way: _mean_likeness(frames, seen[way], noise) for way, frames in ways.items()
-    }
-    return next(
-        way for way, score in scores.items() if score > max(scores.values()) - 5e-3
-    )
-
-
-def _orientation(light: Array, expected: Both, noise: Array) -> tuple[int, bool]:
-    return _plainest_turn(
-        np.array(
-            [
-                _mean_likeness(orient_frames(light, k), expected[k % 2], noise)
-                for k in _EVERY
-            ]
-        )
-    )
 
 
 def _plainest_turn(scores: Array) -> tuple[int, bool]:

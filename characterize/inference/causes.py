@@ -65,8 +65,8 @@ class ImageChange:
     sigma: of every change, one for all or each its own, how much of it is reckoned with
     where nobody states it: a
     standard deviation, 0 for none.
-    frees: parameters that describe it, but those that are stated exactly. sought:
-    whether it is looked for alone.
+    frees: parameters that describe it. stated: whether one of these is stated without
+    an error. sought: whether it is looked for alone.
     roughly: the change is of the right kind but of an unknown pattern, so that the
     frames cannot bound it by what they
     show of it. of_mask: of the lens itself.
@@ -78,6 +78,7 @@ class ImageChange:
     told: str = ""
     sigma: float | Array = 0.0
     frees: tuple[str, ...] = ()
+    stated: bool = False
     sought: bool = True
     roughly: bool = False
     of_mask: bool = False
@@ -134,7 +135,8 @@ def systematic_changes(
             _LIGHT_STEP,
             held[0] + " {:.3g}",
             sizes,
-            frees,
+            frees or held,
+            not frees,
         )
     yield from _of_phase(task, x, image, slopes)
 
@@ -161,8 +163,7 @@ def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]
             change = (task.model.images(after)[0] - first)[None]
             sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
             words = row.effect.format(before[PLACE["glass_um"]])
-            needs = ("glass_um",) if base else ()
-            frees = () if _exactly(task, name) else (*needs, name)
+            frees = ("glass_um", name) if base else (name,)
             yield ImageChange(
                 words,
                 change,
@@ -170,6 +171,7 @@ def _of_model(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]
                 name + " {:.3g}",
                 sigma,
                 frees,
+                _exactly(task, name),
                 of_mask=name in _OF_MASK,
             )
 

@@ -62,6 +62,7 @@ _ROUNDS, _STAYS = (
     5,
     0.1,
 )  # of rounded counts; sigma by which the last moves nothing farther
+Looked = tuple[FitSolution, ScoreTests, list[ResidualFinding]]
 # chi-square a pixel of frames left out, with what their prediction is uncertain by
 _LEFT_OUT = 1.25
 
@@ -154,10 +155,11 @@ def _fit(
     leans = looked[1].leans if looked else []
     _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
     posterior = uncertainty.explore_posterior(task, ends)
+    doubts = looked[2] if looked else []
     if looked is None or posterior.best is not looked[0]:
-        looked = posterior.best, missing.run_score_tests(task, posterior.best)
+        looked = posterior.best, missing.run_score_tests(task, posterior.best), doubts
     cautions += verdict.quantization_text(frames.gain, whole=frames.count_e > 0)
-    result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
+    result = _result(capture, task, posterior, cautions, frames.gain, looked)
     _refuse(result.problems, options, leans)
     return result
 
@@ -233,20 +235,21 @@ def _unrounded(
 
 def _with_what_is_there(
     task: SearchTask, ends: list[FitSolution], gain: SensorNoise, cautions: list[str]
-) -> tuple[SearchTask, list[FitSolution], tuple[FitSolution, ScoreTests] | None]:
+) -> tuple[SearchTask, list[FitSolution], Looked | None]:
     """The task with parameters of causes that are likely there (:func:`missing.to_fit`)
     and explain the frames better.
 
-    With the last look beside the fit and the solution it was at; None without a known
-    gain.
+    With the last look beside the fit, the solution it was at, and what that contradicts;
+    None without a known gain.
     """
     if not gain.known:
         return task, ends, None
-    looked = missing.run_score_tests(task, ends[0])
+    looked, doubts = missing.run_score_tests(task, ends[0]), list[ResidualFinding]()
     for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
             break
-        cause = _best_cause(task, ends[0], looked.leans)
+        falls = _falls(task, ends[0], looked.leans)
+        cause = next((one for _, one in falls if not one.stated), None)
         if cause is None:
             break
         more = dataclasses.replace(task, free=(*task.free, *cause.frees))
@@ -258,21 +261,22 @@ def _with_what_is_there(
             f"{cause.cause} explains the frames better (chi-square falls by "
             f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
         )
+        doubts += _contradicted(cause, falls)
         task, ends = wide
         looked = missing.run_score_tests(task, ends[0])
-    return task, ends, (ends[0], looked)
+    return task, ends, (ends[0], looked, doubts)
 
 
-def _best_cause(
+def _falls(
     task: SearchTask,
     best: FitSolution,
     leans: list[ScoreTest],
     *,
     out_of_bounds: float = 10.0,
-) -> ScoreTest | None:
-    """The cause whose parameters lower the misfit most; None where none lowers it by
-    half of what the residuals promise, or where a parameter ran to its bound by
-    ``out_of_bounds`` of -2 ln L.
+) -> list[tuple[float, ScoreTest]]:
+    """(fall of the misfit by their parameters, cause), largest first: of those that
+    lower it by half of what the residuals promise, or, where a parameter ran to its
+    bound, by ``out_of_bounds`` of -2 ln L.
     """
     stuck = bool(verdict.at_bounds(task.names, best, task.prior))
     falls: list[tuple[float, ScoreTest]] = []
@@ -280,7 +284,27 @@ def _best_cause(
         fall = best.merit - multistart.merit_with(task, best, cause.frees)
         if fall > (out_of_bounds if stuck else cause.chi2 / 2):
             falls.append((fall, cause))
-    return max(falls, key=lambda pair: pair[0])[1] if falls else None
+    return sorted(falls, key=lambda pair: -pair[0])
+
+
+def _contradicted(
+    fitted: ScoreTest, falls: list[tuple[float, ScoreTest]]
+) -> list[ResidualFinding]:
+    """What is stated without an error and, were it wrong, would explain the frames as
+    well as the cause that is fitted in its place.
+    """
+    most = next(fall for fall, cause in falls if cause is fitted)
+    return [
+        ResidualFinding(
+            f"{one.cause} would explain the frames about as well as {fitted.cause} "
+            f"({math.sqrt(fall):.1f} sigma: chi-square falls by {fall:.0f}), but "
+            f"{', '.join(one.frees)} is held as stated: state it with its error, or "
+            "mend the bench",
+            math.sqrt(fall),
+        )
+        for fall, one in falls
+        if one.stated and fall > most - multistart.MODES_WITHIN
+    ]
 
 
 def _spoken_of(options: FitOptions) -> set[str]:
@@ -317,8 +341,9 @@ def _result(
     found: FitPosterior,
     cautions: list[str],
     gain: SensorNoise,
-    looked: ScoreTests,
+    seen: Looked,
 ) -> AsBuilt:
+    _, looked, doubts = seen
     model, data, solution, names = task.model, task.data, found.best, task.names
     fitted, unseen = (
         dict(zip(names, solution.value.tolist(), strict=True)),
@@ -327,7 +352,7 @@ def _result(
     covariance = _with_gain(names, found, gain)
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
-    findings = _findings(task, solution, looked)
+    findings = [*_findings(task, solution, looked), *doubts]
     more, value = uncertainty.REACH * unstated.sigma, solution.value
     return AsBuilt(
         design=model.lens,

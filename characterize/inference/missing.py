@@ -58,9 +58,9 @@ class ScoreTest:
 
     taken: what takes it up, in words, where the fit cannot tell it from what is fitted;
     empty where it can.
-    frees: parameters that describe it and that nobody states exactly. odds: for it, as
-    large as is reckoned with,
-    against its absence; 0 where no size is known.
+    frees: parameters that describe it. stated: whether one is stated without an error:
+    it is not fitted then. odds: for it, as large as is assumed, against its absence; 0
+    where no size is known.
     """
 
     cause: str
@@ -70,6 +70,7 @@ class ScoreTest:
     taken: str = ""
     frees: tuple[str, ...] = ()
     odds: float = 0.0
+    stated: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -190,13 +191,12 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
             odds = (
                 fit.odds(unstated[one.cause])
-                if one.cause in unstated and one.frees
+                if one.cause in unstated and one.frees and not one.stated
                 else 0.0
             )
+            about = {"taken": taken, "frees": one.frees, "stated": one.stated}
             found.append(
-                dataclasses.replace(
-                    fit.lean(one.cause, change), taken=taken, frees=one.frees, odds=odds
-                )
+                dataclasses.replace(fit.lean(one.cause, change), odds=odds, **about)
             )
     found.append(_ghost(task, x, image, root, fit))
     if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(
@@ -237,8 +237,8 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
 def to_fit(
     found: list[ScoreTest], *, stuck: bool = False, most: int = 5
 ) -> list[ScoreTest]:
-    """Causes that free parameters describe and that may be fitted next, likeliest
-    first.
+    """Causes that free parameters describe and that may explain the frames, likeliest
+    first; with those that are stated otherwise without an error.
 
     Those that the residuals lean to beyond chance; else those that are likelier there
     than not.
@@ -251,7 +251,9 @@ def to_fit(
     some = [one for one in found if one.frees]
     told = [one for one in some if one.chance < CHANCE]
     likely = sorted((one for one in some if one.odds > ODDS), key=lambda one: -one.odds)
-    return (some if stuck else told or likely)[:most]
+    if stuck:
+        told = [one for one in some if not one.stated]
+    return (told or likely)[:most]
 
 
 def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
@@ -275,12 +277,14 @@ def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
             "state the light of every frame, by a monitor diode, in proportion as "
             "exposure_s of stage.csv"
         )
+    sigma = float(stats.norm.isf(max(first.chance, 1e-300) / 2))
+    why = "as stated" if first.stated else "not fitted"
     said = (
-        f"residuals lean towards {first.cause}, which is not fitted (chi-square "
-        f"{first.chi2:.0f} with {first.degrees} degrees of freedom){more}: intervals "
-        f"hold only if it is absent; {cure}"
+        f"residuals lean towards {first.cause}, which is {why} ({sigma:.1f} sigma: "
+        f"chi-square {first.chi2:.0f} with {first.degrees} degrees of freedom){more}: "
+        f"intervals hold only if it is absent; {cure}"
     )
-    return [ResidualFinding(said, float(stats.norm.isf(max(first.chance, 1e-300) / 2)))]
+    return [ResidualFinding(said, sigma)]
 
 
 def misplaced_windows_text(found: list[ScoreTest]) -> list[str]:

@@ -189,6 +189,27 @@ def test_uneven_light_is_found_fitted_and_the_rest_comes_back(response):
 
 
 @pytest.mark.slow
+def test_a_wrong_pixel_pitch_that_is_stated_as_exact_is_named():
+    """Pixels 1 % smaller than stated, to which bright frames of a wider lens tell 7
+    sigma; uneven light of 0.1 would do as well.
+    """
+    lens = hidden.lens(200.0, 900.0, 6000.0)
+    session = hidden.session(
+        0,
+        values=hidden.hidden(0, scale=8.0),
+        depths_um=(4300.0, 4900.0, 5600.0, 6300.0, 7400.0, 9200.0),
+        pixel_um=2.4,
+        pixels=32,
+        peak_e=40000.0,
+        bits=14,
+    )
+    seen = bench.shoot(lens, bench.with_faults(session, pixel_error=-0.01)).capture
+    seen.about["pixel_sigma_um"] = 0.0
+    with pytest.raises(FitError, match=r"a wrong pixel pitch .*\(\d\.\d sigma"):
+        characterize.fit(seen, lens)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault", [{"glass_um": 100.0}, {"stitch_nm": 60.0}, {"sidewall_deg": 1.5}]
 )

@@ -46,18 +46,6 @@ def test_the_number_of_rows_says_that_frames_run_along_the_last_axis(tmp_path, n
     assert words in found.corrections
 
 
-def test_pages_from_the_first_on_say_it_too(tmp_path):
-    stage = "file,page,depth_um\n" + "".join(
-        f"s.h5,{k},{9 - k}\n" for k in (3, 0, 4, 1, 2)
-    )
-    found = capture.load(folder(tmp_path, "s.h5", np.moveaxis(FRAMES, 0, 2), stage))
-    assert np.array_equal(found.frames, FRAMES[[3, 0, 4, 1, 2]])
-    assert (
-        "s.h5 taken as (y, x, n), 5 frames of 26 x 19 pixels, since its pages 0 to 4 are listed"
-        in found.corrections
-    )
-
-
 def test_a_number_that_fits_both_axes_means_the_first(tmp_path):
     frames = FRAMES[:, :, :5]
     found = capture.load(folder(tmp_path, "s.h5", frames, rows("s.h5", 5)))
@@ -107,8 +95,7 @@ def test_a_lone_stack_that_reads_like_rows_is_refused_until_its_axes_are_stated(
 
 
 @pytest.mark.parametrize(
-    "shape",
-    [(5, 26, 19), (30, 12, 12), (12, 12, 19), (9, 26, 9), (40, 24, 12), (1, 26, 5)],
+    "shape", [(5, 26, 19), (30, 12, 12), (12, 12, 19), (9, 26, 9), (1, 26, 5)]
 )
 def test_stacks_of_frames_of_usual_shapes_are_taken_as_they_lie(tmp_path, shape):
     lying = RNG.integers(37, 4096, shape).astype(np.uint16)
@@ -156,30 +143,6 @@ def test_other_axes_are_refused(tmp_path):
         capture.load(
             folder(tmp_path, "s.h5", FRAMES, rows("s.h5", 5), ABOUT + 'axes = "nxy"\n')
         )
-
-
-@pytest.mark.parametrize(
-    ("shape", "told"),
-    [((64, 48, 40), True), ((12, 12, 19), True), ((9, 26, 19), False)],
-)
-def test_how_a_stack_was_taken_is_told_where_the_other_way_is_as_likely(
-    tmp_path, shape, told
-):
-    """64 frames of 48 x 40 pixels or 40 of 64 x 48; 12 of 12 x 19 or 19 of 12 x 12."""
-    first, second, last = shape
-    stack(tmp_path / "s.h5", RNG.integers(37, 4096, shape).astype(np.uint16))
-    taken = f"s.h5 taken as (n, y, x), {first} frames of {second} x {last} pixels; if it is {last} frames of {first} x "
-    assert (
-        any(
-            words.startswith(taken)
-            for words in capture.load(tmp_path / "s.h5").corrections
-        )
-        == told
-    )
-    (tmp_path / "s.toml").write_text('axes = "nyx"\n')
-    assert not any(
-        "(n, y, x)" in words for words in capture.load(tmp_path / "s.h5").corrections
-    )
 
 
 def test_pages_that_were_written_one_by_one_are_frames_however_narrow(tmp_path):
