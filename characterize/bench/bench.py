@@ -22,7 +22,6 @@ from characterize.model import (
     parameter_vector,
 )
 from metalens import psf
-from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import FitError
 from metalens.fabrication import Sensitivity
@@ -31,9 +30,7 @@ from metalens.lens import Lens
 FINE = 9
 _SPECTRUM = 1e-5  # of a mean over it: a fiftieth of what the fit allows itself
 _MARGIN = 4  # pixels about the window that blur may reach in from
-_TOGETHER = (
-    1_000_000  # fine samples of the frames that are computed together, by one worker
-)
+_TOGETHER = 1_000_000  # fine samples of the frames that are computed together
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,21 +178,20 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
         raise FitError(
             f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens"
         )
-    tasks = []
+    random = np.random.default_rng(truth.seed + 1)
+    noise = random.standard_normal(lens.diameters.diameter_um.shape)
+    noise_um = noise * (truth.diameter_noise_nm * 1e-3)
+    frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
     line = SpectralLine.of(lens, depth, angles, tolerance=_SPECTRUM)
     for offset_nm, weight in line.colours(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
-        tasks += [
-            _Task(colour, weight, way, index, depth[index])
-            for way, index in _alike(lens, truth, colour, depth, angles)
-        ]
-    frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
-    seen = executor.gather_parallel(
-        _shown, _Made(lens, truth, response), tasks, beside=False
-    )
-    for task, light in zip(tasks, seen, strict=True):
-        frames[task.index] += task.weight * light
+        for way, index in _alike(lens, truth, colour, depth, angles):
+            t = made.as_built_transmission(
+                lens, response, colour, noise_um=noise_um, angle_rad=way.incidence_rad
+            )
+            seen = _frames(lens, truth, colour, t, way, depth[index])
+            frames[index] += weight * seen
     return np.asarray(
         frames
         / FilmStack.of(lens.layers, lens.wavelength_um).apparent_um(
@@ -255,61 +251,6 @@ def _alike(
     for way, index in ways.items():
         for first in range(0, len(index), most):
             yield way, index[first : first + most]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Task:
-    """Frames of one colour, (parameters, weight in the spectrum), whose light comes the
-    same way; their (n,) depths.
-    """
-
-    x: Array
-    weight: float
-    way: _Way
-    index: list[int]
-    depth_um: Array
-
-
-@dataclass(eq=False, slots=True)
-class _Made:
-    """The hidden lens; light of its pillars for the colour and incidence that were
-    asked for last is kept.
-
-    noise_um: (y, x) errors of the diameters, drawn by whoever needs them first: a seed
-    travels lighter than a map.
-    """
-
-    lens: Lens
-    truth: HiddenLens
-    response: Sensitivity
-    kept: tuple[tuple[bytes, float], Array] | None = None
-    noise_um: Array | None = None
-
-    def pillars(self, x: Array, incidence_rad: float) -> Array:
-        """(y, x) complex transmission."""
-        key = x.tobytes(), incidence_rad
-        if self.kept is None or self.kept[0] != key:
-            if self.noise_um is None:
-                random = np.random.default_rng(self.truth.seed + 1)
-                noise = random.standard_normal(self.lens.diameters.diameter_um.shape)
-                self.noise_um = np.asarray(noise) * (
-                    self.truth.diameter_noise_nm * 1e-3
-                )
-            t = made.as_built_transmission(
-                self.lens,
-                self.response,
-                x,
-                noise_um=self.noise_um,
-                angle_rad=incidence_rad,
-            )
-            self.kept = key, t
-        return self.kept[1]
-
-
-def _shown(hidden: _Made, task: _Task) -> Array:
-    """(n, y, x) frames of one task."""
-    t = hidden.pillars(task.x, task.way.incidence_rad)
-    return _frames(hidden.lens, hidden.truth, task.x, t, task.way, task.depth_um)
 
 
 def _frames(
