@@ -5,7 +5,7 @@ for along that (score test).
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -443,61 +443,58 @@ class FitAtMode:
         )
 
 
+def _strongest(
+    changes: Iterable[Array], root: Array, fit: FitAtMode
+) -> tuple[float, int, float]:
+    """(chi-square, index, chance) of the one of many (n, y, x) changes above 0 that
+    explains most; its chance is that of the best of all.
+    """
+    best, place, count = 0.0, 0, 0
+    for one in changes:
+        change = (one * root).reshape(1, -1)
+        left, score = fit.left(change)
+        seen = float((change * left).sum())
+        if seen > 1e-3 * float((change**2).sum()) and score[0] > 0:
+            chi2 = float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
+            best, place = max((best, place), (chi2, count))
+        count += 1
+    return best, place, min(1.0, count * float(stats.chi2.sf(best, 1)) / 2)
+
+
 def _ghost(
     task: SearchTask, x: Array, image: Array, root: Array, fit: FitAtMode
 ) -> ScoreTest:
-    """The shift of the light at which a fainter copy of it explains most; its chance is
-    that of the best of many.
-    """
+    """The shift of the light at which a fainter copy of it explains most."""
     light = image - background_planes(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
+    steps = range(-reach, reach + 1)
     places = [
-        (i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)
+        (i, j) for i in steps for j in steps if max(abs(i), abs(j)) >= _NEAREST_PX
     ]
-    places = [p for p in places if max(abs(p[0]), abs(p[1])) >= _NEAREST_PX]
     places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
-    best = 0.0
-    for shift in places:
-        copy = (shift_frames(light, shift) * root).reshape(1, -1)
-        left, score = fit.left(copy)
-        seen = float((copy * left).sum())
-        if seen > 1e-3 * float((copy**2).sum()) and score[0] > 0:
-            best = max(
-                best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
-            )
-    chance = min(1.0, len(places) * float(stats.chi2.sf(best, 1)) / 2)
-    return ScoreTest(
-        "a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance
-    )
+    copies = (shift_frames(light, shift) for shift in places)
+    best, _, chance = _strongest(copies, root, fit)
+    words = "a ghost: a fainter, shifted copy of the light"
+    return ScoreTest(words, best, int(bool(places)), chance)
 
 
 def _patch(task: SearchTask, x: Array, root: Array, fit: FitAtMode) -> ScoreTest:
-    """The place on the lens whose light, left out, explains most; its chance is that of
-    the best of many.
+    """The place on the lens whose light, left out, explains most.
 
     The light that is left out of a spot is linear in its depth, as long as it is a
     small share of all: -2 Re(E* E_s).
     """
     u, v = _places()
     names = [f"residual_{k}" for k in range(len(u))]
-    dark = np.asarray(
-        task.model.with_residual(np.zeros(len(u)), _spots).images(x, names)[1]
-    )
-    best, place = 0.0, 0
-    for k, one in enumerate((dark * root).reshape(len(u), 1, -1)):
-        left, score = fit.left(one)
-        seen = float((one * left).sum())
-        if seen > 1e-3 * float((one**2).sum()) and score[0] > 0:
-            chi2 = float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
-            best, place = max((best, place), (chi2, k))
+    model = task.model.with_residual(np.zeros(len(u)), _spots)
+    dark = np.asarray(model.images(x, names)[1])
+    best, place, chance = _strongest(dark, root, fit)
     x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
-    chance = min(1.0, len(u) * float(stats.chi2.sf(best, 1)) / 2)
-    return ScoreTest(
-        f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the lens",
-        best,
-        1,
-        chance,
+    words = (
+        f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the "
+        "lens"
     )
+    return ScoreTest(words, best, 1, chance)
 
 
 def _places() -> tuple[Array, Array]:
