@@ -137,8 +137,9 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """Total 95 % interval: the profile interval and the unstated effects, in
-        quadrature.
+        """Total (marginal) 95 % interval: the profile interval and what is open about
+        the unstated effects, in quadrature, about the value less what these effects, as
+        large as the frames make likely, do to it; no less than the statistical one.
         """
         return _ends(
             self.names.index(name), self.value, self.covariance, self.low, self.high

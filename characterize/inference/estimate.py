@@ -353,7 +353,8 @@ def _result(
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
     findings = [*_findings(task, solution, looked), *doubts]
-    more, value = uncertainty.REACH * unstated.sigma, solution.value
+    more, value = uncertainty.REACH * unstated.spread, solution.value
+    centre = value - unstated.mean
     return AsBuilt(
         design=model.lens,
         response=model.response,
@@ -390,8 +391,8 @@ def _result(
             *verdict.held_back(names, solution, task.prior),
             *missing.decisive_findings(findings),
         ),
-        low=value - np.hypot(value - within.low, more),
-        high=value + np.hypot(within.high - value, more),
+        low=np.minimum(centre - np.hypot(value - within.low, more), within.low),
+        high=np.maximum(centre + np.hypot(within.high - value, more), within.high),
         draws=_drawn(task, found.draws, unstated),
         within=within,
         curves={

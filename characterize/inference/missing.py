@@ -90,12 +90,15 @@ class ScoreTests:
     of_mask: frozenset[str] = frozenset()
 
     def reckoned(self) -> "UnmodelledShifts":
-        """What the causes may have done to the parameters; see :meth:`Fitted.likely`."""
+        """What the causes may have done to the parameters; see
+        :meth:`FitAtMode.amounts`.
+        """
         names, p = tuple(self.unstated), len(self.fit.names)
         if not names:
             return UnmodelledShifts.none(p)
         every = np.concatenate([self.unstated[name] for name in names])
-        moved, second = self.fit.moved_by(every), np.eye(len(every))
+        moved, open_ = self.fit.moved_by(every), np.eye(len(every))
+        amount = np.zeros(len(every))
         exact = np.concatenate(
             [
                 np.full(len(part), name not in self.roughly)
@@ -103,7 +106,9 @@ class ScoreTests:
             ]
         )
         if exact.any():
-            second[np.ix_(exact, exact)] = self.fit.likely(every[exact])
+            part, pull = self.fit.amounts(every[exact])
+            open_[np.ix_(exact, exact)], amount[exact] = part, part @ pull
+        second = open_ + np.outer(amount, amount)
         first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
         own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
         by_cause = [
@@ -117,8 +122,14 @@ class ScoreTests:
             ]
         )
         bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
+        spread = np.einsum("pi,ij,pj->p", moved, open_, moved)
         return UnmodelledShifts(
-            names, np.sqrt(np.maximum(by_cause, 0)), moved @ second @ moved.T, bench
+            names,
+            np.sqrt(np.maximum(by_cause, 0)),
+            moved @ second @ moved.T,
+            bench,
+            moved @ amount,
+            np.sqrt(np.maximum(spread, 0)),
         )
 
 
@@ -130,17 +141,22 @@ class UnmodelledShifts:
     covariance: (p, p) second moment of the shifts by all of them. bench: the same by
     those that the lens leaves behind
     with the bench; the others act on its light as the parameters do that took them up.
+    mean, spread: (p,) expected shift of each parameter by all of them, given the
+    frames, and its standard deviation.
     """
 
     causes: tuple[str, ...]
     by_cause: Array
     covariance: Array
     bench: Array
+    mean: Array
+    spread: Array
 
     @classmethod
     def none(cls, p: int) -> "UnmodelledShifts":
         """Every cause stated."""
-        return cls((), np.zeros((0, p)), np.zeros((p, p)), np.zeros((p, p)))
+        nothing = np.zeros((0, p)), np.zeros((p, p)), np.zeros((p, p))
+        return cls((), *nothing, np.zeros(p), np.zeros(p))
 
     @property
     def sigma(self) -> Array:
@@ -369,19 +385,6 @@ class FitAtMode:
         """(p, k) shift M of the parameters by (k, pixels) changes."""
         return np.asarray(np.linalg.solve(self.known, self.slopes @ changes.T))
 
-    def likely(self, changes: Array) -> Array:
-        """(k, k) second moment of the factors c of (k, pixels) changes of one standard
-        deviation each, by the frames.
-
-        With H = GᵀG' and S the scatter of their scores s, c is (1 + H S⁻¹ H)⁻¹ H S⁻¹ s,
-        known to (1 + H S⁻¹ H)⁻¹. As
-        the error is counted from the fit, a cause that seems to be there widens
-        intervals to where they would be.
-        """
-        open_, told = self._open(changes)
-        likely = open_ @ told
-        return np.asarray(open_ + np.outer(likely, likely))
-
     def odds(self, changes: Array) -> float:
         """For (k, pixels) changes of one standard deviation each, in some amount,
         against their absence (Bayes factor).
@@ -389,13 +392,15 @@ class FitAtMode:
         With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to
         exp(tᵀC t / 2) (det C)^½.
         """
-        open_, told = self._open(changes)
+        open_, told = self.amounts(changes)
         size = float(told @ open_ @ told) / 2 + float(np.linalg.slogdet(open_)[1]) / 2
         return math.exp(min(size, 100.0))
 
-    def _open(self, changes: Array) -> tuple[Array, Array]:
-        """(k, k) C = (1 + H S⁻¹ H)⁻¹ and (k,) H S⁻¹ s of changes whose amounts scatter
-        by one about 0.
+    def amounts(self, changes: Array) -> tuple[Array, Array]:
+        """Posterior of the factors c of (k, pixels) changes G of one standard deviation
+        each, given the frames: (k, k) covariance C and (k,) H S⁻¹ s, of mean C H S⁻¹ s.
+
+        With H = GᵀG' and S the scatter of their scores s, C = (1 + H S⁻¹ H)⁻¹.
         """
         left, score = self.left(changes)
         seen = changes @ left.T
