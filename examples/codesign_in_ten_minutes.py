@@ -24,9 +24,9 @@ from codesign.network.architecture import Architecture, SearchSpace
 from codesign.network.supernet import recalibrate_batch_norm
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
-from codesign.train import assess, inner
-from codesign.train.depth_test import depth_response
-from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
+from codesign.train import assess, make_model
+from codesign.train.assess import depth_response
+from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image.sensor import Sensor
 
 # %% [markdown]
@@ -81,7 +81,7 @@ def train(polynomials, steps=200):
     config = InnerConfig(
         steps=steps, batch=32, optics=moving, optics_weight=0.0, slip_weight=8.0
     )
-    made = inner.make_model(lens, pitch_um=9.0, seed=0, space=space)
+    made = make_model(lens, pitch_um=9.0, seed=0, space=space)
     trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
     losses = [record.task for record in trainer.run()]
     seen = assess.sensor_frames(trainer, batches, 6)

@@ -5,7 +5,7 @@ import torch
 from codesign.batches import EyeScenes, SceneConfig, sensor_irradiance
 from codesign.optics import OpticsConfig
 from codesign.optics.stack import lens_psf_stack, stack_imager
-from codesign.train.formation import read_out
+from codesign.train.imaging import read_out
 from metalens.image import Sensor
 
 lens = OpticsConfig(image="uniform", polynomials=8, sample_um=24.0, window_samples=17)

@@ -27,9 +27,10 @@ from characterize.inference.estimate import FitOptions, fit
 from characterize.model.parameters import KnownValue
 from codesign.adapt import correction
 from codesign.adapt import report as retrain_report
+from codesign.adapt import source as finished
 from codesign.adapt import train as retraining
-from codesign.adapt.settings import RetrainConfig
 from codesign.optics import built
+from codesign.settings import RetrainConfig
 from metalens import lens as lenses
 from metalens.cli import main
 from metalens.fabrication import proxy_sensitivity
@@ -124,7 +125,7 @@ display(Image(retrain_report.plot_error_bars(told)))
 # A new bias table and a corrected map, and what they would gain on the true lens.
 
 # %%
-optics = retraining.load_finished_run(work / "run").settings.optics
+optics = finished.load_finished_run(work / "run").settings.optics
 engine = built.MadeLens(design, optics)
 plan = correction.propose_correction(
     design,

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from codesign.train import checkpoint
-from codesign.train.inner import InnerConfig
+from codesign.train.trainer import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
 from metalens.core import store, transaction
 from tests.fuzz import test_file_fuzz as artefacts

@@ -23,9 +23,9 @@ from codesign.network.supernet import Supernet
 from codesign.optics import formed
 from codesign.optics import stack as optics
 from codesign.optics.stack import OpticsConfig
-from codesign.train import inner
-from codesign.train.formation import read_out
-from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
+from codesign.train import make_model
+from codesign.train.imaging import read_out
+from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.image import sensor as camera
 from metalens.image.pupil import psf
 from metalens.image.sensor import Sensor
@@ -322,7 +322,7 @@ def _trainer(
     settings = InnerConfig(
         steps=10_000, batch=BATCH, optics=lens, pitch=pitch, optics_weight=0.0
     )
-    fresh = inner.make_model(of, pitch_um=9.0, seed=0, space=SPACE)
+    fresh = make_model(of, pitch_um=9.0, seed=0, space=SPACE)
     return Trainer(
         settings, of, SENSOR, PoolScenes(made, 16, 0.2, 0), fresh, architecture=member
     )
@@ -423,7 +423,7 @@ def _anew(of: OpticsConfig) -> float:
 
 def _forward(member: Architecture) -> float:
     """Seconds a frame of a network's forward pass as it trains."""
-    net = inner.make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.train()
+    net = make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.train()
     frames = torch.randn(BATCH, 1, 128, 128).contiguous(
         memory_format=torch.channels_last
     )
@@ -449,7 +449,7 @@ def _compiled(threads: int) -> list[Row]:
             )
         ]
     member, frames = _member(0.5, 2), torch.randn(8, 1, 128, 128)
-    net = inner.make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.eval()
+    net = make_model(OPTICS, pitch_um=9.0, seed=0, space=SPACE).net.eval()
     quick = torch.compile(lambda x: net(x, member).slip)
     with torch.no_grad():
         error = float((quick(frames) - net(frames, member).slip).abs().max())

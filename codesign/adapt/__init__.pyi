@@ -1,13 +1,9 @@
 from . import correction as correction
 from . import report as report
 from . import retrained as retrained
-from . import sure as sure
+from . import source as source
 from . import train as train
-from .reading import bootstrap_interval as bootstrap_interval
-from .reading import bootstrap_ratio as bootstrap_ratio
-from .settings import RetrainConfig as RetrainConfig
 from .source import FinishedRun as FinishedRun
 from .source import lens_file as lens_file
-from .source import restore_weights as restore_weights
 from .source import weights_file as weights_file
 from .train import LensPsfs as LensPsfs

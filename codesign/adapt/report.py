@@ -80,7 +80,12 @@ def _share(o: RetrainingOutcome) -> str:
     return "no gap beyond chance" if o.recovered is None else f"{o.recovered:.0%}"
 
 
-def _accuracy(story: RetrainingResults) -> Section:
+def accuracy_table(outcome: RetrainingOutcome) -> Table:
+    """A row a case.
+
+    Args:
+        outcome: accuracy of all cases.
+    """
     head = (
         "case",
         "slippage error / mm",
@@ -92,7 +97,7 @@ def _accuracy(story: RetrainingResults) -> Section:
         "pupil IoU",
     )
     rows: list[tuple[Any, ...]] = []
-    for name, v in story.outcome.rows().items():
+    for name, v in outcome.rows().items():
         interval = f"{v['slip_low_mm']:.3f} to {v['slip_high_mm']:.3f}"
         rows.append(
             (
@@ -106,6 +111,10 @@ def _accuracy(story: RetrainingResults) -> Section:
                 v["iou"],
             )
         )
+    return Table(head, rows, digits=3)
+
+
+def _accuracy(story: RetrainingResults) -> Section:
     text = (
         "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
         "trained on for as many steps as the others, so that no case is credited with more training. The finer image "
@@ -119,7 +128,7 @@ def _accuracy(story: RetrainingResults) -> Section:
                 plot_error_bars(story.outcome),
                 "Slippage error, with its 95 % interval.",
             ),
-            Table(head, rows, digits=3),
+            accuracy_table(story.outcome),
             Figure(_curves(story), "Loss while training on."),
         ],
     )

@@ -11,9 +11,14 @@ from typing import Any
 from characterize.bench import HiddenLens
 from characterize.inference import asbuilt
 from codesign.adapt import train as retraining
-from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.source import FinishedRun, is_retraining, lens_file
+from codesign.adapt.source import (
+    FinishedRun,
+    is_retraining,
+    lens_file,
+    load_finished_run,
+)
 from codesign.optics import MadeLens
+from codesign.settings import RetrainConfig
 from codesign.train import RunConfig, checkpoint
 from metalens import lens as lenses
 from metalens.core import config, store, transaction
@@ -94,7 +99,7 @@ def load_retrained(path: Path) -> FinishedRun:
     """
     folder = _folder(path)
     if not is_retraining(folder):
-        return retraining.load_finished_run(path)
+        return load_finished_run(path)
     job = "retrained" if path == folder else path.stem
     transaction.check_manifest(folder)
     recipe, places = config.load(folder / RECIPE, RetrainingRecipe), _places(folder)
@@ -104,7 +109,7 @@ def load_retrained(path: Path) -> FinishedRun:
         ("truth", recipe.truth),
     ):
         _unchanged(folder, name, places[name], sha)
-    source = retraining.load_finished_run(
+    source = load_finished_run(
         _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
     )
     built = asbuilt.load(_known(places["asbuilt"]))

@@ -80,7 +80,7 @@ def load_finished_run(folder: Path, *, budget_mmacs: float = 0.0) -> FinishedRun
             f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
         )
     architecture = architecture_of(found[0]["architecture"], made, folder)
-    restore_weights(made, found[0], folder)
+    restore_network(made, found[0], folder)
     return FinishedRun(made, architecture, found[0])
 
 
@@ -105,7 +105,7 @@ def lens_file(folder: Path, settings: RunConfig, budget_mmacs: float) -> Path:
     return folder / f"{name}.h5"
 
 
-def restore_weights(run: CodesignRun, row: dict[str, Any], folder: Path) -> None:
+def restore_network(run: CodesignRun, row: dict[str, Any], folder: Path) -> None:
     """Give the run's network the weights that a row of result.json was judged with.
 
     Without fine-tuning those are the checkpoint's own; networks with optics of their

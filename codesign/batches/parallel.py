@@ -67,7 +67,7 @@ def wait_for_all() -> None:
         dist.barrier()
 
 
-def part_of(batch: FrameBatch) -> FrameBatch:
+def batch_share(batch: FrameBatch) -> FrameBatch:
     """The frames of a batch that this process takes.
 
     Raises:

@@ -92,7 +92,7 @@ def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoolScenes:
-    """Batches from a pool; see :class:`codesign.train.inner.Scenes`.
+    """Batches from a pool; see :class:`codesign.batches.SceneSource`.
 
     Every pass over the pool has an order of its own, and every frame a new scale each
     time it is drawn.

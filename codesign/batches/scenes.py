@@ -13,6 +13,7 @@ from codesign.batches.batch import EyePose, FrameBatch
 from codesign.eye import (
     POPULATION,
     CameraRig,
+    DrawnAugmentations,
     EyeStates,
     MotionRanges,
     PinholeCamera,
@@ -129,7 +130,7 @@ class SceneConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EyeScenes:
-    """Frames by number; see :class:`codesign.train.inner.Scenes`.
+    """Frames by number; see :class:`codesign.batches.SceneSource`.
 
     seed, stream: choose the subjects and states.
     """
@@ -198,6 +199,37 @@ class EyeScenes:
             size: frames of a step.
         """
         return as_batch(self.rendered(step, size), self.margin)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StateScenes:
+    """Frames of given states, batch after batch, with what each of them has.
+
+    scenes: rig, camera and margin. stream: of the noise.
+    """
+
+    scenes: EyeScenes
+    states: EyeStates
+    worn: DrawnAugmentations
+    stream: int
+
+    @property
+    def margin(self) -> int:
+        """Samples around the frame that are blurred in but not seen."""
+        return self.scenes.margin
+
+    def batch(self, step: int, size: int) -> FrameBatch:
+        """Frames of a step; fewer, or none, where the states end.
+
+        Args:
+            size: frames of a step.
+        """
+        rows = slice(step * size, (step + 1) * size)
+        rig, camera = self.scenes.rig, self.scenes.camera
+        made = render_dressed(
+            self.states[rows], self.worn[rows], rig=rig, camera=camera
+        )
+        return as_batch(made, self.margin)
 
 
 def augmented_frames(

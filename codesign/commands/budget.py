@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from characterize.inference import asbuilt
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.commands.options.budget import Options
 from codesign.evaluate.error_budget import (
     MEASURED,
@@ -48,11 +48,11 @@ def run(options: Options) -> int:
         links = options.console.track(budget.entries(), total=19, label="links")
         rows = list(links)
         save_budget(draft.path, rows, origin)
-        write_page(draft.path.with_suffix(".html"), rows)
+        write_budget_page(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), plot_budget(rows))
     values = {"rows": [dataclasses.asdict(row) for row in rows], **budget_summary(rows)}
     light = of_light(made)
-    words = "\n".join(filter(None, [budget_text(rows), light]))
+    words = "\n".join(filter(None, [budget_table(rows).text, light]))
     return options.console.judged(
         _plain(values | {"light": light}), words, budget.above
     )
@@ -132,7 +132,7 @@ def load_budget(path: Path) -> list[BudgetEntry]:
     return [BudgetEntry(*row) for row in zip(*columns, strict=True)]
 
 
-def write_page(path: Path, rows: list[BudgetEntry]) -> None:
+def write_budget_page(path: Path, rows: list[BudgetEntry]) -> None:
     """One page: chart, table, how each number was determined.
 
     Args:
@@ -152,15 +152,24 @@ def write_page(path: Path, rows: list[BudgetEntry]) -> None:
         "the device's image. What a network was trained with is shown switched off and is not in the sum. Without a "
         "run nothing reads gaze."
     )
-    head = ("link", "phase / rad", "PSF, relative", "gaze / deg", "method")
     picture = report.Figure(
         plot_budget(rows), "Error of each link, log scale.", wide=True
     )
-    caption = "Mean angles over eyes; the sum is the root of their squares."
-    table = report.Table(head, [budget_cells(row) for row in rows], caption)
+    table = budget_table(rows)
     section = report.Section("Error budget", words, (picture, table))
     lead = "What each link of the chain costs, in phase, PSF and gaze."
     report.write_report(path, "Error budget", [section], lead=lead, key_figures=figures)
+
+
+def budget_table(rows: list[BudgetEntry]) -> report.Table:
+    """A row a link, for page and terminal.
+
+    Args:
+        rows: of the budget.
+    """
+    head = ("link", "phase / rad", "PSF, relative", "gaze / deg", "method")
+    caption = "Mean angles over eyes; the sum is the root of their squares."
+    return report.Table(head, [budget_cells(row) for row in rows], caption)
 
 
 def budget_cells(row: BudgetEntry) -> tuple[str, ...]:
@@ -190,19 +199,6 @@ def plot_budget(rows: list[BudgetEntry]) -> bytes:
     return report.figure_png(figure)
 
 
-def budget_text(rows: list[BudgetEntry]) -> str:
-    """The table for a terminal.
-
-    Args:
-        rows: of the budget.
-    """
-    lines = [f"{'link':<30} {'phase/rad':>10} {'PSF':>9} {'gaze/deg':>10}  how"]
-    for row in rows:
-        link, phase, psf, gaze, method = budget_cells(row)
-        lines.append(f"{link:<30} {phase:>10} {psf:>9} {gaze:>10}  {method}")
-    return "\n".join(lines)
-
-
 def _given(options: Options) -> BudgetInputs:
     if options.led_fwhm_nm < 0:
         raise ConfigError(f"--led-fwhm-nm {options.led_fwhm_nm:g}: need 0 or more")
@@ -211,7 +207,7 @@ def _given(options: Options) -> BudgetInputs:
         mask=of_process(options.process) if options.process else None,
         library=library.load(options.library) if options.library else None,
         asbuilt=asbuilt.load(options.asbuilt) if options.asbuilt else None,
-        run=retraining.load_finished_run(options.run) if options.run else None,
+        run=finished.load_finished_run(options.run) if options.run else None,
         frames=options.frames,
     )
 

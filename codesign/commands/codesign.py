@@ -2,31 +2,27 @@
 under compute budgets.
 """
 
-import contextlib
 import io
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from matplotlib import image as plt_image
-from torch import Tensor
 
 from codesign.adapt import lens_file, weights_file
 from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
 from codesign.network import Subnet
-from codesign.optics import OpticsConfig, formed
+from codesign.optics import formed
 from codesign.optics import stack as trained
+from codesign.settings import Part
 from codesign.train import (
     BudgetResult,
     CodesignRun,
     LogRecord,
-    Part,
     RunConfig,
     assess,
     best_candidate,
@@ -34,15 +30,14 @@ from codesign.train import (
     device_of,
     finished_budgets,
     pareto_front,
-    pictures,
     place_on_device,
+    results,
     search,
 )
 from codesign.train import run as runs
-from metalens import design, lens, library
+from metalens import lens
 from metalens.core import config, report, store, transaction
-from metalens.core.errors import ConfigError, LensError
-from metalens.core.report import Console
+from metalens.core.errors import ConfigError
 
 CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
@@ -94,8 +89,10 @@ def _work(
     parallel.wait_for_all()
     writer = _writer(folder, going.trainer.step) if options.events else None
     held = False
-    for record in _progress(console, runs.train_run(going, folder / CHECKPOINT), going):
-        _log(folder, {"kind": "step", **asdict(record)})
+    records = runs.train_run(going, folder / CHECKPOINT)
+    left = settings.inner.steps - going.trainer.step
+    for record in console.track(records, total=left, label="training"):
+        checkpoint.append_entry(folder / LOG, {"kind": "step", **asdict(record)})
         if writer:
             _events(writer, going, record)
         if (limit := going.trainer.pitch_held_um) is not None and not held:
@@ -106,11 +103,10 @@ def _work(
                 f"step {record.step}/{settings.inner.steps}: loss {record.loss:.4f}, task {record.task:.4f}, "
                 f"pitch {record.pitch_um:.2f} um, {record.mmacs:.1f} MMACs, {record.skipped} skipped"
             )
-    for budget, born in search.search(going, folder / CHECKPOINT):
+    for budget, born in search.search_architectures(going, folder / CHECKPOINT):
         one = {"budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6}
-        _log(
-            folder, {"kind": "birth", **one, "architecture": asdict(born.architecture)}
-        )
+        entry = {"kind": "birth", **one, "architecture": asdict(born.architecture)}
+        checkpoint.append_entry(folder / LOG, entry)
         console.say(
             f"budget {budget:g} MMACs: gaze error {born.error:.2f} deg at {born.macs / 1e6:.2f} MMACs"
         )
@@ -175,7 +171,7 @@ def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
     place_on_device(going.trainer, device)
     for _ in runs.train_run(going, folder / CHECKPOINT):
         pass
-    for _ in search.search(going, folder / CHECKPOINT):
+    for _ in search.search_architectures(going, folder / CHECKPOINT):
         pass
     parallel.leave_processes()
     return 0
@@ -207,7 +203,7 @@ def _events(writer: Any, going: CodesignRun, record: LogRecord) -> None:
         if name != "step":
             writer.add_scalar(name, float(value), record.step)
     if record.step % going.settings.checkpoint_every == 0:
-        for name, picture in pictures.all_of(going).items():
+        for name, picture in results.run_pictures(going).items():
             image = plt_image.imread(io.BytesIO(picture))
             writer.add_image(name, image, record.step, dataformats="HWC")
     writer.flush()
@@ -224,42 +220,13 @@ def _resume(folder: Path, settings: RunConfig) -> CodesignRun:
     """The run of the folder's checkpoint; log lines beyond it are dropped."""
     made = runs.resume_run(folder / CHECKPOINT, settings)
     births = sum(len(s.history) for s in made.searches)
-    kept: list[str] = []
-    for line in (
-        (folder / LOG).read_text(encoding="utf-8").splitlines()
-        if (folder / LOG).is_file()
-        else []
-    ):
-        entry = _entry(line)
-        if entry.get("kind") == "step" and entry["step"] <= made.trainer.step:
-            kept.append(line)
-        elif entry.get("kind") == "birth" and births > 0:
-            kept.append(line)
-            births -= 1
-    store.write_text(folder / LOG, "".join(line + "\n" for line in kept))
+    entries = checkpoint.read_entries(folder / LOG)
+    steps = [
+        e for e in entries if e["kind"] == "step" and e["step"] <= made.trainer.step
+    ]
+    born = [e for e in entries if e["kind"] == "birth"]
+    checkpoint.write_entries(folder / LOG, steps + born[:births])
     return made
-
-
-def _entry(line: str) -> dict[str, Any]:
-    try:
-        entry: dict[str, Any] = json.loads(line)
-    except (
-        json.JSONDecodeError
-    ):  # the line that was being written when the run was killed
-        return {}
-    return entry
-
-
-def _progress(
-    console: Console, records: Iterator[LogRecord], going: CodesignRun
-) -> Iterator[LogRecord]:
-    left = going.settings.inner.steps - going.trainer.step
-    return console.track(records, total=left, label="training")
-
-
-def _log(folder: Path, entry: dict[str, Any]) -> None:
-    with open(folder / LOG, "a", encoding="utf-8") as file:
-        file.write(json.dumps(entry) + "\n")
 
 
 def _keep(
@@ -268,8 +235,8 @@ def _keep(
     """lens.h5, the networks, result.json, answers.h5 and the plot of the Pareto set."""
     settings = going.settings
     about = store.Provenance(config=config.dumps(settings), seed=settings.inner.seed)
-    phase = runs.lens_coefficients(going)
-    lens.save(folder / "lens.h5", trained_lens(settings.optics, phase, about))
+    phase = going.trainer.model.coefficients_rad.detach()
+    lens.save(folder / "lens.h5", trained.trained_lens(settings.optics, phase, about))
     _weights(folder, going, ends, about)
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
@@ -279,7 +246,7 @@ def _keep(
         "steps": settings.inner.steps,
         "rows": rows,
     }
-    found |= {"bound": pictures.window_depth_bound(going)}
+    found |= {"bound": results.window_depth_bound(going)}
     found |= {"frozen": list(settings.run.frozen), "image": said}
     found |= {"pitch_held_um": going.trainer.pitch_held_um}
     found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
@@ -291,7 +258,7 @@ def _keep(
     store.save(
         folder / ANSWERS,
         "answers",
-        pictures.predictions_of_frames(ends, SHOWN),
+        results.predictions_of_frames(ends, SHOWN),
         attributes=said_by,
     )
     if going.searches:
@@ -311,50 +278,10 @@ def _weights(
         }
         checkpoint.save_network(weights_file(folder, budget), kept, beside=optics)
         if going.settings.search.inner_steps:
-            own = trained_lens(
+            own = trained.trained_lens(
                 going.settings.optics, model.coefficients_rad.detach(), about
             )
             lens.save(lens_file(folder, going.settings, budget), own)
-
-
-SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
-
-
-def trained_lens(
-    settings: OpticsConfig, coefficients_rad: Tensor, provenance: store.Provenance
-) -> lens.Lens:
-    """The lens of a trained phase, its pillars known over the light of training.
-
-    Over 1.25 of the width of a line to either side (0.3 % of a Gaussian lies beyond),
-    over half of that where pillars would cover less than a turn of phase, else at the
-    middle alone.
-
-    Args:
-        coefficients_rad: (polynomials,) of the phase.
-        settings: of the lens and its image. provenance: of the file.
-    """
-    middle_um, light = settings.focus.wavelength_um, formed.source_of(settings)
-    width_um = 0.0 if light is None else light.fwhm_nm * 1e-3
-
-    def over(half_um: float) -> lens.Lens:
-        waves = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
-        waves_um = tuple((waves + middle_um).tolist())
-        made = library.sweep(settings.cell, wavelengths_um=waves_um)
-        result, _ = design.make(
-            trained.phase_of(settings, coefficients_rad.numpy()),
-            settings.focus,
-            aperture_um=settings.aperture_mm * 1e3,
-            cell=made.cell,
-            proxy=library.proxy_of(made),
-            profile="codesign",
-            provenance=provenance,
-        )
-        return result
-
-    for half_um in (1.25 * width_um, 0.625 * width_um) if width_um else ():
-        with contextlib.suppress(LensError):
-            return over(half_um)
-    return over(0.0)
 
 
 def _plot(going: CodesignRun) -> bytes:
@@ -386,33 +313,29 @@ def _plot(going: CodesignRun) -> bytes:
     return report.figure_png(figure)
 
 
+COLUMNS = {  # of the table, by name in result.json
+    "budget_mmacs": "budget",
+    "mmacs": "MMACs",
+    "effective_pitch_um": "pixels seen / um",
+    "gaze_deg": "gaze / deg",
+    "axial_slip_mm": "axial / mm",
+    "finer_axial_slip_mm": "finer image / mm",
+    "finer_ratio": "ratio",
+    "axial_interval_mm": "90 % interval / mm",
+    "axial_coverage_90": "covers",
+    "lateral_slip_mm": "lateral / mm",
+    "iou": "IoU",
+    "depth_response_mm_per_mm": "mm per mm of depth",
+}
+
+
 def _table(rows: list[dict[str, Any]]) -> str:
-    head = (
-        "budget  MMACs  pixels seen / um  gaze / deg  axial / mm  finer image (ratio)  "
-        "90 % interval (covers)  lateral / mm   IoU  mm per mm of depth"
-    )
-    lines = []
-    for r in rows:
-        budget = f"{r['budget_mmacs']:6g}"
-        iou = "    -" if r["iou"] is None else f"{r['iou']:.3f}"
-        interval, fine = "                     -", "                  -"
-        if "axial_coverage_90" in r:
-            covered = 100 * r["axial_coverage_90"]
-            interval = f"+-{r['axial_interval_mm']:5.2f} mm ({covered:7.0f} %)"
-        if "finer_ratio" in r:
-            fine = f"{r['finer_axial_slip_mm']:12.3f} ({r['finer_ratio']:4.2f})"
-        errors = (
-            f"{r['gaze_deg']:10.2f}  {r['axial_slip_mm']:10.3f}  {fine}  {interval}"
-        )
-        costs = f"{r['mmacs']:5.2f}  {r['effective_pitch_um']:16.1f}"
-        lines.append(
-            f"{budget}  {costs}  {errors}  {r['lateral_slip_mm']:12.3f}  {iou}  "
-            f"{r['depth_response_mm_per_mm']:6.2f}"
-        )
+    cells = [[row.get(name) for name in COLUMNS] for row in rows]
+    text = report.Table(list(COLUMNS.values()), cells, digits=3).text
     worst = max((r.get("finer_ratio", 1.0) for r in rows), default=1.0)
-    if worst > assess.SAME:
-        lines.append(
-            f"results depend on the image: on one formed at a quarter of "
-            f"optics.image_tolerance errors are {worst:.2f} times as large; lower it"
-        )
-    return "\n".join([head, *lines])
+    if worst <= assess.SAME:
+        return text
+    return (
+        f"{text}\nresults depend on the image: on one formed at a quarter of "
+        f"optics.image_tolerance errors are {worst:.2f} times as large; lower it"
+    )

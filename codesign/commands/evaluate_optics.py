@@ -22,7 +22,6 @@ from codesign.evaluate import (
 )
 from codesign.evaluate import optics as evaluate_optics
 from codesign.evaluate import plots as evaluate_plots
-from codesign.evaluate import tables as evaluate_tables
 from codesign.eye import states_at
 from metalens import design
 from metalens import lens as lenses
@@ -126,11 +125,11 @@ def _measure(
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *told])) from error
     tables = [
-        *evaluate_tables.format_tables(axial, scenes, measured, spread=told),
+        *evaluate_optics.format_tables(axial, scenes, measured, spread=told),
         *field_page.field_tables(seen),
     ]
-    values = evaluate_tables.table_values(axial, scenes, measured)
-    values["failures"] = evaluate_tables.table_failures(axial, scenes, measured)
+    values = evaluate_optics.table_values(axial, scenes, measured)
+    values["failures"] = evaluate_optics.table_failures(axial, scenes, measured)
     for name, one in seen.items():
         values["lenses"][name] |= {
             "focuses": name not in spread,

@@ -10,18 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from codesign.adapt import FinishedRun, bootstrap_interval, bootstrap_ratio, retrained
+from codesign.adapt import FinishedRun, retrained
 from codesign.commands.options.experiment import Options
-from codesign.evaluate import (
-    AXIAL,
-    LATERAL,
-    ExperimentConfig,
-    RunResult,
-    experiment_plots,
-    run_experiment,
-)
+from codesign.evaluate import AXIAL, LATERAL, RunResult, plots, run_experiment
 from codesign.gaze import PopulationPrior, people_file
 from codesign.optics import formed
+from codesign.settings import ExperimentConfig
+from codesign.train import bootstrap_interval, bootstrap_ratio
 from metalens.core import config as settings
 from metalens.core import reading, report, store
 from metalens.core.errors import ConfigError
@@ -70,9 +65,9 @@ def run(options: Options) -> int:
             f"{one.name}: {one.above}" for one in results if one.above
         ]
         pictures = {
-            "samples.png": experiment_plots.plot_samples(sources[0], config),
-            "ambiguity.png": experiment_plots.plot_ambiguity(results[0]),
-            "errors.png": experiment_plots.plot_gaze_errors(results),
+            "samples.png": plots.plot_samples(sources[0], config),
+            "ambiguity.png": plots.plot_ambiguity(results[0]),
+            "errors.png": plots.plot_gaze_errors(results),
         }
         _write(draft.path, values, pictures)
         for number, (result, source) in enumerate(
@@ -85,7 +80,7 @@ def run(options: Options) -> int:
                     provenance=_made(source, config),
                 )
     return options.console.judged(
-        values, f"{experiment_table(values)}\nopen {folder / PAGE}", values["failures"]
+        values, f"{experiment_text(values)}\nopen {folder / PAGE}", values["failures"]
     )
 
 
@@ -99,7 +94,7 @@ def _made(source: FinishedRun, config: ExperimentConfig) -> store.Provenance:
 
 def image_summary(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
     """How every run's images were formed and how wrong they are, as the run itself
-    found; None of older runs.
+    found; None where it did not say.
 
     Of a retraining, those of the run that it went on from.
 
@@ -221,16 +216,6 @@ def _of_reach(row: dict[str, Any]) -> str:
     )
 
 
-def _of_lenses(values: dict[str, Any]) -> list[str]:
-    """Sentences on the runs that are shown through another lens than the design's."""
-    made = {
-        name: lens
-        for name, lens in values.get("lenses", {}).items()
-        if lens != "as designed"
-    }
-    return [f"{name}: through the lens {lens}" for name, lens in made.items()]
-
-
 def _per_subject(result: RunResult) -> dict[str, Any]:
     error, axial = result.slip_error_mm, result.trial.group(AXIAL)
     return {
@@ -242,87 +227,22 @@ def _per_subject(result: RunResult) -> dict[str, Any]:
         "slip_mm": result.per_subject(error.mean(1)),
         "slip_axial_mm": result.per_subject(error[:, 2]),
         "slip_lateral_mm": result.per_subject(error[:, :2].mean(1)),
-        "slip_visible_mm": result.per_subject(result.slip_visible_mm.mean(1)),
         "slip_rest_mm": result.per_subject(result.slip_rest_mm.mean(1)),
         "iou": result.per_subject(result.iou),
     }
 
 
-def _finer_words(row: dict[str, Any]) -> str:
-    if row["finer_ratio"] is None:
-        return f"{'-':>32}"
-    return f"{row['finer_gaze_axial_deg']:24.2f} ({row['finer_ratio']:5.2f})"
-
-
-def experiment_table(values: dict[str, Any]) -> str:
-    """The numbers as text.
+def experiment_tables(values: dict[str, Any]) -> list[report.Table]:
+    """Numbers of every run, and ratios of the first to the others.
 
     Args:
         values: content of experiment.json.
     """
-    head = (
-        f"{'run':<16}{'MMACs':>7}{'gaze axial':>12}{'lateral/deg':>12}{'slip':>8}"
-        f"{'axial/mm':>10}{'IoU':>7}{'finer image: axial/deg (ratio)':>32}"
-    )
-    lines = [head]
-    for r in values["runs"]:
-        iou = "      -" if r["iou"] is None else f"{r['iou']:7.3f}"
-        lines.append(
-            f"{r['name']:<16}{r['mmacs']:7.2f}{r['gaze_axial_deg']:12.2f}{r['gaze_lateral_deg']:12.2f}"
-            f"{r['slip_mm']:8.3f}{r['slip_axial_mm']:10.3f}{iou}{_finer_words(r)}"
-        )
-    for r in values["ratios"]:
-        low, high = r["interval"]
-        lines.append(
-            f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]"
-        )
-    lines += _of_lenses(values) + [
-        _of_reach(r) for r in values["runs"] if "beyond_training_mm" in r
-    ]
-    for name, found in values.get("images", {}).items():
-        lines.append(
-            f"{name}: {formed.describe_image_text(found) if found else 'image: uniform, of unknown error; run it again'}"
-        )
-    return "\n".join(lines)
-
-
-def _write(folder: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
-    for name, picture in pictures.items():
-        store.write_bytes(folder / name, picture)
-    _page(folder / PAGE, values, pictures)
-    store.write_text(folder / JSON, json.dumps(values, indent=1) + "\n")
-
-
-# of the page's table: what the numbers are called in the result, and on paper
-COLUMNS = {
-    "name": "run",
-    "mmacs": "million MACs a frame",
-    "gaze_axial_deg": "gaze error under axial slip / deg",
-    "finer_gaze_axial_deg": "the same on a finer image / deg",
-    "finer_ratio": "ratio",
-    "gaze_lateral_deg": "under lateral slip / deg",
-    "gaze_told_slip_deg": "axial, slip told / deg",
-    "slip_mm": "slip error / mm",
-    "finer_slip_mm": "slip error on a finer image / mm",
-    "slip_axial_mm": "its axial part / mm",
-    "slip_lateral_mm": "its lateral part / mm",
-    "slip_visible_mm": "slip error of the visible displacement read exactly / mm",
-    "slip_rest_mm": "slip error from where its wearer calibrated / mm",
-    "iou": "overlap of pupil masks",
-}
-CAPTIONS = {
-    "errors.png": "Mean gaze error at every stimulus: area of the markers (paper Fig. 11).",
-    "ambiguity.png": "Pupil centres under slippage (paper Fig. 10): one place, many gazes.",
-    "samples.png": "Eyes by slippage state, pupil as it is (green) and as read (red) (paper Fig. 9).",
-}
-
-
-def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
-    rows = [tuple(run[name] for name in COLUMNS) for run in values["runs"]]
-    tables = [report.Table(tuple(COLUMNS.values()), rows, digits=3)]
+    rows = [[run[name] for name in COLUMNS] for run in values["runs"]]
+    tables = [report.Table(list(COLUMNS.values()), rows, digits=3)]
     ratios = [
         (
-            COLUMNS.get(r["quantity"], r["quantity"]).split(" / ")[0],
+            COLUMNS[r["quantity"]].split(" / ")[0],
             r["against"],
             r["ratio"],
             "{:.2f} to {:.2f}".format(*r["interval"]),
@@ -332,6 +252,65 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
     if ratios:
         head = ("error", "against", f"ratio of {values['first']}", "95 % interval")
         tables.append(report.Table(head, ratios, digits=3))
+    return tables
+
+
+def _remarks(values: dict[str, Any]) -> list[str]:
+    """Sentences on lenses as made, on slippage that training never saw."""
+    made = [
+        f"{name}: through the lens {lens}"
+        for name, lens in values["lenses"].items()
+        if lens != "as designed"
+    ]
+    return made + [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
+
+
+def experiment_text(values: dict[str, Any]) -> str:
+    """The tables and remarks as text.
+
+    Args:
+        values: content of experiment.json.
+    """
+    images = [
+        f"{name}: {formed.describe_image_text(found)}"
+        for name, found in values["images"].items()
+        if found
+    ]
+    tables = [table.text for table in experiment_tables(values)]
+    return "\n".join([*tables, *_remarks(values), *images])
+
+
+def _write(folder: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
+    for name, picture in pictures.items():
+        store.write_bytes(folder / name, picture)
+    _page(folder / PAGE, values, pictures)
+    store.write_text(folder / JSON, json.dumps(values, indent=1) + "\n")
+
+
+# what the numbers are called in the result, and in tables
+COLUMNS = {
+    "name": "run",
+    "mmacs": "MMACs",
+    "gaze_axial_deg": "gaze, axial slip / deg",
+    "finer_gaze_axial_deg": "finer image / deg",
+    "finer_ratio": "ratio",
+    "gaze_lateral_deg": "gaze, lateral slip / deg",
+    "gaze_told_slip_deg": "slip told / deg",
+    "slip_mm": "slip / mm",
+    "finer_slip_mm": "finer image / mm",
+    "slip_axial_mm": "axial slip / mm",
+    "slip_lateral_mm": "lateral slip / mm",
+    "slip_rest_mm": "from calibration / mm",
+    "iou": "IoU",
+}
+CAPTIONS = {
+    "errors.png": "Mean gaze error at every stimulus: area of the markers (paper Fig. 11).",
+    "ambiguity.png": "Pupil centres under slippage (paper Fig. 10): one place, many gazes.",
+    "samples.png": "Eyes by slippage state, pupil as it is (green) and as read (red) (paper Fig. 9).",
+}
+
+
+def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> None:
     figures = [
         report.Figure(pictures[name], caption, wide=True)
         for name, caption in CAPTIONS.items()
@@ -342,16 +321,9 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
         )
         for r in values["runs"]
     ]
-    reach = [f"{_of_reach(r)}." for r in values["runs"] if "beyond_training_mm" in r]
-    words = " ".join(
-        [
-            _told(values["settings"]),
-            *(f"{line}." for line in _of_lenses(values)),
-            *reach,
-        ]
-    )
+    words = [_told(values["settings"]), *(f"{line}." for line in _remarks(values))]
     sections = [
-        report.Section("Numbers", words, tables),
+        report.Section("Numbers", " ".join(words), experiment_tables(values)),
         report.Section("Figures", "", figures),
     ]
     report.write_report(path, "Virtual experiment", sections, key_figures=keys)
@@ -365,9 +337,8 @@ def _told(about: dict[str, Any]) -> str:
         f"pupil, slippage) becomes gaze by a linear mixed model learned from {about['people']} other people, or, of a "
         "network that tells no axis, by a sphere and a regressor of one hidden layer. Subjects "
         f"fixate with {about['fixation_deg']} degrees of scatter, which counts as error. With the slippage told, the "
-        "error under axial slip is that of pupil, sphere and regressor alone. A camera sees the head's displacement "
-        "before it, its own turn on the mount included: who reads that exactly errs by what the table says, for all "
-        f"runs alike. Intervals are over subjects. {_of_light(about)}"
+        "error under axial slip is that of pupil, sphere and regressor alone. From calibration: the slip error beside "
+        f"its mean over the frames that calibrated a subject. Intervals are over subjects. {_of_light(about)}"
     )
 
 

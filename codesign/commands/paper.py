@@ -7,20 +7,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.commands import evaluate_optics as command_evaluate_optics
 from codesign.commands import experiment as command_experiment
 from codesign.commands.options import experiment as experiment_options
 from codesign.commands.options import optics as optics_options
 from codesign.commands.options.paper import Options
-from codesign.evaluate import (
-    ROLES,
-    ClaimLine,
-    ExperimentConfig,
-    MeasuredNumber,
-    paper,
-    paper_runs,
-)
+from codesign.evaluate import ROLES, ClaimLine, MeasuredNumber, paper
+from codesign.settings import ExperimentConfig
 from metalens.core import report, store
 from metalens.core.errors import ConfigError
 
@@ -46,7 +40,7 @@ def run(options: Options) -> int:
             f"{folder / JSON} exists; give --force to write it again from the measurements beside it"
         )
     for path in options.runs:
-        retraining.rows_of(path)  # refused now, not after an hour of measuring
+        finished.rows_of(path)  # refused now, not after an hour of measuring
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
         if options.runs and options.measure:
             _measure(options, draft.path)
@@ -122,11 +116,11 @@ def collect_measurements(
     if optics.is_file():
         found |= paper.of_optics(optics)
     if (folder / GAZE).is_file():
-        found |= paper_runs.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
-    rows = {role: retraining.rows_of(path) for role, path in runs.items()}
+        found |= paper.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
+    rows = {role: finished.rows_of(path) for role, path in runs.items()}
     found |= paper.of_runs(rows)
-    return found | paper_runs.of_ablations(
-        rows.get("proposed", []), dict(paper_runs.frozen_rows(others))
+    return found | paper.of_ablations(
+        rows.get("proposed", []), dict(paper.frozen_rows(others))
     )
 
 
@@ -154,7 +148,7 @@ def _measure(options: Options, folder: Path) -> None:
         asked_of = folder / "optics.toml"
         store.write_text(
             asked_of,
-            f"[scenes]\nimage_tolerance = {paper_runs.image_tolerance(options.runs)}\n",
+            f"[scenes]\nimage_tolerance = {paper.image_tolerance(options.runs)}\n",
         )
         optics = optics_options.Options(
             lenses=lenses,
@@ -174,7 +168,7 @@ def _measure_gaze(options: Options, path: Path) -> None:
     if str(folder) in told:
         return
     options.console.say(f"measuring: gaze of {folder}")
-    told[str(folder)] = {"rows": paper_runs.gaze_errors(folder)}
+    told[str(folder)] = {"rows": paper.gaze_rows(folder)}
     store.write_text(path, json.dumps(told, indent=1) + "\n")
 
 

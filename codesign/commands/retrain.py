@@ -13,19 +13,12 @@ from codesign.adapt import FinishedRun, LensPsfs, correction, lens_file
 from codesign.adapt import report as retrain_report
 from codesign.adapt import train as retraining
 from codesign.adapt.retrained import RECIPE, RESULT, RetrainingRecipe, relative_inputs
-from codesign.adapt.sure import MAP, judge_correction
+from codesign.adapt.source import check_lens, load_finished_run
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior_parameters, psf_error
-from codesign.train import (
-    LogRecord,
-    Trainer,
-    assess,
-    checkpoint,
-    device_of,
-    place_on_device,
-)
+from codesign.train import Trainer, assess, checkpoint, device_of, place_on_device
 from metalens import __version__, lens
 from metalens.core import config, store
 from metalens.core.errors import TrainingError
@@ -46,7 +39,7 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    source = retraining.load_finished_run(
+    source = load_finished_run(
         options.run_dir, budget_mmacs=options.settings.budget_mmacs
     )
     place_on_device(source.run.trainer, device_of(options.device))
@@ -54,7 +47,7 @@ def run(options: Options) -> int:
     design = lens.load_plain(
         lens_file(options.run_dir, source.settings, source.row["budget_mmacs"])
     )
-    retraining.check_lens(design, result, insist=options.insist)
+    check_lens(design, result, insist=options.insist)
     truth = config.load(options.truth, HiddenLens) if options.truth else None
     old = correction.present_bias(options.process)
     recipe = _recipe(options, source)
@@ -114,15 +107,17 @@ def _story(
         )
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
     printed = correction.printed_um(design)
-    sure = judge_correction(
+    sure = correction.judge_correction(
         result,
         lambda x: (
-            correction.bias_table(
+            correction.correction_table(
                 design, x, response=made.response, old=old, range_um=printed
             ).bias_nm
         ),
     )
-    even = judge_correction(result, correction.uneven_nm, part=MAP)
+    even = correction.judge_correction(
+        result, correction.uneven_nm, part=correction.MAP
+    )
     refused = sure.words or correction.loss_reason(states[0], states[1])
     uneven = even.words or correction.loss_reason(states[1], states[2])
     apart = (
@@ -194,44 +189,21 @@ def _train(
     path = folder / f"{name}.safetensors"
     if path.is_file():
         going.restore(checkpoint.load(path, settings=recipe)["trainer"])
-    _trim(folder, name, going.step)
+    entries = checkpoint.read_entries(folder / LOG)
+    checkpoint.write_entries(
+        folder / LOG,
+        [e for e in entries if e["job"] != name or e["step"] <= going.step],
+    )
     records = retraining.run_job(going, path, recipe)
     for record in console.track(
         records, total=going.inner.steps - going.step, label=f"training: {name}"
     ):
-        _log(folder, name, record)
+        checkpoint.append_entry(folder / LOG, {"job": name, **asdict(record)})
     return going
 
 
-def _log(folder: Path, name: str, record: LogRecord) -> None:
-    with open(folder / LOG, "a", encoding="utf-8") as file:
-        file.write(json.dumps({"job": name, **asdict(record)}) + "\n")
-
-
-def _trim(folder: Path, name: str, step: int) -> None:
-    kept = [e for e in _entries(folder) if e["job"] != name or e["step"] <= step]
-    store.write_text(folder / LOG, "".join(json.dumps(e) + "\n" for e in kept))
-
-
-def _entries(folder: Path) -> list[dict[str, Any]]:
-    lines = (
-        (folder / LOG).read_text("utf-8").splitlines()
-        if (folder / LOG).is_file()
-        else []
-    )
-    entries = []
-    for line in lines:
-        try:
-            entries.append(json.loads(line))
-        except (
-            json.JSONDecodeError
-        ):  # the line that was being written when the run was killed
-            continue
-    return entries
-
-
 def _curves(folder: Path, found: LensPsfs) -> dict[str, tuple[list[int], list[float]]]:
-    entries = _entries(folder)
+    entries = checkpoint.read_entries(folder / LOG)
     return {
         name: (
             [e["step"] for e in entries if e["job"] == name],
@@ -310,23 +282,9 @@ def _values(
     }
 
 
-def _finer(row: dict[str, float]) -> str:
-    if "finer_ratio" not in row:
-        return ""
-    return f" {row['finer_slip_mm']:.3f} ({row['finer_ratio']:.2f})"
-
-
 def _text(story: retrain_report.RetrainingResults, folder: Path) -> str:
     o = story.outcome
-    lines = [
-        f"{'case':<38}slippage error / mm        axial   IoU   finer image (ratio)"
-    ]
-    for name, v in o.rows().items():
-        span = f"[{v['slip_low_mm']:.3f}, {v['slip_high_mm']:.3f}]"
-        lines.append(
-            f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} "
-            f"{v['axial_mm']:.3f}   {v['iou']:.3f}{_finer(v)}"
-        )
+    lines = [retrain_report.accuracy_table(o).text]
     won = (
         "nothing to win back beyond chance"
         if o.recovered is None

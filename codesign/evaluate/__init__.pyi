@@ -1,14 +1,11 @@
 from . import error_budget as error_budget
-from . import experiment_plots as experiment_plots
 from . import field_page as field_page
 from . import gaze_experiment as gaze_experiment
 from . import imaged as imaged
 from . import optics as optics
 from . import paper as paper
-from . import paper_runs as paper_runs
 from . import plots as plots
 from . import reader as reader
-from . import tables as tables
 from .field_page import FieldSetting as FieldSetting
 from .gaze_experiment import AXIAL as AXIAL
 from .gaze_experiment import LATERAL as LATERAL
@@ -21,4 +18,3 @@ from .paper import ClaimLine as ClaimLine
 from .paper import MeasuredNumber as MeasuredNumber
 from .reader import ReaderConfig as ReaderConfig
 from .reader import judge_lenses as judge_lenses
-from .shown import ExperimentConfig as ExperimentConfig

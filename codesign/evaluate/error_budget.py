@@ -12,10 +12,10 @@ from characterize.model import PLACE, process_state_of
 from codesign.adapt import FinishedRun
 from codesign.batches import EXPERIMENT
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.evaluate.shown import AXIAL, ExperimentConfig
 from codesign.eye import PinholeCamera, RenderedFrames, render
 from codesign.gaze import CalibratedPerson, NetworkReadings, PersonCalibrator, angle_deg
 from codesign.optics import MadeLens, OpticsConfig, formed
+from codesign.settings import ExperimentConfig
 from codesign.train import assess
 from metalens.cell import Incidence
 from metalens.core.arrays import Array
@@ -205,7 +205,7 @@ class NetworkReading:
         self.trial = experiment.join_subjects(trials)
         known = experiment.calibration_frames(self.trial, config)
         judged = ~np.isin(np.arange(len(self.trial.subject)), known)
-        self.judged = judged & self.trial.group(AXIAL)
+        self.judged = judged & self.trial.group(experiment.AXIAL)
         self.measured_rad = NONE
         self._people: dict[int, CalibratedPerson] = {}
         self._thin: list[RenderedFrames] = []

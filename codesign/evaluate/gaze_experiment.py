@@ -4,19 +4,14 @@ known slippage of the camera.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
 
 from codesign.adapt import FinishedRun
-from codesign.batches import EXPERIMENT, EyeScenes, as_batch, sensor_irradiance
-from codesign.evaluate.shown import AXIAL as AXIAL
-from codesign.evaluate.shown import LATERAL as LATERAL
-from codesign.evaluate.shown import ExperimentConfig
-from codesign.evaluate.shown import ExperimentTrials as ExperimentTrials
-from codesign.evaluate.shown import RunResult as RunResult
+from codesign.batches import EXPERIMENT, EyeScenes, as_batch
 from codesign.eye import (
     POPULATION,
     CameraRig,
@@ -35,13 +30,14 @@ from codesign.gaze import (
     face_angles,
     shared,
 )
-from codesign.network import losses
 from codesign.optics import formed
-from codesign.train import Predictions, SensorFrames, assess, frame_wide, read_out
+from codesign.settings import ExperimentConfig
+from codesign.train import Predictions, SensorFrames, assess
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError, PropagationError, SceneError
 from metalens.image import Imager, Sensor, low_snr
 
+AXIAL, LATERAL = "axial", "lateral"
 # streams of the random generator
 LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
 TURNS = (
@@ -51,6 +47,112 @@ BEFORE, EACH = (
     100_000,
     120,
 )  # first number of the people who calibrated before, and their frames
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ExperimentTrials:
+    """Of every frame (n,): subject, stimulus, slippage state; and what was true.
+
+    stimulus_deg: (n, 2). slip_mm: (n, 3).
+    """
+
+    subject: Array
+    stimulus: Array
+    state: Array
+    stimulus_deg: Array
+    slip_mm: Array
+
+    def group(self, kind: str) -> Array:
+        """(n,) frames of the axial or lateral states, the origin among both.
+
+        Args:
+            kind: "axial" or "lateral".
+        """
+        along = 2 if kind == AXIAL else 0
+        other = self.slip_mm[:, [0, 1] if kind == AXIAL else [1, 2]]
+        return np.asarray((other == 0).all(1) & np.isfinite(self.slip_mm[:, along]))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RunResult:
+    """One run in the experiment.
+
+    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,).
+    gaze_deg: (n,) error of the
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg:
+    (n,) the same error where sphere
+    and regressor are given the pupil as read and the true slippage: what the pupil
+    alone leaves. reach_mm: largest
+    slippage along x, y, z that the run's training saw. how: subjects were calibrated.
+    above: why the error
+    of the images is above what the run asks for; empty where it is not. finer: the same
+    frames on images formed at a quarter of the run's tolerance, calibrated on those;
+    None where they are not known.
+    """
+
+    name: str
+    mmacs: float
+    trial: ExperimentTrials
+    slip_mm: Array
+    centre: Array
+    iou: Array
+    gaze_deg: Array
+    predicted_deg: Array
+    told_deg: Array
+    reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    how: PersonCalibrator | None = None
+    above: str = ""
+    finer: "RunResult | None" = None
+
+    @property
+    def within(self) -> Array:
+        """(n,) frames whose slippage training saw."""
+        return np.asarray((np.abs(self.trial.slip_mm) <= self.reach_mm).all(1))
+
+    def gaze(self, kind: str) -> float:
+        """Mean gaze error over the judged frames of a group, deg.
+
+        Args:
+            kind: "axial" or "lateral".
+        """
+        return float(np.nanmean(self.gaze_deg[self.trial.group(kind)]))
+
+    @property
+    def slip_error_mm(self) -> Array:
+        """(n, 3) absolute errors of the slippage."""
+        return np.asarray(np.abs(self.slip_mm - self.trial.slip_mm))
+
+    @property
+    def slip_rest_mm(self) -> Array:
+        """(n, 3) absolute errors beside the mean error of the subject's calibration,
+        nan for frames that calibrated.
+
+        What is constant of a person (size of the face, and the camera's turn on it) is
+        no slippage: a device is zeroed
+        where its wearer calibrates.
+        """
+        error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
+        out = np.full_like(error, math.nan)
+        for subject in np.unique(self.trial.subject):
+            mine = self.trial.subject == subject
+            out[mine & judged] = np.abs(
+                error[mine & judged] - error[mine & ~judged].mean(0)
+            )
+        return out
+
+    def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
+        """(subjects,) means of (n,) values, of which nan are left out; nan where none
+        is left.
+
+        Args:
+            chosen: (n,) frames that count; all without it.
+        """
+        keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
+        mine = (
+            values[keep & (self.trial.subject == s)]
+            for s in np.unique(self.trial.subject)
+        )
+        return np.array([one.mean() if len(one) else math.nan for one in mine])
 
 
 def states_of(
@@ -168,27 +270,14 @@ def image_frames(
         source: finished run: its network, lens and sensor. made: rendered frames.
         prepared: what forms the images.
     """
-    trainer = source.run.trainer
     margin = source.settings.scenes.margin
-    batch = as_batch(made, margin)
-    light = sensor_irradiance(batch.frames, prepared)
-    noise = torch.Generator().manual_seed(seed)
-    pitch = trainer.model.pitch_um
-    pixels = read_out(
-        light,
-        trainer.optics.sample_um,
-        pitch,
-        sensor or trainer.sensor,
-        generator=noise,
+    return assess.read_batch(
+        source.run.trainer,
+        as_batch(made, margin),
+        prepared,
+        seed=seed,
+        sensor=sensor,
         quiet=quiet,
-    )
-    wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
-    return SensorFrames(
-        pixels,
-        losses.mask_in_frame(batch.mask, wide),
-        batch.slip_mm,
-        trainer.inner.batch,
-        wide=wide,
     )
 
 
@@ -257,7 +346,6 @@ def run_experiment(
     _check(sources, config)
     scenes = sources[0].run.scenes(EXPERIMENT)
     trials: list[ExperimentTrials] = []
-    visible: list[Array] = []
     answers: list[list[Predictions]] = [[] for _ in sources]
     on_fine: list[list[Predictions]] = [[] for _ in sources]
     prepared = [prepare_run(source, image=config.image) for source in sources]
@@ -271,7 +359,6 @@ def run_experiment(
         states, trial = states_of(config, subject, scenes)
         made = render_subject(states, config, subject, scenes)
         trials.append(trial)
-        visible.append((made.labels.shift_um * 1e-3).numpy())
         each = [
             *zip(answers, sources, prepared, sensors, strict=True),
             *zip(on_fine, sources, fine, sensors, strict=True),
@@ -291,7 +378,7 @@ def run_experiment(
         formed.image_tolerance_problem(source.run.trainer.optics, one)
         for source, one in zip(sources, prepared, strict=True)
     ]
-    seen_mm, results = np.concatenate(visible), []
+    results = []
     for i, (label, source, one) in enumerate(zip(labels, sources, how, strict=True)):
         found = _result(label, source, answers[i], whole, config, one)
         exact = (
@@ -299,7 +386,7 @@ def run_experiment(
             if on_fine[i]
             else None
         )
-        results.append(replace(found, visible_mm=seen_mm, above=above[i], finer=exact))
+        results.append(replace(found, above=above[i], finer=exact))
     yield config.subjects, results
 
 

@@ -90,10 +90,10 @@ def lens_imager(
         margin,
         2 * margin + 1,
     )
-    return imager(lens, grid, spectrum=source_of(lens, fwhm_nm), tolerance=tolerance)
+    return imager(lens, grid, spectrum=diode_source(lens, fwhm_nm), tolerance=tolerance)
 
 
-def source_of(lens: Lens, fwhm_nm: float) -> Source | None:
+def diode_source(lens: Lens, fwhm_nm: float) -> Source | None:
     """A diode about the design wavelength; None for one wavelength, a width of 0.
 
     Args:
@@ -159,7 +159,7 @@ def image_first_frames(
         optics.error,
         {name: float(value) for name, value in optics.parts.items()},
         spectrum.outside_library_text(
-            source_of(lens, fwhm_nm), lens.proxy.wavelengths_um
+            diode_source(lens, fwhm_nm), lens.proxy.wavelengths_um
         ),
         optics.above(TOLERANCE),
     )

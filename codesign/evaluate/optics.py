@@ -4,8 +4,9 @@ of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals ov
 scenes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,15 +17,18 @@ from codesign.eye import (
     EyeStates,
     PinholeCamera,
     RenderedFrames,
-    SeparabilityTriplets,
-    render_triplets,
+    moved_states,
+    render,
 )
+from codesign.train import bootstrap_ratio
 from metalens.core.errors import ConfigError, SceneError
+from metalens.core.report import Table
 from metalens.image import Grid, Imager, Normalisation, axial_information, imager
 from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens, passed_um2
 
 WINDOW = 56.4  # width of the PSFs, in wavelength / NA
+KINDS = ("gaze", "slip", "separability")
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,28 +316,16 @@ def scene_energies(
                 f"for {distance:g} um: their images differ in size; compare lenses of one sensor distance"
             )
     views = scene_views(states, settings, sensor_distance_um=distance)
+    window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
+    grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
     out = []
     for lens in lenses:
-        whole = lens_imager(lens, (views.anchor, views.gaze, views.slip), settings)
+        whole = imager(lens, grid, tolerance=settings.image_tolerance)
         found = energies_of(
             whole, views, light=1 - whole.parts["outside"], image_error=whole.error
         )
         out.append(replace(found, above=whole.above(settings.image_tolerance)))
     return out
-
-
-def lens_imager(
-    lens: Lens, views: Sequence[RenderedFrames], settings: SensitivityScenes
-) -> Imager:
-    """The true image of a lens at one wavelength, on the pixels of the scenes and over
-    the depths that they hold.
-
-    Args:
-        views: rendered views of the scenes. settings: of the scenes.
-    """
-    window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
-    grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
-    return imager(lens, grid, layers=lens.layers, tolerance=settings.image_tolerance)
 
 
 def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
@@ -351,24 +343,27 @@ def scene_views(
     settings: SensitivityScenes,
     *,
     sensor_distance_um: float = 2000.0,
-) -> SeparabilityTriplets:
-    """Anchor, gaze and slip views of the states.
+) -> list[RenderedFrames]:
+    """Anchor, gaze and slip views of the states, at one exposure.
 
     Args:
         settings: of the scenes. sensor_distance_um: lens to sensor.
     """
-    return render_triplets(
-        states,
-        gaze_step_rad=math.radians(settings.gaze_step_deg),
-        slip_step_um=1e3 * settings.slip_step_mm,
-        rig=replace(CameraRig(), sensor_distance_um=sensor_distance_um),
-        camera=PinholeCamera(settings.pixels, settings.pitch_um),
+    motions = (
+        ("gaze_rad", 0, math.radians(settings.gaze_step_deg)),
+        ("slip_um", 2, 1e3 * settings.slip_step_mm),
     )
+    rig = replace(CameraRig(), sensor_distance_um=sensor_distance_um)
+    camera = PinholeCamera(settings.pixels, settings.pitch_um)
+    return [
+        render(one, rig=rig, camera=camera, exposed=states)
+        for one in moved_states(states, motions)
+    ]
 
 
 def energies_of(
     optics: Imager,
-    views: SeparabilityTriplets,
+    views: Sequence[RenderedFrames],
     *,
     light: float = 1.0,
     image_error: float = math.nan,
@@ -380,8 +375,7 @@ def energies_of(
         light: share of the light that the PSFs' windows hold.
         image_error: relative L2 error of the images.
     """
-    seen = [v.frames for v in (views.anchor, views.gaze, views.slip)]
-    images = [optics(f) for f in seen]
+    images = [optics(view.frames) for view in views]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
     maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
     sums = [m.sum((1, 2)) for m in maps]
@@ -392,4 +386,161 @@ def energies_of(
         light,
         image_error,
         torch.stack([anchor[0], maps[0][0], maps[2][0]]),
+    )
+
+
+def lens_ratios(
+    scenes: Mapping[str, SceneEnergy],
+) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1.
+
+    Args:
+        scenes: scene sensitivity by name of the lens.
+    """
+    first = next(iter(scenes.values()))
+    return {
+        name: {
+            kind: bootstrap_ratio(*(getattr(e, kind).numpy() for e in (energy, first)))
+            for kind in KINDS
+        }
+        for name, energy in scenes.items()
+    }
+
+
+def table_values(
+    axial: Mapping[str, AxialInformation],
+    scenes: Mapping[str, SceneEnergy],
+    setting: ResolvedSettings,
+) -> dict[str, Any]:
+    """Every number of the tables, ready for JSON.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
+    out: dict[str, Any] = {
+        "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
+        "angles_deg": list(setting.angles_deg),
+        "binnings": list(setting.binnings),
+        "normalisation": setting.normalisation,
+        "lenses": {},
+    }
+    compared = lens_ratios(scenes)
+    for name, found in axial.items():
+        energy = scenes[name]
+        out["lenses"][name] = {
+            "information_per_mm2": found.information.tolist(),
+            "encircled_energy": found.encircled.tolist(),
+            "psf_error": found.psf_error,
+            "scene_ratios": {
+                kind: list(interval) for kind, interval in compared[name].items()
+            },
+            "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
+            "light_in_window": energy.light,
+            "image_error": None
+            if math.isnan(energy.image_error)
+            else energy.image_error,
+        }
+    return out
+
+
+def table_failures(
+    axial: Mapping[str, AxialInformation],
+    scenes: Mapping[str, SceneEnergy],
+    setting: ResolvedSettings,
+) -> list[str]:
+    """What of the numbers misses its tolerance, in words.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
+    asked = setting.tolerance
+    above = [
+        f"{name}: the PSFs' error {one.psf_error:.2g} is above axial.tolerance = {asked:g}"
+        for name, one in axial.items()
+        if one.psf_error > asked
+    ]
+    return above + [f"{name}: {one.above}" for name, one in scenes.items() if one.above]
+
+
+def format_tables(
+    axial: Mapping[str, AxialInformation],
+    scenes: Mapping[str, SceneEnergy],
+    setting: ResolvedSettings,
+    *,
+    spread: Sequence[str] = (),
+) -> list[Table]:
+    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1;
+    spread: what is said of lenses that do not focus, a line each.
+
+    Args:
+        axial: axial information by name of the lens.
+        scenes: scene sensitivity by name of the lens.
+        setting: how the lenses were measured.
+    """
+    return [_axial(axial, setting, spread), _scenes(scenes)]
+
+
+def _axial(
+    axial: Mapping[str, AxialInformation],
+    setting: ResolvedSettings,
+    spread: Sequence[str],
+) -> Table:
+    low, high = setting.depths_mm
+    caption = (
+        f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
+        f"normalisation, averaged over sub-pixel positions; pixels of {setting.pixel_um:g} µm. Light: the least share "
+        f"within {setting.radius_um:g} µm over the depths."
+        + "".join(f"\n{line}." for line in spread)
+    )
+    head = (
+        "lens",
+        "binning",
+        *(f"{angle:g}°" for angle in setting.angles_deg),
+        "light on axis",
+        "light at all angles",
+    )
+    rows: list[tuple[str, ...]] = []
+    for name, found in axial.items():
+        for k, b in enumerate(setting.binnings):
+            told = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
+            least = (
+                [
+                    f"{float(found.encircled[0].min()):.2f}",
+                    f"{float(found.encircled.min()):.2f}",
+                ]
+                if k == 0
+                else []
+            )
+            rows.append(
+                (name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""]))
+            )
+    return Table(head, rows, caption)
+
+
+def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
+    first = next(iter(scenes))
+    caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
+    rows: list[tuple[str, ...]] = []
+    for name, found in lens_ratios(scenes).items():
+        one = scenes[name]
+        parts = [
+            f"{value:.2f} [{low:.2f}, {high:.2f}]"
+            for value, low, high in found.values()
+        ]
+        angle = float(torch.rad2deg(one.angle_rad).mean())
+        rows.append(
+            (
+                name,
+                *parts,
+                f"{angle:.1f}°",
+                f"{one.light:.2f}",
+                f"{one.image_error:.3f}",
+            )
+        )
+    return Table(
+        ("lens", *KINDS, "span angle", "light in window", "image error"), rows, caption
     )

@@ -5,16 +5,27 @@ What was not measured says so, with the command that would measure it: no number
 filled in.
 """
 
+import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from codesign.adapt import source as finished
+from codesign.batches import CALIBRATION, TEST
+from codesign.gaze import NetworkReadings, bench
+from codesign.network import Architecture, recalibrate_batch_norm
+from codesign.train import SensorFrames, assess
+from codesign.train import run as runs
 from metalens.core import config
-from metalens.core.errors import StoreError
+from metalens.core.errors import StoreError, TrainingError
+
+Shown = tuple[bench.PeopleFrames, SensorFrames]
 
 ROLES = (
     "proposed",
@@ -22,6 +33,11 @@ ROLES = (
     "best_focus",
     "double_helix",
 )  # of the runs, in the order they are given
+
+PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
+# other people of as many frames, whose gaze tells what an axis that is read means
+BEFORE = 32
+WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,3 +292,142 @@ def _json(path: Path, *needed: str) -> dict[str, Any]:
             f"{path}: {', '.join(missing)} missing: made by another version; measure it again"
         )
     return told
+
+
+def frozen_parts(folder: Path) -> tuple[str, ...]:
+    """Parts of a finished run that did not move, from its result.json.
+
+    Args:
+        folder: of the files.
+
+    Raises:
+        TrainingError: no finished run, or of another version.
+    """
+    finished.rows_of(folder)  # refuses what is missing, cut short or empty
+    return tuple(_json(folder / "result.json").get("frozen", ()))
+
+
+def image_tolerance(folders: Sequence[Path]) -> float:
+    """Of the true image that lenses of these runs are compared by: the largest that one
+    of them is imaged at.
+
+    Args:
+        folders: of finished runs.
+    """
+    return max(
+        runs.load_run_settings(folder / "run.toml").optics.image_tolerance
+        for folder in folders
+    )
+
+
+@torch.no_grad()
+def gaze_rows(
+    folder: Path, *, people: int = PEOPLE, seed: int = 5
+) -> list[dict[str, Any]]:
+    """Gaze errors of every network of a finished run on people whom training never saw,
+    after a calibration on a fifth of their frames; least compute first.
+
+    Args:
+        folder: of the files. people: how many. seed: of the random generator.
+
+    Raises:
+        TrainingError: no finished run, half written, or of another version.
+    """
+    settings = runs.load_run_settings(folder / "run.toml")
+    going = runs.resume_run(folder / "checkpoint.safetensors", settings)
+    trainer, net = going.trainer, going.trainer.model.net
+
+    def simulate(stream: int, count: int, seed: int) -> Shown:
+        found = bench.simulate_people(going.scenes(stream), count, EACH, seed=seed)
+        return found, assess.frames_of(trainer, found)
+
+    def read(architecture: Architecture, shown: Shown) -> NetworkReadings:
+        one = assess.predict_frames(net, architecture, shown[1], settings.inner)
+        return bench.read_of(shown[0], one.centre, one.slip_mm, one.axis)
+
+    test = simulate(TEST, people, seed)
+    before = functools.cache(lambda: simulate(CALIBRATION, BEFORE, seed + 1))
+    known = assess.training_frames(trainer)
+    out = []
+    for row in sorted(finished.rows_of(folder), key=lambda r: float(r["mmacs"])):
+        architecture = finished.architecture_of(row["architecture"], going, folder)
+        finished.restore_network(going, row, folder)
+        recalibrate_batch_norm(net, architecture, known)
+        found, how = read(architecture, test), None
+        if found.axis_deg is not None:
+            others = before()
+            how = bench.learn_from_people(others[0], read(architecture, others))
+        error = bench.calibrated_error_deg(test[0], found, how=how)
+        about = {"people": people, "frames_each": EACH, "seed": seed}
+        out.append({"mmacs": row["mmacs"], **about, "personal_deg": error})
+    return out
+
+
+def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
+    """Table 2 from gaze.json, {folder: {rows of :func:`gaze_rows`}}: the first run is
+    the proposed one. Networks of others are not rebuilt here.
+
+    Args:
+        told: content of gaze.json.
+    """
+    for entry in told.values():
+        rows = entry["rows"]
+        accurate = min(rows, key=lambda r: float(r["personal_deg"]))
+        return {
+            "table2/proposed_efficient": _measured(rows[0]),
+            "table2/proposed_accurate": _measured(accurate),
+        }
+    return {}
+
+
+def _measured(row: Mapping[str, Any]) -> MeasuredNumber:
+    words = f"{row['mmacs']:.1f} MMACs, {row['people']} synthetic people, seed {row['seed']}, {WORDS}"
+    return MeasuredNumber(float(row["personal_deg"]), conditions=words)
+
+
+def of_ablations(
+    ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> dict[str, MeasuredNumber]:
+    """Fig. 8b: compute of a run with one part frozen over ours, at the best axial
+    slippage that the frozen one reaches.
+
+    ours: rows of the joint run. others: {frozen part: rows}. A part whose best error
+    ours never reaches is left out.
+    """
+    found = {}
+    for part, rows in others.items():
+        best = min(rows, key=lambda r: float(r["axial_slip_mm"]))
+        enough = [
+            float(r["mmacs"])
+            for r in ours
+            if r["axial_slip_mm"] <= best["axial_slip_mm"]
+        ]
+        if enough:
+            words = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(enough):.1f} MMACs"
+            found[f"fig8b/{part}"] = MeasuredNumber(
+                float(best["mmacs"]) / min(enough), conditions=words
+            )
+    return found
+
+
+def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """(part, rows) of every run in which exactly one part was frozen.
+
+    Args:
+        folders: of finished runs.
+
+    Raises:
+        TrainingError: two runs with the same part frozen.
+    """
+    seen: dict[str, Path] = {}
+    for folder in folders:
+        parts = frozen_parts(folder)
+        if len(parts) != 1:
+            continue
+        (part,) = parts
+        if part in seen:
+            raise TrainingError(
+                f"{seen[part]} and {folder} both have {part} frozen; give one of them"
+            )
+        seen[part] = folder
+        yield part, finished.rows_of(folder)

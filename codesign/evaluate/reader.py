@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from codesign.adapt import bootstrap_interval
 from codesign.batches import (
     EXPERIMENT,
     TEST,
@@ -18,6 +17,7 @@ from codesign.batches import (
     EyeScenes,
     PoolScenes,
     SceneConfig,
+    SceneSource,
     depth_um,
     render_pool,
     sensor_irradiance,
@@ -26,7 +26,7 @@ from codesign.evaluate.imaged import lens_imager, margin_of
 from codesign.eye import PinholeCamera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
-from codesign.train import SceneSource, read_out
+from codesign.train import bootstrap_interval, read_out
 from metalens.core import threads
 from metalens.core.errors import ConfigError
 from metalens.core.report import Table

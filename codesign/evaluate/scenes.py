@@ -42,13 +42,10 @@ class SceneObjective:
             count=settings.scenes, pitch_um=9.0, pixels=128, window_um=153.0
         )
         states = states_at(torch.arange(self.scenes.count), 100 + settings.seed)
-        self.views = scene_views(
+        views = scene_views(
             states, self.scenes, sensor_distance_um=pupil.sensor_distance_um
         )
-        self.frames = [
-            view.frames
-            for view in (self.views.anchor, self.views.gaze, self.views.slip)
-        ]
+        self.frames = [view.frames for view in views]
         seen = torch.cat([f.depth_um[f.coverage > 0] for f in self.frames])
         low, high = float(seen.min()), float(seen.max())
         self.depths_um = 1 / torch.linspace(

@@ -4,10 +4,8 @@ from . import model as model
 from . import population as population
 from . import renderer as renderer
 from . import textures as textures
-from .dataset import SeparabilityTriplets as SeparabilityTriplets
 from .dataset import ambiguity_pairs as ambiguity_pairs
 from .dataset import moved_states as moved_states
-from .dataset import render_triplets as render_triplets
 from .dataset import states_at as states_at
 from .population import POPULATION as POPULATION
 from .population import CameraRig as CameraRig

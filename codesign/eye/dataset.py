@@ -1,9 +1,9 @@
-"""Sets of states: triplets for the Fisher matrix, pairs that share a pupil position,
+"""Sets of states: moved ones for the Fisher matrix, pairs that share a pupil position,
 and shards of frames on disk.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,7 @@ from codesign.eye.renderer import PinholeCamera, RenderedFrames, render
 from metalens.core import store
 from metalens.core.arrays import Array
 from metalens.core.errors import SceneError
-from metalens.core.store import Provenance, typed_reader
-from metalens.image import Frames
+from metalens.core.store import Provenance
 
 
 def states_at(
@@ -31,6 +30,11 @@ def states_at(
         motion: ranges of the states; the usual ones without it.
     """
     parts = [eye.draw_states(1, (seed, int(i)), motion=motion) for i in indices]
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[EyeStates]) -> EyeStates:
+    """States one after the other."""
     return EyeStates(
         *(
             torch.cat([getattr(part, name) for part in parts])
@@ -39,56 +43,11 @@ def states_at(
     )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class SeparabilityTriplets:
-    """Anchor, gaze+ and slip+ renderings of the same subjects (paper Sec. 3.6), and the
-    steps between them.
-
-    gaze_step_rad, slip_step_um: the steps taken, across and along the camera's axis.
-    """
-
-    anchor: RenderedFrames
-    gaze: RenderedFrames
-    slip: RenderedFrames
-    gaze_step_rad: float
-    slip_step_um: float
-
-
-def render_triplets(
-    states: EyeStates,
-    *,
-    gaze_step_rad: float = 3.5e-5,
-    slip_step_um: float = 1.0,
-    rig: CameraRig | None = None,
-    camera: PinholeCamera | None = None,
-) -> SeparabilityTriplets:
-    """Finite-difference triplets in the linear regime, at one exposure.
-
-    Args:
-        states: subjects with gaze and slippage.
-        gaze_step_rad: step of the gaze. slip_step_um: step of the slippage.
-        rig: pose of camera and lamps; the default one without it.
-        camera: pixel grid; the default one without it.
-
-    Accuracy:
-        Divided by the default steps, the differences agree with the exact derivatives
-        to 2 % (gaze) and 10 % (slip),
-        with an error in proportion to the step: lashes and lid edges are a few tens of
-        um wide. At half a degree,
-        where edges move by pixels, they are wrong by 40 % and more.
-    """
-    motions = ("gaze_rad", 0, gaze_step_rad), ("slip_um", 2, slip_step_um)
-    anchor, gaze, slip = (
-        render(one, rig=rig, camera=camera, exposed=states)
-        for one in moved_states(states, motions)
-    )
-    return SeparabilityTriplets(anchor, gaze, slip, gaze_step_rad, slip_step_um)
-
-
 def moved_states(
     states: EyeStates, motions: Sequence[tuple[str, int, float]]
 ) -> list[EyeStates]:
-    """The states, then the same moved along every motion.
+    """The states, then the same moved along every motion: the differences of their
+    frames, rendered at one exposure, are those of the Fisher matrix (paper Sec. 3.6).
 
     Args:
         states: subjects with gaze and slippage.
@@ -102,22 +61,6 @@ def moved_states(
     return out
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class AmbiguousPairs:
-    """Pairs of states of one subject whose pupil centroids coincide on the sensor
-    (paper Sec. 3.6).
-
-    first, second: the states. distance_px: (n,) between the centroids of their rendered
-    pupil masks.
-    tried: pairs that were looked at to find these.
-    """
-
-    first: EyeStates
-    second: EyeStates
-    distance_px: Tensor
-    tried: int
-
-
 def ambiguity_pairs(
     count: int,
     seed: int,
@@ -125,23 +68,22 @@ def ambiguity_pairs(
     rig: CameraRig | None = None,
     camera: PinholeCamera | None = None,
     motion: MotionRanges | None = None,
-    tolerance_px: float = 0.1,
-    least_slip_um: float = 800.0,
-) -> AmbiguousPairs:
-    """Pairs of distinct slip and gaze whose visible pupil has the same centroid within
-    ``tolerance_px``.
+) -> EyeStates:
+    """Pairs of states of one subject with distinct slip and gaze, whose visible pupils
+    have the same centroid within 0.1 pixels (paper Sec. 3.6).
 
-    The second state takes a new slip; its gaze is then solved, on the rendered masks,
-    so that the centroid returns.
-    Pairs that need a gaze outside the range, or whose pupil is cut by lid or frame, are
-    left out.
+    The second state takes a new slip, 0.8 mm or more away; its gaze is then solved, on
+    the rendered masks, so that the centroid returns. Pairs that need a gaze outside the
+    range, or whose pupil is cut by lid or frame, are left out.
 
     Args:
         count: how many. seed: of the random generator.
         rig: pose of camera and lamps; the default one without it.
         camera: pixel grid; the default one without it.
         motion: ranges of the states; the usual ones without it.
-        least_slip_um: least distance of the two slippages of a pair.
+
+    Returns:
+        2 ``count`` states, the two of a pair one after the other.
 
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
@@ -151,7 +93,7 @@ def ambiguity_pairs(
         camera or PinholeCamera(),
         motion or MotionRanges(),
     )
-    kept: list[tuple[EyeStates, EyeStates, Tensor]] = []
+    kept: list[EyeStates] = []
     found = tried = 0
     while found < count:
         if tried > 50 * max(found, 64):
@@ -165,22 +107,14 @@ def ambiguity_pairs(
         )
         tried += batch
         second = replace(first, slip_um=second.slip_um)
-        second, distance, good = _returned(
-            first, second, rig=rig, camera=camera, tolerance_px=tolerance_px
-        )
+        second, good = _returned(first, second, rig=rig, camera=camera)
         limits = torch.tensor([motion.gaze_x_rad, motion.gaze_y_rad])
         good &= (second.gaze_rad.abs() <= limits).all(1)
-        good &= (second.slip_um - first.slip_um).norm(dim=1) >= least_slip_um
-        rows = torch.nonzero(good)[: count - found, 0]
-        kept.append((first[rows], second[rows], distance[rows]))
-        found += len(rows)
-    joined = [
-        EyeStates(
-            *(torch.cat([getattr(k[i], n) for k in kept]) for n in EyeStates.__slots__)
-        )
-        for i in (0, 1)
-    ]
-    return AmbiguousPairs(joined[0], joined[1], torch.cat([k[2] for k in kept]), tried)
+        good &= (second.slip_um - first.slip_um).norm(dim=1) >= 800.0
+        for row in torch.nonzero(good)[: count - found]:
+            kept += [first[row], second[row]]
+        found = len(kept) // 2
+    return _joined(kept)
 
 
 def _returned(
@@ -189,8 +123,8 @@ def _returned(
     *,
     rig: CameraRig,
     camera: PinholeCamera,
-    tolerance_px: float,
-) -> tuple[EyeStates, Tensor, Tensor]:
+    tolerance_px: float = 0.1,
+) -> tuple[EyeStates, Tensor]:
     """``second`` with the gaze that brings its centroid to that of ``first``: Newton
     steps on rendered masks.
     """
@@ -222,7 +156,7 @@ def _returned(
     here, visible = _centroids(second, gaze, rig, camera)
     distance = (goal.centroid_px - here).norm(dim=1)
     good = (distance <= tolerance_px) & (visible > 0.97) & (goal.visible > 0.97)
-    return replace(second, gaze_rad=gaze), distance, good
+    return replace(second, gaze_rad=gaze), good
 
 
 def _centroids(
@@ -262,29 +196,6 @@ def write_shard(
     store.save(
         path, "scene", arrays, provenance=replace(provenance or Provenance(), seed=seed)
     )
-
-
-@typed_reader
-def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
-    """Frames, pupil masks and labels by name of a shard.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        StoreError: not a scene file.
-    """
-    arrays = store.load(path, "scene").arrays
-    eye_share = torch.from_numpy(arrays["coverage"]).float() / 255
-    radiance = torch.from_numpy(arrays["radiance"]).float() / 255
-    depth = torch.from_numpy(arrays["depth_um"].astype(np.float32))
-    labels = {
-        name[7:]: torch.from_numpy(a)
-        for name, a in arrays.items()
-        if name.startswith("labels/")
-    }
-    frames = Frames(radiance, torch.stack([1 - eye_share, eye_share], 1), depth)
-    return frames, torch.from_numpy(arrays["pupil"]).float() / 255, labels
 
 
 def _bytes(values: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -432,7 +432,7 @@ def frames(
     first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array,
     w: Array, light: Array, cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip
-    """Strips of frames from the first to before the end; see :func:`render`.
+    """Strips of frames from the first to before the end; see :func:`render_rows`.
 
     Args:
         parameters: (n, COUNT) of the frames. scale: (n,) factor of the depths.
@@ -464,7 +464,7 @@ def frames(
             _copy_out(x, HOLE, pupil[n, 0], row, column)
 
 
-def render(
+def render_rows(
     parameters: Array, scale: Array, bank: Array, u: Array, w: Array, light: Array,
     cover: Array, depth: Array, pupil: Array,
 ) -> None:  # fmt: skip

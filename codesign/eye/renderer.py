@@ -171,7 +171,9 @@ def _compiled(
             slice(first, end),
         )
         out = (light[run], cover[run], depth[run], pupil[run])
-        kernel.render(values[run], factor[run], textures.packed_bank(seed), t, t, *out)
+        kernel.render_rows(
+            values[run], factor[run], textures.packed_bank(seed), t, t, *out
+        )
     return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(
         pupil[:, 0]
     )

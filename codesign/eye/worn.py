@@ -296,77 +296,78 @@ def apply_augmentations(
     light, cover, depth = (
         getattr(made.frames, name).clone() for name in Frames.__slots__
     )
-    pupil, grid = made.pupil.clone(), _grid(int(light.shape[-1]))
-    for steps in (
-        (_made_up, _grown, _glints),
-        (_lit,),
-        (_spectacles,),
-        (_moved,),
-        (_recorded,),
-    ):
-        for step in steps:
-            step(light, cover, depth, pupil, grid, worn, made.labels)
+    canvas = _Canvas(light, cover, depth, made.pupil.clone(), worn)
+    _make_up(canvas)
+    _darken(canvas)
+    _add_glints(canvas, made.labels)
+    _light_unevenly(canvas)
+    _add_spectacles(canvas)
+    _move(canvas)
+    _record(canvas)
     return RenderedFrames(
-        Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil)
+        Frames(light, cover, depth),
+        canvas.pupil,
+        _labels(made.labels, made.pupil, canvas.pupil),
     )
 
 
-def _grid(pixels: int) -> tuple[Tensor, Tensor]:
-    """(1, x) and (y, 1) places in frame widths from the middle."""
-    line = (torch.arange(pixels) + 0.5) / pixels - 0.5
-    return line[None], line[:, None]
+@dataclass(frozen=True, eq=False, slots=True)
+class _Canvas:
+    """Frames that are painted over in place: light, cover, depth (n, 2, y, x), pupil
+    (n, y, x), and what each of them has.
+    """
+
+    light: Tensor
+    cover: Tensor
+    depth: Tensor
+    pupil: Tensor
+    worn: DrawnAugmentations
+
+    @property
+    def pixels(self) -> int:
+        """Along a side."""
+        return int(self.light.shape[-1])
+
+    @property
+    def places(self) -> tuple[Tensor, Tensor]:
+        """(1, x) and (y, 1) places in frame widths from the middle."""
+        line = (torch.arange(self.pixels) + 0.5) / self.pixels - 0.5
+        return line[None], line[:, None]
+
+    def having(self, name: str) -> list[tuple[int, float, Array]]:
+        """(frame, size, draws) of every frame that has a cause."""
+        size, draws = self.worn.size[name], self.worn.draws[name]
+        return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
 
 
-def _on(worn: DrawnAugmentations, name: str) -> list[tuple[int, float, Array]]:
-    """(frame, size, draws) of every frame that has a cause."""
-    size, draws = worn.size[name], worn.draws[name]
-    return [(int(i), float(size[i]), draws[i]) for i in np.flatnonzero(size)]
-
-
-def _made_up(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: object,
-    worn: DrawnAugmentations,
-    of: FrameLabels,
-) -> None:
+def _make_up(canvas: _Canvas) -> None:
     """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin
     above, up to 12 % of the frame.
     """
-    pixels = int(light.shape[-1])
-    for i, opacity, draws in _on(worn, "liner"):
+    pixels = canvas.pixels
+    for i, opacity, draws in canvas.having("liner"):
         wide = max(1, round((0.015 + 0.025 * draws[0]) * pixels))
-        near = _spread(cover[i, 1], up=wide, down=wide if draws[1] < 0.5 else 1)
-        light[i, 0] *= 1 - opacity * near
-    for i, opacity, draws in _on(worn, "lid_shadow"):
+        near = _spread(canvas.cover[i, 1], up=wide, down=wide if draws[1] < 0.5 else 1)
+        canvas.light[i, 0] *= 1 - opacity * near
+    for i, opacity, draws in canvas.having("lid_shadow"):
         high = max(2, round((0.06 + 0.06 * draws[2]) * pixels))
-        light[i, 0] *= 1 - opacity * _soft(
-            _spread(cover[i, 1], up=high, down=0), high / 2
+        canvas.light[i, 0] *= 1 - opacity * _soft(
+            _spread(canvas.cover[i, 1], up=high, down=0), high / 2
         )
 
 
-def _grown(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: object,
-    worn: DrawnAugmentations,
-    of: FrameLabels,
-) -> None:
+def _darken(canvas: _Canvas) -> None:
     """A darker eye, light of the retina, dark places of the skin, lashes over both
     sheets; masks stay outlines.
     """
-    for i, taken, _ in _on(worn, "socket"):
-        light[i, 1] *= 1 - taken
-    for i, radiance, _ in _on(worn, "retina"):
-        light[i, 1] += radiance * pupil[i]
-    for i, opacity, draws in _on(worn, "patch"):
-        light[i, 0] *= 1 - opacity * soft_patches(int(light.shape[-1]), draws)
-    for i, opacity, draws in _on(worn, "overhang"):
-        light[i] *= 1 - opacity * draw_lashes(cover[i, 1], draws)
+    for i, taken, _ in canvas.having("socket"):
+        canvas.light[i, 1] *= 1 - taken
+    for i, radiance, _ in canvas.having("retina"):
+        canvas.light[i, 1] += radiance * canvas.pupil[i]
+    for i, opacity, draws in canvas.having("patch"):
+        canvas.light[i, 0] *= 1 - opacity * soft_patches(canvas.pixels, draws)
+    for i, opacity, draws in canvas.having("overhang"):
+        canvas.light[i] *= 1 - opacity * draw_lashes(canvas.cover[i, 1], draws)
 
 
 def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
@@ -384,58 +385,43 @@ def _soft(picture: Tensor, width: float) -> Tensor:
     return F.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
-def _glints(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: tuple[Tensor, Tensor],
-    worn: DrawnAugmentations,
-    of: FrameLabels,
-) -> None:
+def _add_glints(canvas: _Canvas, labels: FrameLabels) -> None:
     """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is
     seen of the eye.
     """
-    pixels, (x, y) = int(light.shape[-1]), grid
-    for i, radiance, draws in _on(worn, "glints"):
-        px, py = ((of.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
+    pixels, (x, y) = canvas.pixels, canvas.places
+    for i, radiance, draws in canvas.having("glints"):
+        px, py = ((labels.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
         turn, apart = 6.283 * draws[3], 0.02 + 0.07 * draws[4]
         for k in range(1 + int(4 * draws[5])):
             at = turn + 1.7 * k
             size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
             dx, dy = x - px - apart * np.cos(at), y - py - apart * np.sin(at)
-            light[i, 1] += (
-                radiance * cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
+            canvas.light[i, 1] += (
+                radiance * canvas.cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
             )
 
 
-def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: DrawnAugmentations,
-         of: FrameLabels) -> None:  # fmt: skip
+def _light_unevenly(canvas: _Canvas) -> None:
     """Uneven light and shadows: a factor on both sheets."""
-    x, y = grid
-    for i, change, draws in _on(worn, "gradient"):
+    x, y = canvas.places
+    for i, change, draws in canvas.having("gradient"):
         at = 6.283 * draws[7]
-        light[i] *= (1 + change * 2 * (x * np.cos(at) + y * np.sin(at))).clamp_min(0.1)
-    for i, taken, draws in _on(worn, "shade"):
+        canvas.light[i] *= (
+            1 + change * 2 * (x * np.cos(at) + y * np.sin(at))
+        ).clamp_min(0.1)
+    for i, taken, draws in canvas.having("shade"):
         at, edge = 6.283 * draws[8], 0.02 + 0.1 * draws[9]
         away = x * np.cos(at) + y * np.sin(at) - (draws[10] - 0.5) * 0.6
-        light[i] *= 1 - taken * torch.sigmoid(away / edge)
+        canvas.light[i] *= 1 - taken * torch.sigmoid(away / edge)
 
 
-def _spectacles(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: tuple[Tensor, Tensor],
-    worn: DrawnAugmentations,
-    of: FrameLabels,
-) -> None:
+def _add_spectacles(canvas: _Canvas) -> None:
     """Mirrored windows on the glass, then the rim before all: an arc that hides what is
     behind it.
     """
-    x, y = grid
-    for i, radiance, draws in _on(worn, "reflection"):
+    x, y = canvas.places
+    for i, radiance, draws in canvas.having("reflection"):
         for k in range(1 + int(3 * draws[0])):
             at_x, at_y = (
                 (draws[1] + 0.61 * k) % 1 - 0.5,
@@ -447,10 +433,10 @@ def _spectacles(
             )
             lean = 0.6 * (draws[5] - 0.5)
             u, v = (x - at_x) + lean * (y - at_y), (y - at_y) - lean * (x - at_x)
-            light[i] += (
-                radiance * cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+            canvas.light[i] += (
+                radiance * canvas.cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
             )
-    for i, width, draws in _on(worn, "rim"):
+    for i, width, draws in canvas.having("rim"):
         radius, at, gap = (
             0.45 + 0.5 * draws[6],
             6.283 * draws[7],
@@ -460,49 +446,48 @@ def _spectacles(
         away = (
             torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
         )
-        band = torch.sigmoid(
-            (width / 2 - (away - width / 2).abs()) * light.shape[-1] * 2
-        )
+        band = torch.sigmoid((width / 2 - (away - width / 2).abs()) * canvas.pixels * 2)
         shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(away / width * 6.0))
-        eye = depth[i, 1][
-            depth[i, 1] > 0
+        eye = canvas.depth[i, 1][
+            canvas.depth[i, 1] > 0
         ]  # 0 behind skin, which is most of many frames
-        far = (eye if len(eye) else depth[i, 0]).median() * RIM_DEPTH
-        _hidden(light, cover, depth, pupil, i, band, band * shine, far)
+        far = (eye if len(eye) else canvas.depth[i, 0]).median() * RIM_DEPTH
+        _hide(canvas, i, band, band * shine, far)
 
 
-def _hidden(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, i: int, band: Tensor, shine: Tensor,
-            depth_um: Tensor) -> None:  # fmt: skip
-    """Put something of coverage ``band`` before frame ``i``, on its near sheet."""
-    light[i] *= 1 - band
-    cover[i] *= 1 - band
-    pupil[i] *= 1 - band
-    light[i, 0] += shine
-    cover[i, 0] += band
-    depth[i, 0] = torch.where(band > 0.5, depth_um, depth[i, 0])
-
-
-def _moved(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: object,
-    worn: DrawnAugmentations,
-    of: FrameLabels,
+def _hide(
+    canvas: _Canvas, i: int, band: Tensor, shine: Tensor, depth_um: Tensor
 ) -> None:
+    """Put something of coverage ``band`` before frame ``i``, on its near sheet."""
+    canvas.light[i] *= 1 - band
+    canvas.cover[i] *= 1 - band
+    canvas.pupil[i] *= 1 - band
+    canvas.light[i, 0] += shine
+    canvas.cover[i, 0] += band
+    canvas.depth[i, 0] = torch.where(band > 0.5, depth_um, canvas.depth[i, 0])
+
+
+def _move(canvas: _Canvas) -> None:
     """Both sheets and the mask averaged along a line: what the pixels collect while the
     picture moves.
     """
-    pixels = int(light.shape[-1])
-    for i, length, draws in _on(worn, "movement"):
+    pixels = canvas.pixels
+    for i, length, draws in canvas.having("movement"):
         kernel = line_kernel(length * pixels, 3.1416 * draws[11])
-        kept = cover[i].clamp_min(1e-6)
-        stack = torch.cat([light[i], cover[i], kept * depth[i], kept, pupil[i][None]])
+        kept = canvas.cover[i].clamp_min(1e-6)
+        stack = torch.cat(
+            [
+                canvas.light[i],
+                canvas.cover[i],
+                kept * canvas.depth[i],
+                kept,
+                canvas.pupil[i][None],
+            ]
+        )
         reach = len(kernel) // 2
         padded = F.pad(stack[:, None], (reach,) * 4, mode="replicate")
         seen = F.conv2d(padded, kernel[None, None])[:, 0]
-        light[i], cover[i], depth[i], pupil[i] = (
+        canvas.light[i], canvas.cover[i], canvas.depth[i], canvas.pupil[i] = (
             seen[:2],
             seen[2:4],
             seen[4:6] / seen[6:8],
@@ -510,15 +495,7 @@ def _moved(
         )
 
 
-def _recorded(
-    light: Tensor,
-    cover: Tensor,
-    depth: Tensor,
-    pupil: Tensor,
-    grid: tuple[Tensor, Tensor],
-    worn: DrawnAugmentations,
-    of: FrameLabels,
-) -> None:
+def _record(canvas: _Canvas) -> None:
     """As another camera gives it: stray light, darker corners, white from some level
     on, a curve from black to white.
 
@@ -526,20 +503,20 @@ def _recorded(
     are dressed: blur and curve
     change places only at edges.
     """
-    x, y = grid
-    for i, radiance, _ in _on(worn, "veil"):
-        light[i] += radiance * cover[i]
-    for i, dark, _ in _on(worn, "vignette"):
-        light[i] *= 1 - dark * 2 * (x**2 + y**2)
-    for i, share, _ in _on(worn, "saturation"):
-        level = light[i].sum(0)
-        light[i] *= (torch.quantile(level, 1 - share) / level.clamp_min(1e-9)).clamp(
-            max=1.0
-        )
-    for i, log_gamma, _ in _on(worn, "tone"):
-        level = light[i].sum(0)
+    x, y = canvas.places
+    for i, radiance, _ in canvas.having("veil"):
+        canvas.light[i] += radiance * canvas.cover[i]
+    for i, dark, _ in canvas.having("vignette"):
+        canvas.light[i] *= 1 - dark * 2 * (x**2 + y**2)
+    for i, share, _ in canvas.having("saturation"):
+        level = canvas.light[i].sum(0)
+        canvas.light[i] *= (
+            torch.quantile(level, 1 - share) / level.clamp_min(1e-9)
+        ).clamp(max=1.0)
+    for i, log_gamma, _ in canvas.having("tone"):
+        level = canvas.light[i].sum(0)
         white = torch.quantile(level, WHITE).clamp_min(1e-9)
-        light[i] *= (level / white).clamp_min(BLACK) ** (np.exp(log_gamma) - 1)
+        canvas.light[i] *= (level / white).clamp_min(BLACK) ** (np.exp(log_gamma) - 1)
 
 
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:

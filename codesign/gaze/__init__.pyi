@@ -2,7 +2,6 @@ from . import bench as bench
 from . import people_file as people_file
 from . import personal as personal
 from . import shared as shared
-from .bench import GazeErrors as GazeErrors
 from .personal import PersonalGaze as PersonalGaze
 from .personal import SphereCalibrator as SphereCalibrator
 from .personal import angle_deg as angle_deg

@@ -4,7 +4,7 @@ from . import stack as stack
 from .built import MadeLens as MadeLens
 from .built import posterior_parameters as posterior_parameters
 from .built import psf_error as psf_error
-from .lens_errors import LensError as LensError
+from .lens_errors import DrawnLensErrors as DrawnLensErrors
 from .lens_errors import LensErrors as LensErrors
 from .stack import OpticsConfig as OpticsConfig
 from .stack import PixelPsfStack as PixelPsfStack

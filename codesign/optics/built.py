@@ -3,7 +3,7 @@ pupil, on the samples of a run.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numba
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from characterize.inference import AsBuilt
 from characterize.model import PLACE, parameter_vector, process_state_of
-from codesign.optics.stack import OpticsConfig, PixelPsfStack
+from codesign.optics.stack import OpticsConfig, PixelPsfStack, sampled_light
 from metalens.core.arrays import Array
 from metalens.design import Focus, profiles
 from metalens.fabrication import (
@@ -30,7 +30,6 @@ from metalens.image import (
     Pupil,
     SmoothWave,
     amplitude,
-    aperture_light,
     cell_um,
     coordinates,
     view_pupil,
@@ -43,7 +42,7 @@ TABLE_STEP_UM = 1e-5  # of the table of t over the diameter
 SPARE = 4  # samples around the window, so that what wraps around does not reach it
 
 
-def of_lens(x: Array) -> Array:
+def at_rest(x: Array) -> Array:
     """The parameters that a lens keeps when it leaves the bench; those of bench and
     light source are set to rest.
 
@@ -206,7 +205,7 @@ class MadeLens:
         Args:
             x: all parameters; of the bench's own (stage, light, camera) none enters.
         """
-        known = of_lens(parameter_vector() if x is None else x)
+        known = at_rest(parameter_vector() if x is None else x)
         distance = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
         pupil, tangents = self._pupil(distance), self._field.tangents
         seen = view_pupil(pupil, self._field, self.design.source_distance_um)
@@ -225,10 +224,17 @@ class MadeLens:
             source_path(seen.x_um, seen.y_um, tangents, 1 / z)
             for z in self.settings.depths_um.tolist()
         ]
-        angles = (torch.remainder(inward + k * p, 2 * math.pi) for p in paths)
-        light = self._psfs(seen.weight * field, angles, pupil)
+        field = field * seen.weight
+        light = []
+        for path in paths:
+            angle = torch.remainder(inward + k * path, 2 * math.pi)
+            wave = (field * torch.polar(torch.ones_like(angle), angle)).to(
+                torch.complex64
+            )
+            grid = self.settings.sample_um, self.settings.window_samples
+            light.append(sampled_light(wave, pupil, *grid))
         return PixelPsfStack(
-            light,
+            torch.stack(light),
             self.settings.depths_um,
             Optics(self._plane(made, cells), self.design.layers, distance),
         )
@@ -243,7 +249,7 @@ class MadeLens:
         Args:
             x: all parameters of a lens, in the fit's order; None for the design.
         """
-        known = of_lens(parameter_vector() if x is None else x)
+        known = at_rest(parameter_vector() if x is None else x)
         pupil = self._pupil(self.design.sensor_distance_um)
         nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
         field = self._on_nodes(
@@ -379,47 +385,6 @@ class MadeLens:
             for a in (filled.real, filled.imag)
         )
         return np.asarray(real + 1j * imaginary)
-
-    def _psfs(self, field: Tensor, angles: Iterable[Tensor], pupil: Pupil) -> Tensor:
-        """(depths, samples, samples) share of the light through the aperture on each
-        sample, low-passed to the grid.
-
-        field: (nodes, nodes) complex wave. angles: its phase for every depth, rad.
-        """
-        harmonics, columns = self._samples(pupil)
-        size = pupil.nodes + harmonics
-        s = self.settings
-        given = aperture_light(pupil, s.window_samples * s.sample_um)
-        scale = (s.sample_um / pupil.period_um) ** 2 / (given * size**2)
-        out = []
-        for angle in angles:
-            wave = field * torch.polar(torch.ones_like(angle), angle)
-            light = torch.fft.fft2(wave.to(torch.complex64), s=(size, size))
-            transfer = torch.fft.fft2(light.real**2 + light.imag**2)
-            keep = torch.arange(-harmonics + 1, harmonics) % size
-            out.append((columns @ transfer[keep][:, keep] @ columns.mT).real * scale)
-        return torch.stack(out).to(torch.float32)
-
-    def _samples(self, pupil: Pupil) -> tuple[int, Tensor]:
-        """Harmonics of the period up to what the samples show, and (samples, 2
-        harmonics - 1) from them to samples.
-        """
-        s = self.settings
-        edge = pupil.period_um / (2 * s.sample_um)
-        harmonics = math.floor(edge + 0.5) + 1
-        m = torch.arange(-harmonics + 1, harmonics, dtype=torch.float64)
-        kept = (edge - m.abs() + 0.5).clamp(
-            0, 1
-        )  # the last in part, so that the width of the period does not matter
-        place = (
-            torch.arange(s.window_samples, dtype=torch.float64)
-            - (s.window_samples - 1) / 2
-        ) * s.sample_um
-        f = m / pupil.period_um
-        wave = torch.exp(2j * math.pi * place[:, None] * f) * (
-            kept * torch.sinc(f * s.sample_um)
-        )
-        return harmonics, wave.to(torch.complex64)
 
 
 def _filled(cells: Array) -> Array:

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from codesign.optics import stack as lens
-from codesign.optics.lens_errors import LensError, variance_rad2
+from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
 from codesign.optics.stack import OpticsConfig, PixelPsfStack
 from metalens.core.errors import PropagationError, SceneError, TrainingError
 from metalens.image import (
     Imager,
     Optics,
+    PillarWave,
     SmoothWave,
     normalise_psfs,
     surrogate_loss,
@@ -25,31 +26,17 @@ from metalens.image import (
 )
 from metalens.image import imager as field_imager
 from metalens.optics import Layers
-from metalens.psf import Source
 
 There = tuple[
     int, int, torch.device
 ]  # samples along a side of the frames, margin included; margin; where they are
 
 
-def source_of(settings: OpticsConfig) -> Source | None:
-    """The light that reaches the sensor; None for one wavelength.
-
-    A Gaussian line of width a behind a Gaussian filter of width b has the width a b /
-    √(a² + b²).
-
-    Args:
-        settings: of the lens and its image.
-    """
-    width = settings.fwhm_nm
-    if width and settings.filter_nm:
-        width = width * settings.filter_nm / math.hypot(width, settings.filter_nm)
-    return Source(settings.wavelength_nm, width) if width else None
-
-
-def wave_of(
-    settings: OpticsConfig, coefficients_rad: Tensor, error: LensError | None = None
-) -> SmoothWave:
+def lens_wave(
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    error: DrawnLensErrors | None = None,
+) -> SmoothWave | PillarWave:
     """The lens plane of these coefficients for :func:`metalens.image.imager`;
     differentiable in them.
 
@@ -58,8 +45,9 @@ def wave_of(
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         error: assembly and process error of one lens; None for none.
     """
-    split = settings.parts > 1 or settings.foci_mm
-    if settings.polynomials or settings.zones or split or error is not None:
+    if settings.parameters == "diameters":
+        return lens.pillar_wave(settings, coefficients_rad)
+    if settings.polynomials or settings.zones or error is not None:
         added = functools.partial(
             lens.phase_at, settings, coefficients_rad, error=error
         )
@@ -74,7 +62,7 @@ def make_imager(
     frame: int,
     *,
     margin: int,
-    error: LensError | None = None,
+    error: DrawnLensErrors | None = None,
     made: PixelPsfStack | None = None,
     device: torch.device | str = "cpu",
 ) -> Imager:
@@ -127,9 +115,11 @@ def _formed(
     settings: OpticsConfig,
     coefficients_rad: tuple[float, ...],
     there: There,
-    error: LensError | None,
+    error: DrawnLensErrors | None,
 ) -> Imager:
-    wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
+    wave = lens_wave(
+        settings, torch.tensor(coefficients_rad, dtype=torch.float64), error
+    )
     frame, margin, device = there
     plane = _in_place(settings, wave)
     return imager_through(settings, plane, frame, margin=margin, device=device)
@@ -156,7 +146,7 @@ def imager_through(
     whole = field_imager(
         plane.wave,
         lens.grid_of(settings, frame, margin),
-        spectrum=source_of(settings),
+        spectrum=settings.light,
         layers=plane.layers,
         field=(math.radians(settings.angle_deg), 0.0),
         tolerance=settings.image_tolerance,
@@ -166,7 +156,7 @@ def imager_through(
     return whole if settings.passed == 1 else whole.scaled(settings.passed)
 
 
-def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
+def _hazy(settings: OpticsConfig, whole: Imager, error: DrawnLensErrors) -> Imager:
     """See :func:`codesign.optics.stack.scatter_loss`; the shadow's light falls on all
     samples
     alike.
@@ -245,11 +235,12 @@ def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
     """
-    moving = settings if coefficients_rad.numel() else replace(settings, polynomials=0)
-    return _in_place(settings, wave_of(moving, coefficients_rad))
+    plain = replace(settings, polynomials=0, parameters="polynomials")
+    moving = settings if coefficients_rad.numel() else plain
+    return _in_place(settings, lens_wave(moving, coefficients_rad))
 
 
-def _in_place(settings: OpticsConfig, wave: SmoothWave) -> Optics:
+def _in_place(settings: OpticsConfig, wave: SmoothWave | PillarWave) -> Optics:
     return Optics(wave, settings.layers or Layers(), settings.sensor_distance_mm * 1e3)
 
 

@@ -88,7 +88,7 @@ class LensErrors(_Entries):  # type: ignore[misc]
             correlation[:size, :size] = np.reshape(self.correlation, (size, size))
         return np.asarray(correlation * np.outer(self.deviations, self.deviations))
 
-    def draw(self, generator: torch.Generator) -> "LensError | None":
+    def draw(self, generator: torch.Generator) -> "DrawnLensErrors | None":
         """The errors of one lens; None where nothing varies.
 
         Args:
@@ -109,7 +109,7 @@ class LensErrors(_Entries):  # type: ignore[misc]
         turn = (
             2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
         )
-        return LensError(
+        return DrawnLensErrors(
             {
                 ENTRIES[n]: amount
                 for n, amount in zip(held, (root @ normal).tolist(), strict=True)
@@ -133,7 +133,7 @@ class LensErrors(_Entries):  # type: ignore[misc]
 
 
 @dataclass(frozen=True, slots=True)
-class LensError:
+class DrawnLensErrors:
     """One lens: amounts by entry of :data:`ENTRIES` (left out: 0), and the direction of
     its gradients.
     """

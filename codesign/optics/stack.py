@@ -2,9 +2,10 @@
 phase, and their PSFs.
 """
 
+import contextlib
 import functools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -14,9 +15,9 @@ from torch import Tensor
 
 from codesign.batches import parallel
 from codesign.optics import families
-from codesign.optics.families import Family, StartingPhase
+from codesign.optics.families import Family
 from codesign.optics.lens_errors import (
-    LensError,
+    DrawnLensErrors,
     LensErrors,
     PhaseRates,
     phase_rates,
@@ -24,26 +25,35 @@ from codesign.optics.lens_errors import (
     variance_rad2,
     wave_front_rad,
 )
+from metalens import library
 from metalens.cell import Cell
 from metalens.core.arrays import Array
-from metalens.core.errors import ConfigError, TrainingError
-from metalens.design import Focus, PhaseOf, profiles
+from metalens.core.errors import ConfigError, LensError, TrainingError
+from metalens.core.store import Provenance
+from metalens.design import Focus, PhaseOf, make, profiles
 from metalens.image import (
     Field,
     Grid,
     Imager,
     Optics,
+    PillarWave,
     Pupil,
     PupilView,
     aperture_light,
+    cell_um,
     coordinates,
     radius,
     uniform_imager,
     view_pupil,
 )
+from metalens.lens import DiameterMap, Lens
 from metalens.library import DEFAULT_CELL, Proxy
 from metalens.optics import Layers
 from metalens.optics.paths import source_path
+from metalens.psf import Source
+
+SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
+ROWS = 64  # of pillars whose phase is computed at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +62,13 @@ class OpticsConfig:
 
     aperture_mm, sensor_distance_mm, wavelength_nm: of the lens.
     focus_mm: source distance that the hyperbolic part images onto the sensor.
+    parameters: what training moves: "polynomials" of phase, or the "diameters" of all
+    pillars through the proxy of their cell (paper Eq. 2), phase and transmission over
+    the whole spectrum; of the true image, and for lenses of some 0.1 mm.
     polynomials: orthonormal terms of order 2 and above that training moves; 0 for a
     fixed lens. family: of these terms:
         "free" form, or "radial" ones alone (one of them is a focus that moves).
     zones: rings of a double helix added to the hyperbolic phase; 0 for none.
-    parts, apart_um: sectors of the aperture whose images lie on a circle of that
-    diameter; 1 for a whole aperture.
-    foci_mm: source distances of rings of equal area, from the middle to the rim; none
-    for one focus.
     depths_mm: (least, largest) depth of the PSF stack. depth_count: its samples, at
     equal steps of 1/z.
     sample_um: of the PSFs; the image is formed on this grid before the pixels integrate
@@ -102,11 +111,9 @@ class OpticsConfig:
     filter_nm: float = 0.0
     image_tolerance: float = 0.015
     family: Family = "free"
-    parts: int = 1
-    apart_um: float = 0.0
-    foci_mm: tuple[float, ...] = ()
     layers: Layers | None = None
     cell: Cell = DEFAULT_CELL
+    parameters: Literal["polynomials", "diameters"] = "polynomials"
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm
@@ -132,9 +139,10 @@ class OpticsConfig:
             raise ConfigError(
                 f"angle_deg = {self.angle_deg}: need a field angle of -40 to 40 degrees"
             )
-        StartingPhase(
-            self.focus, 1.0, self.zones, self.parts, self.apart_um, self.foci_mm
-        )
+        if self.zones < 0 or self.polynomials < 0:
+            raise ConfigError(
+                f"zones = {self.zones}, polynomials = {self.polynomials}: need 0 or more"
+            )
         if not (
             self.fwhm_nm >= 0 and self.filter_nm >= 0 and 0 < self.image_tolerance < 1
         ):
@@ -148,6 +156,13 @@ class OpticsConfig:
             raise ConfigError(
                 f"fwhm_nm = {self.fwhm_nm}, filter_nm = {self.filter_nm}, layers = {self.layers} with image = "
                 "'uniform', an image of one wavelength in air: need image = 'true', or widths of 0 and no layers"
+            )
+        if self.parameters == "diameters" and (
+            self.image == "uniform" or any(self.spread.deviations)
+        ):
+            raise ConfigError(
+                f"parameters = 'diameters' with image = '{self.image}' and spread "
+                f"{self.spread.deviations}: need image = 'true' and no spread"
             )
         if self.filter_nm and not self.fwhm_nm:
             raise ConfigError(
@@ -175,17 +190,14 @@ class OpticsConfig:
         return need + 1 - need % 2
 
     @property
-    def start(self) -> StartingPhase:
-        """The fixed phase on top of the focus."""
-        foci = tuple(f * 1e3 for f in self.foci_mm)
-        return StartingPhase(
-            self.focus,
-            self.aperture_mm * 500,
-            self.zones,
-            self.parts,
-            self.apart_um,
-            foci,
-        )
+    def light(self) -> Source | None:
+        """The light that reaches the sensor; None for one wavelength.
+
+        A Gaussian line of width a behind a Gaussian filter of width b has the width
+        a b / √(a² + b²).
+        """
+        width = self.fwhm_nm * self.passed
+        return Source(self.wavelength_nm, width) if width else None
 
     @property
     def passed(self) -> float:
@@ -255,7 +267,7 @@ def lens_psf_stack(
     settings: OpticsConfig,
     coefficients_rad: Tensor,
     *,
-    error: LensError | None = None,
+    error: DrawnLensErrors | None = None,
     shared: bool = False,
 ) -> PixelPsfStack:
     """PSFs of the lens whose polynomial coefficients are these, on samples of the
@@ -282,24 +294,14 @@ def lens_psf_stack(
         raise TrainingError(
             "the optics left the finite numbers: lower the learning rate of the optics"
         )
-    phase = added_phase(settings, coefficients_rad)
-    if error is not None:
-        phase = phase + _error_phase(settings, error)
-    carriers, shape = _carriers(settings)
+    carriers = _carriers(settings)
     count = len(carriers)
     rows = parallel.shared_rows(count) if shared else torch.arange(count)
     if len(rows) < count:
         carriers = carriers[rows]
-    turn = torch.polar(
-        torch.ones_like(phase, dtype=torch.float32),
-        torch.remainder(phase, 2 * math.pi).float(),
-    )
-    field = torch.fft.fft2(carriers * turn, s=shape)
-    transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
-    to_rows, to_columns = _sample_rows(settings)
-    low = len(to_columns)
-    kept = torch.cat([transfer[:, :low, :low], transfer[:, 1 - low :, :low]], 1)
-    light = (to_rows @ (kept @ to_columns)).real
+    grid = settings.sample_um, settings.window_samples
+    wave = carriers * _node_factor(settings, coefficients_rad, error)
+    light = sampled_light(wave, settings.pupil, *grid)
     if shared:
         light = parallel.gather_rows(light, rows, count)
     if error is not None:
@@ -307,6 +309,24 @@ def lens_psf_stack(
             settings, light, variance_rad2(error.state(), settings.phase_rates)
         )
     return PixelPsfStack(light, settings.depths_um)
+
+
+def _node_factor(
+    settings: OpticsConfig, coefficients_rad: Tensor, error: DrawnLensErrors | None
+) -> Tensor:
+    """(nodes, nodes) complex transmission on top of the hyperbolic focus."""
+    if settings.parameters == "diameters":
+        seen, wave = _seen(settings), pillar_wave(settings, coefficients_rad)
+        angle = math.radians(settings.angle_deg)
+        found = wave.factor(seen.x_um, seen.y_um, settings.focus.wavelength_um, angle)
+        return torch.as_tensor(found)
+    phase = added_phase(settings, coefficients_rad)
+    if error is not None:
+        phase = phase + _error_phase(settings, error)
+    return torch.polar(
+        torch.ones_like(phase, dtype=torch.float32),
+        torch.remainder(phase, 2 * math.pi).float(),
+    )
 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
@@ -325,7 +345,7 @@ def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
     return phase
 
 
-def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
+def pillar_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> PhaseOf:
     """The trained phase as a function of pillar positions, for
     :func:`metalens.design.make`.
 
@@ -333,30 +353,128 @@ def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
         settings: of the lens and its image.
         coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
     """
-    count, family = settings.polynomials, settings.family
-    mix = _polynomials(settings.pupil, count, family)[1] if count else torch.zeros(0, 0)
-    weights = (
-        (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).tolist()
-        if len(mix)
-        else []
-    )
-    rim = settings.aperture_mm * 500
 
     def phase(x_um: Array, y_um: Array) -> Array:
         x, y = (torch.from_numpy(np.asarray(a, float)) for a in (x_um, y_um[:, None]))
-        focused = torch.from_numpy(
-            profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
-        )
-        total = focused + settings.start.phase_rad(x, y)
-        for weight, term in zip(
-            weights,
-            families.phase_terms(x / rim, y / rim, len(weights), family),
-            strict=True,
-        ):
-            total = total + weight * term
-        return total.numpy()
+        added = [
+            phase_at(settings, coefficients_rad, x, rows)
+            for rows in torch.split(y, ROWS)
+        ]
+        focused = profiles.hyperbolic_phase(x_um, y_um[:, None], settings.focus)
+        return np.asarray(focused + torch.cat(added).numpy())
 
     return phase
+
+
+def trained_lens(
+    settings: OpticsConfig,
+    coefficients_rad: Tensor,
+    provenance: Provenance | None = None,
+) -> Lens:
+    """The lens of trained coefficients: of diameters these themselves, of polynomials
+    the pillars of their phase.
+
+    The pillars are known over the light of training: over 1.25 of the width of a line
+    to either side (0.3 % of a Gaussian lies beyond), over half of that where pillars
+    would cover less than a turn of phase, else at the middle alone.
+
+    Args:
+        coefficients_rad: (polynomials,) of the phase, or (pillars,).
+        settings: of the lens and its image. provenance: of the file.
+    """
+    if settings.parameters == "diameters":
+        start = starting_lens(settings)
+        sizes = pillar_diameters(settings, coefficients_rad).numpy().astype(np.float32)
+        return replace(
+            start,
+            diameters=DiameterMap(sizes, start.diameters.pitch_um),
+            provenance=provenance or Provenance(),
+        )
+    middle_um, light = settings.focus.wavelength_um, settings.light
+    width_um = 0.0 if light is None else light.fwhm_nm * 1e-3
+
+    def over(half_um: float) -> Lens:
+        waves = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
+        waves_um = tuple((waves + middle_um).tolist())
+        swept = library.sweep(settings.cell, wavelengths_um=waves_um)
+        made, _ = make(
+            pillar_phase(settings, coefficients_rad),
+            settings.focus,
+            aperture_um=settings.aperture_mm * 1e3,
+            cell=swept.cell,
+            proxy=library.proxy_of(swept),
+            profile="codesign",
+            provenance=provenance,
+        )
+        return made
+
+    for half_um in (1.25 * width_um, 0.625 * width_um) if width_um else ():
+        with contextlib.suppress(LensError):
+            return over(half_um)
+    return over(0.0)
+
+
+@functools.lru_cache(maxsize=2)
+def starting_lens(settings: OpticsConfig) -> Lens:
+    """The lens that training of diameters begins with: of the focus and its rings.
+
+    Args:
+        settings: of the lens and its image.
+    """
+    plain = replace(settings, parameters="polynomials", polynomials=0)
+    return trained_lens(plain, torch.zeros(0, dtype=torch.float64))
+
+
+def count_parameters(settings: OpticsConfig) -> int:
+    """Coefficients of a lens: polynomials, or pillars.
+
+    Args:
+        settings: of the lens and its image.
+    """
+    if settings.parameters == "polynomials":
+        return settings.polynomials
+    return int(np.count_nonzero(starting_lens(settings).diameters.diameter_um))
+
+
+def pillar_diameters(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
+    """(y, x) diameter of every pillar in um, 0 where there is none; differentiable.
+
+    A coefficient of 1 moves a pillar by 1 rad of the proxy's mean slope. Diameters stay
+    in the proxy's domain and beside its resonances, where gradients pass unchanged.
+
+    Args:
+        settings: of the lens and its image.
+        coefficients_rad: (pillars,) change of each from :func:`starting_lens`.
+    """
+    lens = starting_lens(settings)
+    start, domain_um = (
+        torch.from_numpy(lens.diameters.diameter_um),
+        lens.proxy.domain_um,
+    )
+    low, high = domain_um
+    ends = lens.proxy.phase_rad(np.array(domain_um), lens.wavelength_um)
+    um_per_rad = (high - low) / float(ends[1] - ends[0])
+    moved = start[start > 0].double() + um_per_rad * coefficients_rad.double()
+    held = moved.detach().clamp(low, high)
+    for first, last in lens.proxy.gaps_um:
+        nearer = torch.where(held - first < last - held, first, last)
+        held = torch.where((first < held) & (held < last), nearer, held)
+    held = held + moved - moved.detach()
+    return torch.zeros_like(start, dtype=torch.float64).masked_scatter(start > 0, held)
+
+
+def pillar_wave(settings: OpticsConfig, coefficients_rad: Tensor) -> PillarWave:
+    """The lens plane of these diameters, phase and transmission by the proxy;
+    differentiable.
+
+    Args:
+        settings: of the lens and its image. coefficients_rad: (pillars,).
+    """
+    lens = starting_lens(settings)
+    window_um = settings.window_samples * settings.sample_um
+    width = cell_um(lens.layers, lens.wavelength_um, window_um, lens.sensor_distance_um)
+    sizes = pillar_diameters(settings, coefficients_rad).float()
+    return PillarWave(lens, diameter_um=sizes, cell_um=width)
 
 
 def stack_imager(
@@ -421,7 +539,8 @@ def _modes(settings: OpticsConfig) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def _start(settings: OpticsConfig) -> Tensor:
-    return settings.start.phase_rad(_seen(settings).x_um, _seen(settings).y_um)
+    seen, rim = _seen(settings), settings.pupil.radius_um
+    return families.double_helix_phase(seen.x_um / rim, seen.y_um / rim, settings.zones)
 
 
 @functools.lru_cache(maxsize=8)
@@ -435,12 +554,9 @@ def _seen(settings: OpticsConfig) -> PupilView:
 
 
 @functools.lru_cache(maxsize=8)
-def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
+def _carriers(settings: OpticsConfig) -> Tensor:
     """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic
-    lens; size of its transforms.
-
-    The size leaves the autocorrelation free of wrap-around at all frequencies that are
-    kept. complex64.
+    lens, complex64.
     """
     seen, k = _seen(settings), 2 * math.pi / settings.pupil.wavelength_um
     tangents = Field(math.radians(settings.angle_deg)).tangents
@@ -449,7 +565,6 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
         for z in settings.depths_um
     ]
     angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
-    size = scipy.fft.next_fast_len(settings.pupil.nodes + len(_kept(settings)))
     light = torch.polar(seen.weight, angle)
     if settings.layers is not None and settings.layers.stop is not None:
         about = (
@@ -462,46 +577,58 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
             for z in settings.depths_um
         ]
         light = light * torch.from_numpy(np.stack(shadows))
-    return light.to(torch.complex64), (size, size)
+    return light.to(torch.complex64)
 
 
-def _kept(settings: OpticsConfig) -> Tensor:
-    """Share of each harmonic of the pupil's period that the grid of the samples can
-    show, of those that nodes have.
+def sampled_light(wave: Tensor, pupil: Pupil, sample_um: float, samples: int) -> Tensor:
+    """(..., samples, samples) share of the aperture's light on square samples, low-passed
+    to what their grid can show.
+
+    The low frequencies of the intensity are the autocorrelation of the pupil, from one
+    padded transform that leaves them free of wrap-around.
+
+    Args:
+        wave: (..., nodes, nodes) complex64 on the nodes of the pupil.
+        pupil: aperture and its nodes. sample_um: side of a sample. samples: along a
+            side.
     """
-    edge = settings.pupil.period_um / (2 * settings.sample_um)
-    last = min(math.floor(edge + 0.5), settings.pupil.nodes)
-    number = torch.arange(last + 1, dtype=torch.float64)
-    return (edge - number + 0.5).clamp(
-        0, 1
-    )  # the last in part, so that the width of the period does not matter
+    to_rows, to_columns, size = _sample_rows(pupil, sample_um, samples)
+    field = torch.fft.fft2(wave, s=(size, size))
+    transfer = torch.fft.rfft2(field.real**2 + field.imag**2)
+    low = len(to_columns)
+    kept = torch.cat([transfer[..., :low, :low], transfer[..., 1 - low :, :low]], -2)
+    light: Tensor = (to_rows @ (kept @ to_columns)).real
+    return light
 
 
 @functools.lru_cache(maxsize=8)
-def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
+def _sample_rows(
+    pupil: Pupil, sample_um: float, samples: int
+) -> tuple[Tensor, Tensor, int]:
     """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to
-    the light on each sample.
+    the light on each sample; size of the padded transform.
     """
-    pupil, size = settings.pupil, settings.window_samples
-    kept = _kept(settings)
-    harmonic = torch.arange(len(kept), dtype=torch.float64) / pupil.period_um
-    place = (
-        torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    ) * settings.sample_um
-    half = torch.exp(2j * math.pi * place[:, None] * harmonic) * (
-        kept * torch.sinc(harmonic * settings.sample_um)
+    edge = pupil.period_um / (2 * sample_um)  # harmonics that the samples can show
+    number = torch.arange(
+        min(math.floor(edge + 0.5), pupil.nodes) + 1, dtype=torch.float64
+    )
+    # the last in part, so that the width of the period does not matter
+    kept = (edge - number + 0.5).clamp(0, 1)
+    size = scipy.fft.next_fast_len(pupil.nodes + len(kept))
+    harmonic = number / pupil.period_um
+    place = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
+    half = torch.exp(2j * math.pi * sample_um * place[:, None] * harmonic) * (
+        kept * torch.sinc(harmonic * sample_um)
     )
     rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
-    columns = half * torch.where(
-        harmonic == 0, 1.0, 2.0
-    )  # the other half of the frequencies is its conjugate
-    given = (
-        aperture_light(pupil, size * settings.sample_um)
-        * _carriers(settings)[1][0] ** 2
-    )
-    scale = (settings.sample_um / pupil.period_um) ** 2 / given
-    return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(
-        torch.complex64
+    # the other half of the frequencies is its conjugate
+    columns = half * torch.where(harmonic == 0, 1.0, 2.0)
+    given = aperture_light(pupil, samples * sample_um) * size**2
+    scale = (sample_um / pupil.period_um) ** 2 / given
+    return (
+        (rows * scale).to(torch.complex64),
+        columns.mT.contiguous().to(torch.complex64),
+        size,
     )
 
 
@@ -511,7 +638,7 @@ def phase_at(
     x_um: Tensor,
     y_um: Tensor,
     *,
-    error: LensError | None = None,
+    error: DrawnLensErrors | None = None,
 ) -> Tensor:
     """Phase on top of the hyperbolic focus at any places, float64; differentiable in
     the coefficients.
@@ -523,7 +650,7 @@ def phase_at(
         error: assembly and process error of one lens; None for none.
     """
     rim = settings.aperture_mm * 500
-    total = settings.start.phase_rad(x_um, y_um)
+    total = families.double_helix_phase(x_um / rim, y_um / rim, settings.zones)
     if settings.polynomials:
         weights = (
             _polynomials(settings.pupil, settings.polynomials, settings.family)[1].mT
@@ -542,13 +669,13 @@ def phase_at(
     )
 
 
-def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
+def _error_phase(settings: OpticsConfig, error: DrawnLensErrors) -> Tensor:
     seen, rim = _seen(settings), settings.pupil.radius_um
     return _wave_front(settings, error, seen.x_um / rim, seen.y_um / rim)
 
 
 def _wave_front(
-    settings: OpticsConfig, error: LensError, x: Tensor, y: Tensor
+    settings: OpticsConfig, error: DrawnLensErrors, x: Tensor, y: Tensor
 ) -> Tensor:
     """Phase of one made lens less that of its design, at places in units of the rim's
     radius.

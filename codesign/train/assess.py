@@ -1,12 +1,30 @@
-"""How well a network reads frames that it never saw: slippage and pupil mask."""
+"""How well a network reads frames that it never saw: slippage, pupil mask, gaze, and
+whether it reads the optics.
+"""
 
 import itertools
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor
 
-from codesign.batches import depth_um, frame_samples, sensor_irradiance
+from codesign.batches import (
+    EyeScenes,
+    FrameBatch,
+    SceneSource,
+    SingleSurfaceFrames,
+    StateScenes,
+    depth_um,
+    draw_depth_scales,
+    frame_samples,
+    sensor_irradiance,
+)
+from codesign.eye import ambiguity_pairs, draw_augmentations
+from codesign.gaze import bench
 from codesign.network import (
     Architecture,
     Supernet,
@@ -15,10 +33,11 @@ from codesign.network import (
     recalibrate_batch_norm,
 )
 from codesign.optics import OpticsConfig, PixelPsfStack, formed
-from codesign.train.formation import frame_wide, read_out
-from codesign.train.inner import InnerConfig, SceneSource, Trainer
+from codesign.train.imaging import frame_wide, read_out
+from codesign.train.trainer import InnerConfig, Trainer
+from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError, SceneError
-from metalens.image import Imager
+from metalens.image import Frames, Imager, Sensor
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,6 +104,39 @@ def finer_frames(
 
 
 @torch.no_grad()
+def read_batch(
+    trainer: Trainer,
+    batch: FrameBatch,
+    imager: Imager,
+    *,
+    seed: int,
+    sensor: Sensor | None = None,
+    quiet: bool = False,
+) -> SensorFrames:
+    """One batch through an imager and a trainer's pixels, with noise of a seed.
+
+    Args:
+        trainer: with pitch and sensor as they are. batch: rendered frames.
+        imager: what forms the images. seed: of the noise.
+        sensor: in place of the trainer's. quiet: expected electrons, without noise.
+    """
+    sample, pitch = trainer.optics.sample_um, trainer.model.pitch_um
+    light = sensor_irradiance(batch.frames, imager).cpu()
+    noise = torch.Generator().manual_seed(seed)
+    sensor = sensor or trainer.sensor
+    pixels = read_out(light, sample, pitch, sensor, generator=noise, quiet=quiet)
+    wide = frame_wide(light.shape[-1], sample, float(pitch.detach()))
+    return SensorFrames(
+        pixels,
+        losses.mask_in_frame(batch.mask, wide),
+        batch.slip_mm,
+        trainer.inner.batch,
+        blur.window_vergence(depth_um(batch.frames, margin=imager.grid.margin)),
+        wide,
+    )
+
+
+@torch.no_grad()
 def sensor_frames(
     trainer: Trainer,
     scenes: SceneSource,
@@ -93,6 +145,7 @@ def sensor_frames(
     stack: PixelPsfStack | None = None,
     optics: OpticsConfig | None = None,
     first: int = 0,
+    shift_um: float = 0.0,
 ) -> SensorFrames:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
     with fixed noise.
@@ -100,44 +153,50 @@ def sensor_frames(
     Args:
         optics: how the image is formed; as in training without it. first: number of
             the first batch.
+        shift_um: blurred as if everything stood so much farther away; places and sizes
+            stay.
         trainer: with lens, sensor and network as they are. scenes: frames by number.
         batches: how many batches.
     """
-    optics = optics or trainer.optics
-    prepared: Imager | None = None
-    pitch, wide, above = trainer.model.pitch_um, 1.0, ""
-    pixels, masks, slips, depths = [], [], [], []
+    optics, margin = optics or trainer.optics, scenes.margin
+    imager: Imager | None = None
+    stream = int(getattr(scenes, "stream", 0)) + 1
+    parts: list[SensorFrames] = []
     for number in range(first, first + batches):
         batch = scenes.batch(number, trainer.inner.batch)
-        if prepared is None:
-            given = (
-                optics,
-                trainer.model.coefficients_rad,
-                frame_samples(batch.frames),
-            )
-            prepared = formed.make_imager(
-                *given, margin=scenes.margin, made=stack, device=trainer.light.device
-            )
-            above = formed.image_tolerance_problem(optics, prepared)
-        light = sensor_irradiance(batch.frames, prepared).cpu()
-        noise = torch.Generator().manual_seed(
-            1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number
+        if shift_um:
+            batch = replace(batch, frames=displace_frames(batch.frames, shift_um))
+        imager = imager or formed.make_imager(
+            optics,
+            trainer.model.coefficients_rad,
+            frame_samples(batch.frames),
+            margin=margin,
+            made=stack,
+            device=trainer.light.device,
         )
-        wide = frame_wide(
-            light.shape[-1], trainer.optics.sample_um, float(pitch.detach())
-        )
-        pixels.append(
-            read_out(
-                light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise
-            )
-        )
-        masks.append(losses.mask_in_frame(batch.mask, wide))
-        slips.append(batch.slip_mm)
-        depths.append(
-            blur.window_vergence(depth_um(batch.frames, margin=scenes.margin))
-        )
-    shown = torch.cat(pixels), torch.cat(masks), torch.cat(slips)
-    return SensorFrames(*shown, trainer.inner.batch, torch.cat(depths), wide, above)
+        seed = 1_000_003 * stream + number
+        parts.append(read_batch(trainer, batch, imager, seed=seed))
+    joined: dict[str, Any] = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name in ("frames", "mask", "slip_mm", "vergence")
+    }
+    above = formed.image_tolerance_problem(optics, imager) if imager else ""
+    return replace(parts[0], **joined, above=above)
+
+
+def displace_frames(
+    frames: Frames | SingleSurfaceFrames, shift_um: float
+) -> Frames | SingleSurfaceFrames:
+    """Frames with all depths larger by ``shift_um``.
+
+    Args:
+        frames: rendered frames of two layers or of one.
+    """
+    if isinstance(frames, Frames):
+        return replace(frames, depth_um=frames.depth_um + shift_um)
+    added = shift_um / frames.scale[:, None, None]
+    depth = (frames.depth_um + added).clip(0, 65535).round().astype(np.uint16)
+    return replace(frames, depth_um=depth)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -177,10 +236,7 @@ def predict_frames(
     """
     training = net.training
     net.eval()
-    found = [
-        net(seen.frames[i : i + seen.batch], architecture)
-        for i in range(0, len(seen.frames), seen.batch)
-    ]
+    found = [net(frames, architecture) for frames in batched_frames(seen)]
     net.train(training)
     slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
@@ -235,3 +291,150 @@ def recalibrate_network(trainer: Trainer, architecture: Architecture) -> None:
     """
     frames = training_frames(trainer)
     recalibrate_batch_norm(trainer.model.net, architecture, frames)
+
+
+def ambiguous_pairs(scenes: EyeScenes, pairs: int, seed: int) -> StateScenes:
+    """Test frames on which only the blur tells depth (paper Sec. 3.6): the two states of
+    a pair have one pupil place, and sizes mean nothing.
+
+    Args:
+        scenes: rig, camera, ranges and looks. pairs: how many.
+        seed: of states and scales.
+
+    Raises:
+        SceneError: the ranges of ``scenes`` hold hardly any pair.
+    """
+    states = ambiguity_pairs(
+        pairs, seed, rig=scenes.rig, camera=scenes.camera, motion=scenes.settings.motion
+    )
+    scale = draw_depth_scales(
+        scenes.rig.distance_um + states.slip_um[:, 2],
+        scenes.depths_um,
+        scenes.settings.scale,
+        np.random.default_rng((seed, 8)),
+    )
+    generator = np.random.default_rng((seed, scenes.stream, 10))
+    worn = draw_augmentations(len(states), scenes.settings.variety, generator)
+    return StateScenes(
+        scenes, replace(states, scale=scale), worn.from_one_view(), scenes.stream
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DepthResponse:
+    """mm of predicted axial slippage per mm of PSF depth: 1 for a network that measures
+    by the blur alone.
+
+    mean, standard_error: over frames. frames: how many.
+    """
+
+    mean: float
+    standard_error: float
+    frames: int
+
+
+def depth_response(
+    trainer: Trainer,
+    scenes: SceneSource,
+    net: Supernet,
+    architecture: Architecture,
+    *,
+    batches: int,
+    shift_um: float = 1000.0,
+) -> DepthResponse:
+    """Shift the depth of the PSFs alone and see how far the prediction follows; the
+    noise is the same in both.
+
+    A network that guesses depth from the size of what it sees answers 0, however well
+    it scores on natural frames.
+    The batch statistics must be measured
+    (:func:`codesign.network.supernet.recalibrate_batch_norm`).
+
+    Args:
+        trainer: with lens, sensor and network as they are. scenes: frames by number.
+        net: elastic network. architecture: member of the search space.
+        batches: how many batches. shift_um: of the depth of the PSFs.
+    """
+    here, there = (
+        predict_frames(
+            net,
+            architecture,
+            sensor_frames(trainer, scenes, batches, shift_um=shift),
+            trainer.inner,
+        ).slip_mm[:, 2]
+        for shift in (0.0, shift_um)
+    )
+    change = (there - here) / (shift_um * 1e-3)
+    return DepthResponse(
+        float(change.mean()), float(change.std() / len(change) ** 0.5), len(change)
+    )
+
+
+def frames_of(trainer: Trainer, people: bench.PeopleFrames) -> SensorFrames:
+    """Their frames through a trainer's lens and sensor.
+
+    Args:
+        people: people, their frames and where they look.
+    """
+    size = trainer.inner.batch
+    return sensor_frames(trainer, people, math.ceil(len(people.states) / size))
+
+
+def gaze_error_deg(
+    trainer: Trainer,
+    architecture: Architecture,
+    people: bench.PeopleFrames,
+    seen: SensorFrames,
+) -> float:
+    """Mean gaze error of a network whose batch statistics are measured.
+
+    Args:
+        trainer: with lens, sensor and network as they are.
+        architecture: member of the search space.
+        people: people, their frames and where they look.
+        seen: their frames on the sensor.
+    """
+    answers = predict_frames(trainer.model.net, architecture, seen, trainer.inner)
+    read = bench.read_of(people, answers.centre, answers.slip_mm)
+    return bench.calibrated_error_deg(people, read)
+
+
+def bootstrap_interval(
+    values: Array, *, draws: int = 1000, seed: int = 0
+) -> tuple[float, float]:
+    """95 % percentile interval of the mean of (n,) values by the bootstrap; of a single
+    value the value itself.
+
+    Args:
+        values: to average. draws: resamples. seed: of them.
+    """
+    if len(values) < 2:
+        return float(values[0]), float(values[0])
+    ends = stats.bootstrap(
+        (values,), np.mean, n_resamples=draws, method="percentile", rng=seed
+    ).confidence_interval
+    return float(ends.low), float(ends.high)
+
+
+def bootstrap_ratio(
+    values: Array, reference: Array, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float, float]:
+    """Ratio of two means and its 95 % percentile interval by the paired bootstrap; of a
+    single pair the ratio itself.
+
+    Args:
+        values, reference: (n,) of the same n subjects or scenes. draws: resamples.
+            seed: of them.
+    """
+
+    def ratio(one: Array, other: Array, axis: int = -1) -> Array:
+        return np.asarray(one.mean(axis) / other.mean(axis))
+
+    whole = float(ratio(values, reference))
+    if len(values) < 2:
+        return whole, whole, whole
+    ends = stats.bootstrap(
+        (values, reference), ratio, n_resamples=draws, paired=True,
+        method="percentile", rng=seed,
+    ).confidence_interval  # fmt: skip
+    return whole, float(ends.low), float(ends.high)

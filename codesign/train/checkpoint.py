@@ -1,7 +1,8 @@
 """Training state on disk: every tensor bit for bit (safetensors), the rest as JSON,
-written whole or not at all.
+written whole or not at all; and the log beside it, a JSON entry a line.
 """
 
+import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 
 from metalens.core import config
 from metalens.core.errors import TrainingError
-from metalens.core.store import replace_atomically
+from metalens.core.store import replace_atomically, write_text
 
 VERSION = 10
 ABOUT = "about"
@@ -230,3 +231,35 @@ def _merge(tree: Any, tensors: dict[str, Tensor]) -> Any:
             return tensors[tree[_TENSOR]]
         return {k: _merge(v, tensors) for k, v in tree["items"]}
     return tree
+
+
+def append_entry(path: Path, entry: dict[str, Any]) -> None:
+    """Add an entry to a log.
+
+    Args:
+        path: of the log. entry: of plain values.
+    """
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(entry) + "\n")
+
+
+def read_entries(path: Path) -> list[dict[str, Any]]:
+    """Entries of a log, none without one; a line that a kill cut short is left out.
+
+    Args:
+        path: of the log.
+    """
+    entries = []
+    for line in path.read_text("utf-8").splitlines() if path.is_file() else []:
+        with contextlib.suppress(json.JSONDecodeError):
+            entries.append(json.loads(line))
+    return entries
+
+
+def write_entries(path: Path, entries: list[dict[str, Any]]) -> None:
+    """Write a log anew.
+
+    Args:
+        path: of the log. entries: that it keeps.
+    """
+    write_text(path, "".join(json.dumps(entry) + "\n" for entry in entries))

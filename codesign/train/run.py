@@ -15,27 +15,28 @@ import numpy as np
 import torch
 
 from codesign.batches import (
+    TRAINING,
     EyeScenes,
     FramePool,
     PoolScenes,
     SceneConfig,
+    SceneSource,
     parallel,
     render_pool,
 )
 from codesign.network import Architecture, SearchSpace, cost, smallest_architecture
 from codesign.optics import OpticsConfig
+from codesign.settings import Part
 from codesign.train import checkpoint, evolution
 from codesign.train.evolution import EvolutionSettings, EvolutionState
-from codesign.train.formation import network_macs
-from codesign.train.inner import (
+from codesign.train.imaging import network_macs
+from codesign.train.trainer import (
     InnerConfig,
     LearningRateSchedule,
     LogRecord,
-    SceneSource,
     Trainer,
     make_model,
 )
-from codesign.train.words import Part
 from metalens.core import config
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.image import Sensor
@@ -205,14 +206,7 @@ class CodesignRun:
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
-        s = self.settings
-        return EyeScenes(
-            s.scenes,
-            s.optics.sample_um,
-            s.optics.sensor_distance_mm * 1e3,
-            s.inner.seed,
-            stream,
-        )
+        return eye_scenes(self.settings, stream)
 
 
 def start_run(settings: RunConfig) -> CodesignRun:
@@ -227,29 +221,19 @@ def start_run(settings: RunConfig) -> CodesignRun:
             begins with.
     """
     seed, frozen = settings.inner.seed, settings.run.frozen
-    inner = settings.inner
-    inner = (
-        replace(inner, optics=LearningRateSchedule(0.0))
-        if "optics" in frozen
-        else inner
-    )
-    inner = (
-        replace(inner, pitch=LearningRateSchedule(0.0)) if "pitch" in frozen else inner
-    )
+    still: dict[str, Any] = {
+        part: LearningRateSchedule(0.0)
+        for part in ("optics", "pitch")
+        if part in frozen
+    }
+    inner = replace(settings.inner, **still)
     made = make_model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space
     )
-    fresh = EyeScenes(
-        settings.scenes,
-        settings.optics.sample_um,
-        settings.optics.sensor_distance_mm * 1e3,
-        seed,
-    )
+    fresh = eye_scenes(settings, TRAINING)
     scenes: SceneSource = fresh
     if settings.scenes.pool:
-        pool = functools.partial(
-            _pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed
-        )
+        pool = functools.partial(_pool, fresh)
         scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
     trainer = Trainer(
         inner,
@@ -266,46 +250,38 @@ def start_run(settings: RunConfig) -> CodesignRun:
     return run
 
 
+def eye_scenes(settings: RunConfig, stream: int) -> EyeScenes:
+    """Frames of one stream of a run.
+
+    Args:
+        settings: of the run. stream: of the random generator.
+    """
+    optics, seed = settings.optics, settings.inner.seed
+    distance_um = optics.sensor_distance_mm * 1e3
+    return EyeScenes(settings.scenes, optics.sample_um, distance_um, seed, stream)
+
+
 @functools.lru_cache(maxsize=1)
-def _pool(
-    scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int
-) -> FramePool:
-    """The rendered frames of a run; kept for whoever goes on with it in this process,
-    as its retraining does, until
-    another run asks for its own: an experiment over nine runs held nine of a gigabyte
-    each."""
-    return render_pool(
-        EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool
-    )
+def _pool(scenes: EyeScenes) -> FramePool:
+    """The rendered frames of a run, a gigabyte; kept for whoever goes on with it in
+    this process, until another run asks for its own.
+    """
+    return render_pool(scenes, scenes.settings.pool)
 
 
 def _affordable(run: CodesignRun, *, moves: bool) -> float:
-    """The finest pitch that leaves the smallest network within every budget; 0 where
-    the samples' own does.
-
-    By both counts: that which training goes by and that of whole pixels, which the
-    search goes by.
+    """:func:`finest_pitch_um` of the smallest network under the least budget; 0 where
+    the pitch does not move.
 
     Raises:
         TrainingError: it is coarser than the pitch that the run begins with.
     """
-    settings, net = run.settings, run.trainer.model.net
-    least, budget = (
-        smallest_architecture(settings.space),
-        min(settings.run.budgets_mmacs) * 1e6,
-    )
-
-    def count(pitch_um: float) -> float:
-        smooth = network_macs(
-            net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64)
-        )
-        return max(float(smooth), run.counted(least, pitch_um))
-
-    begins, coarsest = (
-        settings.run.pitch_um,
-        cost.coarsest_um(run.window_um, settings.space.resolution[0]),
-    )
+    settings = run.settings
+    least = smallest_architecture(settings.space)
+    budget, begins = min(settings.run.budgets_mmacs) * 1e6, settings.run.pitch_um
+    count = _counter(run, least)
     if count(begins) > budget:
+        coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])
         coarser = finest_within(count, budget, begins, coarsest)
         way = (
             ""
@@ -316,12 +292,38 @@ def _affordable(run: CodesignRun, *, moves: bool) -> float:
             f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.2f} MMACs at "
             f"run.pitch_um = {begins:g}: raise run.budgets_mmacs{way}"
         )
-    finest = min(settings.optics.sample_um, begins)
-    return (
-        0.0
-        if not moves or count(finest) <= budget
-        else finest_within(count, budget, finest, begins) or begins
-    )
+    return finest_pitch_um(run, least, budget, begins_um=begins) if moves else 0.0
+
+
+def _counter(run: CodesignRun, architecture: Architecture) -> Callable[[float], float]:
+    """Multiply-accumulates of an architecture by pitch, um: the larger of the smooth
+    count, which training goes by, and that of whole pixels, which the search goes by.
+    """
+
+    def count(pitch_um: float) -> float:
+        pitch = torch.tensor(pitch_um, dtype=torch.float64)
+        net = run.trainer.model.net
+        smooth = float(network_macs(net, architecture, run.window_um, pitch))
+        return max(smooth, run.counted(architecture, pitch_um))
+
+    return count
+
+
+def finest_pitch_um(
+    run: CodesignRun, architecture: Architecture, budget: float, *, begins_um: float
+) -> float:
+    """The finest pitch at which an architecture keeps its budget; 0 where the samples'
+    own does.
+
+    Args:
+        run: run with its model. architecture: member of the search space.
+        budget: multiply-accumulates. begins_um: pitch that training begins with.
+    """
+    count = _counter(run, architecture)
+    finest = min(run.settings.optics.sample_um, begins_um)
+    if count(finest) <= budget:
+        return 0.0
+    return finest_within(count, budget, finest, begins_um) or begins_um
 
 
 def finest_within(
@@ -393,12 +395,3 @@ def train_run(run: CodesignRun, path: Path) -> Iterator[LogRecord]:
             or record.step == run.settings.inner.steps
         ):
             save_run(path, run)
-
-
-def lens_coefficients(run: CodesignRun) -> torch.Tensor:
-    """Polynomial coefficients of the trained lens, rad.
-
-    Args:
-        run: run with its model.
-    """
-    return run.trainer.model.coefficients_rad.detach().clone()

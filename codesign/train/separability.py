@@ -1,4 +1,6 @@
-"""Eqs. 4 to 6 in training: how separably the sensor shows gaze and slippage."""
+"""What training asks of the lens itself: Eqs. 4 to 6, how separably the sensor shows
+gaze and slippage, or the depth that blurred texture tells.
+"""
 
 import math
 from collections.abc import Callable
@@ -10,8 +12,16 @@ from torch import Tensor
 
 from codesign.batches import EyeScenes
 from codesign.eye import moved_states, render
+from codesign.optics import OpticsConfig, PixelPsfStack
 from metalens.core.errors import ConfigError
-from metalens.image import Frames, OpticsLoss, Sensor, optics_loss
+from metalens.image import (
+    Frames,
+    OpticsLoss,
+    Sensor,
+    encircled_energy,
+    optics_loss,
+    texture_information,
+)
 from metalens.image import sensor as camera
 
 Motions = Literal["axial", "all"]
@@ -136,3 +146,52 @@ def fisher_separability(
         compactness=config.compactness,
     )
     return FisherSeparability(fisher, loss)
+
+
+def depth_information(made: PixelPsfStack) -> Tensor:
+    """(depths - 1,) information on depth between the depths, in the blur of a window of
+    1/f texture, per mm².
+
+    The window is as wide as the PSFs; the noise is a thousandth of the texture's mean
+    power. One over its square root
+    is the least standard deviation of any reader that knows the statistics of the
+    texture and nothing else of it
+    (:func:`metalens.fisher.texture_information`): readers of real frames collect less.
+
+    Args:
+        made: PSFs over depth.
+    """
+    psfs = made.intensity
+    spectrum = _texture(psfs.shape[-1]).to(psfs)
+    gaps = (made.depths_um[1:] - made.depths_um[:-1]).tolist()
+    pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
+    told = [
+        texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
+        for pair, gap in zip(pairs, gaps, strict=True)
+    ]
+    return torch.stack(told)
+
+
+def texture_depth_loss(
+    made: PixelPsfStack, settings: OpticsConfig, *, energy: float
+) -> Tensor:
+    """-log of the information on depth in blurred texture, and a hinge on the encircled
+    energy (paper Eq. 6).
+
+    A texture's blur is what the network reads; the information of the PSF alone ranks
+    lenses wrongly.
+
+    Args:
+        made: PSFs over depth. settings: of the lens and its image.
+    """
+    told, psfs = depth_information(made), made.intensity
+    share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
+    return -torch.log(told + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+
+
+def _texture(size: int) -> Tensor:
+    """Power of a 1/f texture on the grid of rfft2, of mean 1."""
+    fy, fx = torch.fft.fftfreq(size), torch.fft.rfftfreq(size)
+    power = 1 / (fy[:, None] ** 2 + fx**2 + (0.5 / size) ** 2)
+    scaled: Tensor = power / power.mean()
+    return scaled

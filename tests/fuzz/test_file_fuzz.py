@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from characterize.inference import asbuilt
 from codesign.commands import budget as command_budget
 from codesign.evaluate.error_budget import BudgetEntry
-from codesign.eye import dataset
 from codesign.gaze import people_file
 from codesign.gaze.shared import MixedModel, PopulationPrior
 from metalens import lens, library, psf
@@ -193,13 +192,3 @@ def test_every_kind_that_is_fuzzed_is_the_kind_it_says(tmp_path):
     for kind, (write, _) in KINDS.items():
         write(tmp_path / "f.h5")
         assert store.load(tmp_path / "f.h5").kind == kind
-
-
-def test_scene_shards_survive_or_are_refused(tmp_path):
-    arrays = {
-        "radiance": np.zeros((1, 2, 4, 4), np.uint8),
-        "coverage": np.zeros((1, 4, 4), np.uint8),
-    }
-    store.save(tmp_path / "s.h5", "scene", arrays)
-    with pytest.raises(store.StoreError, match="holds no"):
-        dataset.read_shard(tmp_path / "s.h5")

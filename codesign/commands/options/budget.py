@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from codesign.evaluate import ExperimentConfig
+from codesign.settings import ExperimentConfig
 from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.budget"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from codesign.train import Part, Place
+from codesign.settings import Part, Place
 from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.codesign"

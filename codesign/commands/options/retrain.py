@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from codesign.adapt import RetrainConfig
-from codesign.train import Place
+from codesign.settings import Place, RetrainConfig
 from metalens.commands import CommonOptions, Output
 
 WORK = "codesign.commands.retrain"

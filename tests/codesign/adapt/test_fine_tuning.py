@@ -4,9 +4,10 @@ the same frames.
 
 from dataclasses import replace
 
-from codesign.adapt import RetrainConfig, train
+from codesign.adapt import train
+from codesign.settings import RetrainConfig
 from codesign.train import InnerConfig
-from codesign.train.moving import LearningRateSchedule
+from codesign.train.trainer import LearningRateSchedule
 
 
 def test_weights_alone_move_at_the_rate_asked_from_the_first_step_to_the_last():

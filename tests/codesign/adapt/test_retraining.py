@@ -12,15 +12,14 @@ import torch
 import codesign
 from characterize.bench.bench import HiddenLens
 from characterize.model.parameters import KnownValue
-from codesign.adapt import reading
+from codesign.adapt import source as finished
 from codesign.adapt import train as retraining
-from codesign.adapt.reading import NetworkAccuracy
-from codesign.adapt.settings import RetrainConfig
-from codesign.adapt.train import RetrainingOutcome
+from codesign.adapt.train import NetworkAccuracy, RetrainingOutcome
 from codesign.optics import formed
 from codesign.optics.built import MadeLens
 from codesign.optics.stack import PixelPsfStack
-from codesign.train import place_on_device
+from codesign.settings import RetrainConfig
+from codesign.train import assess, place_on_device
 from metalens.core.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
 from tests.codesign import made_lens as m
@@ -114,7 +113,7 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
-        low, high = reading.bootstrap_interval(rng.exponential(1.0, 200), draws=200)
+        low, high = assess.bootstrap_interval(rng.exponential(1.0, 200), draws=200)
         hits += low <= 1.0 <= high
     assert (
         0.88 <= hits / 200 <= 0.99
@@ -123,8 +122,8 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
 
 def test_a_single_subject_has_its_own_value_for_an_interval():
     one, other = np.array([3.0]), np.array([1.5])
-    assert reading.bootstrap_interval(one) == (3.0, 3.0)
-    assert reading.bootstrap_ratio(one, other) == (2.0, 2.0, 2.0)
+    assert assess.bootstrap_interval(one) == (3.0, 3.0)
+    assert assess.bootstrap_ratio(one, other) == (2.0, 2.0, 2.0)
 
 
 def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(found):
@@ -144,7 +143,7 @@ def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(fo
     and three compare.
     """
     config = replace(SHORT, judge=3)
-    source = retraining.load_finished_run(folder)
+    source = finished.load_finished_run(folder)
     blind = retraining.lens_psfs(MadeLens(m.small(), m.SEEN), m.asbuilt(), config)
     going = retraining.make_trainer(source, config, (blind.nominal,))
     told = retraining.retraining_outcome(
@@ -181,7 +180,7 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
         return f"image {len(asked)}"
 
     monkeypatch.setattr(formed, "image_tolerance_problem", above)
-    source = retraining.load_finished_run(folder)
+    source = finished.load_finished_run(folder)
     going = retraining.make_trainer(source, SHORT, (found.nominal,))
     told = retraining.retraining_outcome(
         source, SHORT, found, {"nominal": going, "retrained": going, "known": going}
@@ -199,7 +198,7 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
 
 
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
-    source = retraining.load_finished_run(folder)
+    source = finished.load_finished_run(folder)
     whole = retraining.make_job(source, SHORT, found, "retrained")
     list(retraining.run_job(whole, tmp_path / "whole", SHORT))
     first = retraining.run_job(
@@ -228,10 +227,10 @@ def test_a_job_trains_where_its_run_is_placed(folder, found):
     there.
     """
     plain = retraining.make_job(
-        retraining.load_finished_run(folder), SHORT, found, "retrained"
+        finished.load_finished_run(folder), SHORT, found, "retrained"
     )
     want = next(plain.run(until=1))
-    source = retraining.load_finished_run(folder)
+    source = finished.load_finished_run(folder)
     with elsewhere() as done:
         place_on_device(source.run.trainer, AWAY)
         going = retraining.make_job(source, SHORT, found, "retrained")
@@ -246,7 +245,7 @@ def test_a_job_trains_where_its_run_is_placed(folder, found):
 
 
 def test_only_weights_move(folder, found):
-    source = retraining.load_finished_run(folder)
+    source = finished.load_finished_run(folder)
     going = retraining.make_job(source, SHORT, found, "known")
     list(going.run())
     assert torch.equal(
@@ -276,7 +275,7 @@ def test_half_written_runs_are_named(folder, tmp_path, name, message):
         if path.name != name:
             (tmp_path / path.name).write_bytes(path.read_bytes())
     with pytest.raises(TrainingError, match=message):
-        retraining.load_finished_run(tmp_path)
+        finished.load_finished_run(tmp_path)
 
 
 def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(
@@ -286,17 +285,17 @@ def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(
         TrainingError,
         match=r"is no run folder: .* give the folder that `metalens codesign",
     ):
-        retraining.load_finished_run(tmp_path)
+        finished.load_finished_run(tmp_path)
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "result.json").write_text((folder / "result.json").read_text()[:-9])
     with pytest.raises(TrainingError, match="cut short or of another version"):
-        retraining.load_finished_run(tmp_path)
+        finished.load_finished_run(tmp_path)
     with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are 2"):
-        retraining.load_finished_run(folder, budget_mmacs=7.0)
+        finished.load_finished_run(folder, budget_mmacs=7.0)
 
 
-@pytest.mark.parametrize("take_up", [retraining.load_finished_run, retraining.rows_of])
+@pytest.mark.parametrize("take_up", [finished.load_finished_run, finished.rows_of])
 def test_a_retraining_is_no_run_and_said_to_be_none(folder, tmp_path, take_up):
     for name in ("retrain.toml", "result.json"):
         (tmp_path / name).write_text("{}")
@@ -314,14 +313,14 @@ def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
     with pytest.raises(
         FitError, match=r"another lens: designed diameters differ by up to 3\.0 nm"
     ):
-        retraining.check_lens(m.small(), m.asbuilt(made=foreign))
+        finished.check_lens(m.small(), m.asbuilt(made=foreign))
     wider = replace(m.small(), diameters=DiameterMap(d.diameter_um[1:], d.pitch_um))
     with pytest.raises(FitError, match="another lens"):
-        retraining.check_lens(m.small(), m.asbuilt(made=wider))
+        finished.check_lens(m.small(), m.asbuilt(made=wider))
     refused = m.asbuilt(problems=("chi2 is 3",))
     with pytest.raises(FitError, match="refused by its own checks: chi2 is 3"):
-        retraining.check_lens(m.small(), refused)
-    retraining.check_lens(m.small(), refused, insist=True)
+        finished.check_lens(m.small(), refused)
+    finished.check_lens(m.small(), refused, insist=True)
 
 
 def test_a_made_lens_images_truly_as_its_pillars_do(found):

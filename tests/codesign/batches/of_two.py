@@ -14,9 +14,10 @@ from codesign.batches.pool import PoolScenes, render_pool
 from codesign.batches.scenes import EyeScenes, SceneConfig
 from codesign.network.architecture import Architecture, SearchSpace
 from codesign.optics.stack import OpticsConfig
-from codesign.train import evolution, inner
+from codesign.train import evolution
+from codesign.train import trainer as training
 from codesign.train.evolution import EvolutionSettings
-from codesign.train.inner import InnerConfig, LearningRateSchedule, Trainer
+from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.core.errors import TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
@@ -50,7 +51,7 @@ def trained():
         optics_weight=0.0,
     )
     member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)
-    made = inner.make_model(optics, pitch_um=24.0, seed=1, space=space)
+    made = training.make_model(optics, pitch_um=24.0, seed=1, space=space)
     trainer = Trainer(
         config,
         optics,
@@ -146,7 +147,7 @@ def normalised():
 def refused():
     """What a batch of five is told."""
     try:
-        parallel.part_of(batch(5))
+        parallel.batch_share(batch(5))
     except TrainingError as error:
         return str(error)
 
@@ -160,7 +161,7 @@ def main(folder: Path) -> None:
         "trained": trained(),
         "searched": searched(),
         "averaged": averaged(),
-        "part": parallel.part_of(batch(6)),
+        "part": parallel.batch_share(batch(6)),
         "normalised": normalised(),
         "refused": refused(),
         "mean": parallel.mean_of([1.5 + rank, -2.0 * rank]),

@@ -114,7 +114,7 @@ def test_a_lost_process_is_named_with_the_way_on(two):
 
 def test_one_process_takes_the_whole_batch():
     batch = of_two.batch(3)
-    assert parallel.part_of(batch) is batch
+    assert parallel.batch_share(batch) is batch
     assert (
         parallel.process_rank(),
         parallel.process_count(),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from metalens.cli import main
 from tests.codesign import made_lens as m
 
@@ -40,7 +40,7 @@ def test_a_fine_tuned_network_is_read_back_as_it_was_exported(tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     text = SHORT.replace("[run]", "[run]\nfinetune_steps = 6")
     out = _run(tmp_path / "tuned", text, "--export")
-    source = retraining.load_finished_run(out)
+    source = finished.load_finished_run(out)
     session = onnxruntime.InferenceSession(out / "subnet_2.onnx")
     generator = torch.Generator().manual_seed(3)
     size = session.get_inputs()[0].shape[-1]

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.commands.codesign import trained_lens
-from codesign.optics.stack import OpticsConfig
+from codesign.optics.stack import OpticsConfig, trained_lens
 from metalens import lens
 from metalens.cli import main
 from metalens.core.store import Provenance

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.evaluate.shown import ExperimentConfig
+from codesign.settings import ExperimentConfig
 from tests.codesign import made_lens as m
 
 CONFIG = ExperimentConfig(subjects=1, people=2, grid=(4, 3), share=0.3, snr_db=15.0)
@@ -18,7 +18,7 @@ CONFIG = ExperimentConfig(subjects=1, people=2, grid=(4, 3), share=0.3, snr_db=1
 def source(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dim") / "run"
     m.finished_run(folder)
-    return retraining.load_finished_run(folder)
+    return finished.load_finished_run(folder)
 
 
 def test_dim_light_is_that_of_a_perfect_lens_and_the_same_for_all(source):

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.commands import budget as command
 from codesign.evaluate import error_budget, gaze_experiment
 from codesign.evaluate.error_budget import TOTAL, BudgetEntry, BudgetInputs, ErrorBudget
-from codesign.evaluate.shown import ExperimentConfig
 from codesign.optics import MadeLens, OpticsConfig
+from codesign.settings import ExperimentConfig
 from metalens import design, lens
 from metalens.cell import Cell, Film, Index
 from metalens.cli import main
@@ -120,7 +120,7 @@ def test_the_path_from_the_pupil_ends_where_the_experiment_does(run):
     """The last state is the experiment itself: the same people, frames and noise; the
     causes on the way add up to it, in quadrature, as far as each made the error grow.
     """
-    source = retraining.load_finished_run(run)
+    source = finished.load_finished_run(run)
     budget = ErrorBudget(m.small(), BudgetInputs(run=source, frames=FRAMES, draws=2))
     rows = list(budget.reading.path(budget.smooth, budget.settings))
     measured = math.degrees(budget.reading.measured_rad)

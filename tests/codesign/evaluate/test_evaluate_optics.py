@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.adapt.reading import bootstrap_ratio
 from codesign.commands.evaluate_optics import tuned_like
 from codesign.evaluate import optics as evaluate
 from codesign.evaluate.optics import MeasurementSettings, SensitivityScenes
 from codesign.eye import dataset
+from codesign.train import bootstrap_ratio
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
 from metalens.design.free_form import simple_lenses

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.batches import EyeScenes, SceneConfig
 from codesign.commands import experiment as command
 from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, ExperimentTrials
-from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import population as eye
 from codesign.eye.population import CameraRig
 from codesign.gaze import people_file, personal, regressor, shared
 from codesign.gaze.readings import NetworkReadings
+from codesign.settings import ExperimentConfig
 from metalens.cli import main
 from metalens.core.errors import ConfigError, TrainingError
 from tests.codesign import made_lens as m
@@ -81,7 +81,7 @@ def test_the_paper_s_counts():
 
 
 def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
-    scenes = retraining.load_finished_run(folder / "run").run.scenes(9)
+    scenes = finished.load_finished_run(folder / "run").run.scenes(9)
     states, trial = experiment.states_of(SMALL, 1, scenes)
     assert np.allclose(states.slip_um.numpy() * 1e-3, trial.slip_mm)
     assert np.ptp(states.trait("size").numpy()) == 0  # one subject
@@ -197,7 +197,7 @@ def test_an_eye_that_would_slip_into_the_lens_is_refused():
     ("axial", "words"), [((-9.5,), "11.5 to 21 mm"), ((2.5, 19.5), "21 to 40.5 mm")]
 )
 def test_eyes_that_slip_to_where_images_hold_no_depth_are_refused(folder, axial, words):
-    source = retraining.load_finished_run(folder / "run")
+    source = finished.load_finished_run(folder / "run")
     with pytest.raises(
         ConfigError,
         match=rf"{words} before the lens, where the run's images hold optics.depths_mm",
@@ -312,43 +312,6 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
     assert found[judged] == pytest.approx(np.tile([0.1, 0.2, 0.3], (judged.sum(), 1)))
 
 
-def _turned(place, about_x, about_y):
-    """A place as a camera sees it that is turned about x, then about y, z away from the
-    lens.
-    """
-    cos, sin = np.cos(about_x), np.sin(about_x)
-    first = np.array([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
-    cos, sin = np.cos(about_y), np.sin(about_y)
-    return np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]) @ first @ place
-
-
-def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(folder):
-    """Read exactly, it errs by a constant of the subject: where the eye stands before
-    the turned camera.
-    """
-    source = retraining.load_finished_run(folder / "run")
-    config = replace(SMALL, subjects=2, people=2, axial_mm=(2.5,), lateral_mm=(-5.0,))
-    *_, (_, (found,)) = experiment.run_experiment([source], config)
-    place = np.array([2.4, -0.3, 21.0])
-    for subject in range(2):
-        states, _ = experiment.states_of(config, subject, source.run.scenes(9))
-        off = _turned(place, *states.mount_rad[0].tolist()) - place
-        assert (
-            0.02 < np.linalg.norm(off[:2]) < 0.55
-        )  # up to 1 degree about either axis at 21 mm
-        mine = found.trial.subject == subject
-        assert (found.visible_mm - found.trial.slip_mm)[mine] == pytest.approx(
-            np.tile(off, (mine.sum(), 1)), abs=1e-9
-        )
-        assert found.slip_visible_mm[mine] == pytest.approx(
-            np.tile(np.abs(off), (mine.sum(), 1)), abs=1e-9
-        )
-    (row,) = command.experiment_summary([found], config)["runs"]
-    assert row["slip_visible_mm"] == pytest.approx(
-        np.abs(found.visible_mm - found.trial.slip_mm).mean(), rel=1e-9
-    )
-
-
 def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
     """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and
     pupil are told nothing.
@@ -385,7 +348,7 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
 
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
-    source = retraining.load_finished_run(folder / "run")
+    source = finished.load_finished_run(folder / "run")
     config, imager = replace(SMALL, people=2), experiment.prepare_run(source)
     found, again, dim = (
         experiment.run_calibrator(source, imager, c, experiment.experiment_sensors([source], c)[0])

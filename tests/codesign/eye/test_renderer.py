@@ -68,26 +68,24 @@ def test_differences_of_triplets_agree_with_exact_derivatives_in_their_linear_re
     _, by_gaze = torch.func.jvp(shown, zero, (gaze, zero[1]))
     _, by_slip = torch.func.jvp(shown, zero, (zero[0], slip))
 
-    def error(triple):
-        one, other = (
-            (moved.pinhole() - triple.anchor.pinhole()) / step
-            for moved, step in (
-                (triple.gaze, triple.gaze_step_rad),
-                (triple.slip, triple.slip_step_um),
-            )
+    def error(gaze_rad, slip_um):
+        motions = ("gaze_rad", 0, gaze_rad), ("slip_um", 2, slip_um)
+        anchor, gaze, slip = (
+            renderer.render(one, camera=SMALL, exposed=STATES).pinhole()
+            for one in dataset.moved_states(STATES, motions)
         )
         return [
             float((got - want).norm() / want.norm())
-            for got, want in ((one, by_gaze), (other, by_slip))
+            for got, want in (
+                ((gaze - anchor) / gaze_rad, by_gaze),
+                ((slip - anchor) / slip_um, by_slip),
+            )
         ]
 
-    fine = error(dataset.render_triplets(STATES, camera=SMALL))
+    fine = error(3.5e-5, 1.0)
     assert fine[0] < 0.02
     assert fine[1] < 0.10
-    coarse = dataset.render_triplets(
-        STATES, gaze_step_rad=math.radians(0.5), camera=SMALL
-    )
-    assert error(coarse)[0] > 0.2
+    assert error(math.radians(0.5), 1.0)[0] > 0.2
 
 
 def test_frames_do_not_depend_on_the_threads():

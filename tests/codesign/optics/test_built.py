@@ -26,7 +26,7 @@ def _engine(x, settings):
     """The same PSFs from every pillar, integrated over samples whose light is
     low-passed to their grid.
     """
-    lens, known = m.small(), built.of_lens(x)
+    lens, known = m.small(), built.at_rest(x)
     t = made.as_built_transmission(lens, proxy_sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
     found = psf.psf_stack(
@@ -67,7 +67,7 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     """By which the true image of a made lens tells what cells of pillars leave out of
     it.
     """
-    known = built.of_lens(X)
+    known = built.at_rest(X)
     want = made.as_built_transmission(m.small(), proxy_sensitivity(m.small()), known)
     got = (
         built.MadeLens(m.small(), m.OPTICS)

@@ -11,7 +11,7 @@ import torch
 
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import LensError, LensErrors
+from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
 from metalens.cell import Incidence, Index
 from metalens.library import DEFAULT_CELL, engines
 
@@ -26,7 +26,7 @@ def phase(**amounts):
     )
     inside = torch.hypot(x, y) <= 1
     return (
-        optics._error_phase(SETTINGS, LensError(amounts))[inside],
+        optics._error_phase(SETTINGS, DrawnLensErrors(amounts))[inside],
         x[inside],
         y[inside],
     )
@@ -71,7 +71,7 @@ def test_haze_takes_the_share_of_marechal_and_spreads_it_over_the_shadow():
 
 def test_variance_of_a_bowed_bias_by_plain_quadrature():
     """c00 <b²> + 2 <b> c0·a + a·c·a over the disc, the means by rings of equal area."""
-    state = LensError(
+    state = DrawnLensErrors(
         {"bias_nm": 2.3, "gradient_nm": 3.1, "bow_nm": -1.7, "height_nm": 4.0}, 0.7
     ).state()
     radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None]
@@ -129,7 +129,9 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
     """By the mean of d phase / d diameter over a turn of phases, here the turn over the
     range that it takes.
     """
-    state = LensError({"bias_nm": 6.0, "gradient_nm": 3.1, "bow_nm": -1.7}, 0.7).state()
+    state = DrawnLensErrors(
+        {"bias_nm": 6.0, "gradient_nm": 3.1, "bow_nm": -1.7}, 0.7
+    ).state()
     u, v = (
         torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64),
         torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64),
@@ -172,7 +174,7 @@ def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have(
             substrate=Index(1.45),
         )
         settings = dataclasses.replace(SETTINGS, cell=cell, wavelength_nm=wavelength_nm)
-    state = LensError({"height_nm": 8.0}).state()
+    state = DrawnLensErrors({"height_nm": 8.0}).state()
     want = (2 * math.pi / math.sqrt(12) * 8e-3 / settings.cell.height_um) ** 2
     got = lens_errors.variance_rad2(state, settings.phase_rates)
     assert got == pytest.approx(want, rel=0.01)

@@ -154,9 +154,9 @@ def test_flat_frames_take_the_true_image_as_one_sheet(whole):
 
 def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
     wide = replace(SMALL, fwhm_nm=30.0, filter_nm=40.0)
-    assert formed.source_of(wide).fwhm_nm == pytest.approx(24.0)  # 3-4-5: 30 * 40 / 50
+    assert wide.light.fwhm_nm == pytest.approx(24.0)  # 3-4-5: 30 * 40 / 50
     assert wide.passed == pytest.approx(0.8)
-    assert formed.source_of(SMALL) is None
+    assert SMALL.light is None
     whole = formed.make_imager(
         replace(wide, polynomials=0, image_tolerance=0.4), torch.zeros(0), 20, margin=5
     )

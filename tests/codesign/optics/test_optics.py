@@ -11,7 +11,7 @@ import torch
 
 from codesign.optics import lens_errors
 from codesign.optics import stack as optics
-from codesign.optics.lens_errors import LensError, LensErrors
+from codesign.optics.lens_errors import DrawnLensErrors, LensErrors
 from codesign.optics.stack import OpticsConfig
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.image.pupil import coordinates, psf
@@ -87,7 +87,7 @@ def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     n, pitch = 500, 0.4
     x = (np.arange(n) - (n - 1) / 2) * pitch
     inside = (x[:, None] ** 2 + x**2 <= 100.0**2).astype(float)
-    phase = optics.phase_of(settings, coefficients.numpy())(x, x)
+    phase = optics.pillar_phase(settings, coefficients)(x, x)
     fine = settings.fine
     samples = settings.window_samples * fine
     full = psf_stack(
@@ -158,7 +158,7 @@ def test_a_shifted_sensor_is_a_shifted_focus():
     """
     shifted = 2.0
     vergence = 1 / 20_000.0 + shifted / 400.0**2
-    error = LensError({"focus_um": shifted})
+    error = DrawnLensErrors({"focus_um": shifted})
     with_error = optics.lens_psf_stack(SMALL, torch.zeros(12), error=error).intensity
     peaks = [
         float(
@@ -179,7 +179,7 @@ def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():
     bent = optics.lens_psf_stack(
         SMALL,
         torch.zeros(12),
-        error=LensError({"tilt_waves": 0.3, "astigmatism_waves": 0.3}),
+        error=DrawnLensErrors({"tilt_waves": 0.3, "astigmatism_waves": 0.3}),
     ).intensity[1]
     assert torch.allclose(plain, plain.mT, atol=1e-6)
     assert not torch.allclose(bent, bent.mT, atol=1e-3)
@@ -234,7 +234,7 @@ def test_lens_errors_have_the_covariance_that_was_asked_for():
 def test_a_bias_of_the_diameters_sends_light_straight_on():
     plain = optics.lens_psf_stack(SMALL, torch.zeros(12)).intensity
     hazy = optics.lens_psf_stack(
-        SMALL, torch.zeros(12), error=LensError({"bias_nm": 20.0})
+        SMALL, torch.zeros(12), error=DrawnLensErrors({"bias_nm": 20.0})
     ).intensity
     lost = 1 - math.exp(-7.797e-4 * 400)  # rad²/nm², of the default cell: below
     window = (SMALL.window_samples * SMALL.sample_um) ** 2 / (math.pi * 100.0**2)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from codesign.train.formation import _normal, read_out
+from codesign.train.imaging import _normal, read_out
 from metalens.image import sensor as camera
 from metalens.image.sensor import Sensor
 

@@ -14,8 +14,8 @@ from codesign.adapt import correction
 from codesign.batches import CALIBRATION, EXPERIMENT, TEST, VALIDATION
 from codesign.batches.scenes import TRAINING, EyeScenes, SceneConfig
 from codesign.eye import render
-from codesign.train.ahead import prefetch
-from codesign.train.ambiguity import ambiguous_pairs
+from codesign.train.assess import ambiguous_pairs
+from codesign.train.trainer import prefetch
 
 ROOT = Path(__file__).parents[3]
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from codesign.batches import FrameBatch
 from codesign.network.architecture import SearchSpace, smallest_architecture
 from codesign.optics.lens_errors import LensErrors
 from codesign.optics.stack import OpticsConfig
-from codesign.train import inner, moving
-from codesign.train.inner import FrameBatch, InnerConfig, LearningRateSchedule, Trainer
+from codesign.train import trainer as training
+from codesign.train.trainer import InnerConfig, LearningRateSchedule, Trainer
 from metalens.core.errors import ConfigError, TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
@@ -60,7 +61,7 @@ class Discs:
 
 def _trainer(config=None, *, optics=OPTICS, architecture=None):
     config = config or InnerConfig(steps=6, batch=2, subnets=0)
-    made = inner.make_model(optics, pitch_um=10.0, seed=config.seed)
+    made = training.make_model(optics, pitch_um=10.0, seed=config.seed)
     return Trainer(config, optics, SENSOR, Discs(), made, architecture=architecture)
 
 
@@ -144,7 +145,7 @@ def test_a_budget_drives_the_pitch_up():
     )  # 40 and 41 pixels differ in cost: between others the count is flat
     pitch_um = []
     for weight in (0.0, 100.0):
-        made = inner.make_model(OPTICS, pitch_um=start_um, seed=2, space=space)
+        made = training.make_model(OPTICS, pitch_um=start_um, seed=2, space=space)
         config = replace(MOVING, budget_mmacs=0.7, budget_weight=weight)
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
         assert (
@@ -174,7 +175,7 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
         (1e-3, SIZE * OPTICS.sample_um * 0.6 / 16),
         (0.0, OPTICS.sample_um),
     ):
-        made = inner.make_model(OPTICS, pitch_um=10.0, seed=2, space=space)
+        made = training.make_model(OPTICS, pitch_um=10.0, seed=2, space=space)
         if not budget:
             made.log_pitch.register_hook(lambda slope: torch.ones_like(slope))
         config = replace(fast, budget_mmacs=budget)
@@ -188,7 +189,7 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
 
 
 def test_budgets_of_a_run_are_trained_in_turn():
-    made = inner.make_model(OPTICS, pitch_um=9.0, seed=0)
+    made = training.make_model(OPTICS, pitch_um=9.0, seed=0)
     still = replace(
         MOVING, budget_mmacs=0.0, pitch=LearningRateSchedule(0.0), subnets=0
     )
@@ -237,16 +238,16 @@ def test_lens_errors_are_drawn_anew_each_step_and_belong_to_the_step():
 
 def test_the_optics_loss_falls_along_its_own_gradient():
     from codesign.optics import stack as lens
-    from codesign.train import formation
+    from codesign.train import separability
 
     coefficients = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    start = formation.depth_loss(
+    start = separability.texture_depth_loss(
         lens.lens_psf_stack(OPTICS, coefficients), OPTICS, energy=0.4
     )
     (slope,) = torch.autograd.grad(start, coefficients)
     assert float(slope.norm()) > 0
     step = (0.05 / float(slope.norm())) * slope
-    after = formation.depth_loss(
+    after = separability.texture_depth_loss(
         lens.lens_psf_stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4
     )
     assert float(after) < float(start.detach())
@@ -284,7 +285,7 @@ def test_batches_of_blinks_and_pupils_at_the_border_train_on(kind):
         optics=LearningRateSchedule(0.02, 0.0, 1.0),
         patience=1,
     )
-    made = inner.make_model(OPTICS, pitch_um=9.0, seed=0)
+    made = training.make_model(OPTICS, pitch_um=9.0, seed=0)
     records = list(
         Trainer(
             config,
@@ -340,7 +341,7 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
     moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel][
         "exp_avg"
     ].contiguous()
-    moving.laid_out(optimiser)
+    training.laid_out(optimiser)
     step, after = optimiser.state[pitch]["step"], optimiser.state[kernel]["exp_avg"]
     assert (step.dtype, float(step)) == (before.dtype, 1.0)
     assert after.stride() == kernel.stride()

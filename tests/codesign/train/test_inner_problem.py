@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.adapt import train as retraining
+from codesign.adapt import source as finished
 from codesign.gaze import bench
 from codesign.gaze.readings import NetworkReadings
 from codesign.network.architecture import smallest_architecture
 from codesign.train import run as runs
-from codesign.train import specialise
+from codesign.train import search
 from metalens import lens
 from metalens.cli import main
 from tests.codesign import made_lens as m
@@ -35,7 +35,7 @@ def test_the_inner_problem_moves_lens_pitch_and_weights_and_leaves_the_supernet(
     going = runs.start_run(_settings(tmp_path))
     net = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}
     only = smallest_architecture(going.settings.space)
-    one, again = (specialise.specialise_candidate(going, only, 2.0) for _ in range(2))
+    one, again = (search.specialise_candidate(going, only, 2.0) for _ in range(2))
     assert float(one.model.coefficients_rad.detach().norm()) > 1e-3
     assert float(one.model.pitch_um.detach()) != pytest.approx(3.0, abs=1e-6)
     assert torch.equal(one.model.coefficients_rad, again.model.coefficients_rad)
@@ -43,7 +43,7 @@ def test_the_inner_problem_moves_lens_pitch_and_weights_and_leaves_the_supernet(
     assert not going.trainer.model.coefficients_rad.any()
     for name, value in going.trainer.model.net.state_dict().items():
         assert torch.equal(value, net[name]), name
-    other = specialise.specialise_candidate(going, only, 1.9)
+    other = search.specialise_candidate(going, only, 1.9)
     assert not torch.equal(one.model.coefficients_rad, other.model.coefficients_rad)
 
 
@@ -55,7 +55,7 @@ def test_own_pitch_keeps_the_budget(tmp_path):
     )
     only = smallest_architecture(settings.space)
     budget = 1.02 * going.macs(only) / 1e6
-    made = specialise.specialise_candidate(going, only, budget)
+    made = search.specialise_candidate(going, only, budget)
     pitch = float(made.model.pitch_um.detach())
     assert going.counted(only, pitch) <= budget * 1e6
 
@@ -64,7 +64,7 @@ def test_a_run_keeps_a_lens_for_every_budget_and_reads_it_back(tmp_path):
     (tmp_path / "run.toml").write_text(MOVING)
     out = tmp_path / "out"
     assert main(["codesign", str(tmp_path / "run.toml"), "-o", str(out)]) == 0
-    source = retraining.load_finished_run(out)
+    source = finished.load_finished_run(out)
     model = source.run.trainer.model
     assert source.row["pitch_um"] == pytest.approx(float(model.pitch_um.detach()))
     assert 0 < source.row["gaze_deg"] < 90

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from codesign.network import largest_architecture
-from codesign.train import placement, run
+from codesign.train import run, trainer
 from metalens.core import config
 from metalens.core.errors import ConfigError
 from tests.elsewhere import AWAY, elsewhere
@@ -32,14 +32,14 @@ def _going(change=None, frozen=()):
 
 
 def test_without_a_gpu_the_processor_is_taken():
-    assert placement.device_of("cpu") == torch.device("cpu")
-    assert (placement.device_of("auto").type == "cuda") == GPU
+    assert trainer.device_of("cpu") == torch.device("cpu")
+    assert (trainer.device_of("auto").type == "cuda") == GPU
 
 
 @pytest.mark.skipif(GPU, reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
     with pytest.raises(ConfigError, match="--device cpu"):
-        placement.device_of("cuda")
+        trainer.device_of("cuda")
 
 
 def test_a_network_computes_where_its_parameters_are():
@@ -61,7 +61,7 @@ def test_frames_and_gradients_pass_through_an_attended_network():
     plain, attended = (
         _going({"optics": {"image": "uniform"}}).trainer for _ in range(2)
     )
-    placement.follow_device(attended.model.net, torch.device("cpu"))
+    trainer.follow_device(attended.model.net, torch.device("cpu"))
     for one, other in zip(plain.run(until=2), attended.run(until=2), strict=True):
         assert one == other
     assert float(attended.model.coefficients_rad.grad.norm()) > 0
@@ -83,7 +83,7 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
     plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
     (want,) = plain.run(until=1)
     with elsewhere() as done:
-        placement.place_on_device(moved, AWAY)
+        trainer.place_on_device(moved, AWAY)
         (found,) = moved.run(until=1)
         there = {name: p.cpu() for name, p in moved.model.net.named_parameters()}
     assert {"convolution", "convolution_backward", "_fft_r2c"} <= done
@@ -106,13 +106,13 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
 def test_a_gpu_trains_to_the_same_losses_and_resumes():
     plain, moved = _going().trainer, _going().trainer
-    placement.place_on_device(moved, placement.device_of("cuda"))
+    trainer.place_on_device(moved, trainer.device_of("cuda"))
     losses = [
         (a.loss, b.loss)
         for a, b in zip(plain.run(until=2), moved.run(until=2), strict=True)
     ]
     again = _going().trainer
     again.restore(moved.state())
-    placement.place_on_device(again, placement.device_of("cuda"))
+    trainer.place_on_device(again, trainer.device_of("cuda"))
     losses += [(a.loss, b.loss) for a, b in zip(moved.run(), again.run(), strict=True)]
     assert all(math.isclose(a, b, rel_tol=1e-2) for a, b in losses)

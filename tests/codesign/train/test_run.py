@@ -20,7 +20,7 @@ from codesign.commands import codesign as command_codesign
 from codesign.network import windows
 from codesign.network.architecture import smallest_architecture
 from codesign.train import run, search
-from codesign.train.finish import finish_budgets, finished_budgets
+from codesign.train.results import finished_budgets
 from metalens import cli
 from metalens.core.errors import ConfigError, TrainingError
 
@@ -78,8 +78,8 @@ def test_runs_of_several_seeds_hold_one_pool_of_frames_between_them(settings):
 
 def _end(going, path):
     list(run.train_run(going, path))
-    list(search.search(going, path))
-    return finish_budgets(going)
+    list(search.search_architectures(going, path))
+    return [end.row for end in finished_budgets(going)]
 
 
 def test_frames_are_those_of_the_run_s_own_camera(settings):
@@ -124,7 +124,7 @@ def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_withi
         second.trainer.step == 1
     )  # the checkpoint of the second step is written after the record is taken
     list(run.train_run(second, tmp_path / "part"))
-    births = search.search(second, tmp_path / "part")
+    births = search.search_architectures(second, tmp_path / "part")
     next(births), next(births)
     third = run.resume_run(tmp_path / "part", settings)
     assert _end(third, tmp_path / "part") == rows
@@ -134,8 +134,10 @@ def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_withi
         strict=True,
     ):
         assert torch.equal(a, b)
-    assert torch.equal(run.lens_coefficients(whole), run.lens_coefficients(third))
-    assert float(run.lens_coefficients(whole).abs().max()) > 0
+    assert torch.equal(
+        whole.trainer.model.coefficients_rad, third.trainer.model.coefficients_rad
+    )
+    assert float(whole.trainer.model.coefficients_rad.abs().max()) > 0
     assert all(c.macs <= 2e6 for s in whole.searches for c in s.history)
 
 
@@ -146,7 +148,7 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
     with pytest.raises(TrainingError, match=r"inner\.steps: 2 -> 4"):
         run.resume_run(tmp_path / "c", run.load_run_settings(tmp_path / "other.toml"))
     with pytest.raises(TrainingError, match="0 of 1 searches"):
-        finish_budgets(going)
+        finished_budgets(going)
 
 
 @pytest.mark.parametrize(
@@ -302,7 +304,7 @@ def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_pa
         replace(settings, run=replace(settings.run, frozen=("optics", "architecture")))
     )
     rows = _end(going, tmp_path / "c")
-    assert not run.lens_coefficients(going).any()
+    assert not going.trainer.model.coefficients_rad.any()
     assert [len(s.history) for s in going.searches] == [1]
     assert len(set(rows[0]["architecture"]["kernels"])) == 1
     assert rows[0]["mmacs"] <= 2.0
@@ -314,7 +316,7 @@ def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tm
     )
     going = run.start_run(tuned)
     rows = _end(going, tmp_path / "c")
-    plain = finish_budgets(run.resume_run(tmp_path / "c", tuned))
+    plain = [end.row for end in finished_budgets(run.resume_run(tmp_path / "c", tuned))]
     assert plain == rows
     assert {"ambiguous_axial_slip_mm", "depth_response_mm_per_mm"} <= set(rows[0])
     before = {k: v.clone() for k, v in going.trainer.model.net.state_dict().items()}

@@ -1,11 +1,14 @@
 """The inner loop: lens, pixel pitch and network weights move together against one loss
-(paper Eqs. 8 and 10).
+(paper Eqs. 8 and 10), on the processor or beside a GPU.
 """
 
+import collections
 import math
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -23,23 +26,164 @@ from codesign.batches import (
     parallel,
     sensor_irradiance,
 )
-from codesign.network import Architecture, Prediction, blur, cost, losses, running
-from codesign.optics import LensError, OpticsConfig, PixelPsfStack
+from codesign.network import (
+    Architecture,
+    Prediction,
+    SearchSpace,
+    Supernet,
+    blur,
+    cost,
+    losses,
+    running,
+)
+from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
-from codesign.train import moving
-from codesign.train.ahead import prefetch, renderer_threads
+from codesign.settings import Place
 from codesign.train.evolution import Count, sample_sandwich
-from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
-from codesign.train.light import StepImaging
-from codesign.train.moving import LearningRateSchedule, TrainedModel, make_model
+from codesign.train.imaging import StepImaging, frame_wide, network_macs, read_out
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
+    texture_depth_loss,
     triplet_frames,
 )
 from metalens.core import threads
 from metalens.core.errors import ConfigError, TrainingError
+from metalens.core.executor import usable_cores
 from metalens.image import Frames, Imager, Sensor, encircled_energy
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True, slots=True)
+class LearningRateSchedule:
+    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own
+    clip.
+
+    rate: largest learning rate; 0 keeps the group fixed.
+    start, end: part of the run in which it moves.
+    clip: largest norm of its gradient.
+    """
+
+    rate: float
+    start: float = 0.0
+    end: float = 1.0
+    clip: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.rate >= 0 and 0 <= self.start < self.end <= 1 and self.clip > 0):
+            raise ConfigError(
+                f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0"
+            )
+
+    def at(self, progress: float) -> float:
+        """Learning rate at this part of the run.
+
+        Args:
+            progress: part of the run that is over, 0 to 1.
+        """
+        if not self.start <= progress < self.end:
+            return 0.0
+        inside = (progress - self.start) / (self.end - self.start)
+        return (
+            self.rate
+            * min(1.0, inside / 0.1 + 0.01)
+            * (0.5 + 0.5 * math.cos(math.pi * inside))
+        )
+
+
+@dataclass(eq=False)
+class TrainedModel:
+    """What training moves.
+
+    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel
+    pitch in um. finest_um: pitch below
+    which no network of the run keeps its budget; 0 for none.
+    """
+
+    net: Supernet
+    coefficients_rad: nn.Parameter
+    log_pitch: nn.Parameter
+    finest_um: float = 0.0
+
+    @property
+    def pitch_um(self) -> Tensor:
+        """Pixel pitch, always above 0."""
+        return self.log_pitch.exp()
+
+    def hold(self, finest_um: float, coarsest_um: float) -> float | None:
+        """Bring the pitch back between these; the one that it was held at, None where
+        it was between them.
+
+        Args:
+            finest_um: least pitch. coarsest_um: largest pitch.
+        """
+        wanted = float(self.pitch_um.detach())
+        with torch.no_grad():
+            self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
+        return (
+            finest_um
+            if wanted < finest_um
+            else coarsest_um
+            if wanted > coarsest_um
+            else None
+        )
+
+
+def make_model(
+    settings: OpticsConfig,
+    *,
+    pitch_um: float,
+    seed: int,
+    space: SearchSpace | None = None,
+) -> TrainedModel:
+    """A fresh model: network weights from the seed, a lens without added phase.
+
+    Args:
+        settings: of the lens and its image. pitch_um: of the pixels.
+        space: architectures to choose from; the default space without it.
+    """
+    torch.manual_seed(seed)
+    net = Supernet(space)
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a processor
+    return TrainedModel(
+        net,
+        nn.Parameter(torch.zeros(lens.count_parameters(settings), dtype=torch.float64)),
+        nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
+    )
+
+
+def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
+    """Whether all gradients that there are have finite numbers alone; a device is asked
+    once.
+
+    Args:
+        parameters: with gradients.
+    """
+    grads = [p.grad for p in parameters if p.grad is not None]
+    places = {g.device for g in grads}
+    largest = (
+        nn.utils.get_total_norm([g for g in grads if g.device == place], math.inf)
+        for place in places
+    )
+    return all(bool(torch.isfinite(one)) for one in largest)
+
+
+def laid_out(optimiser: torch.optim.Optimizer) -> None:
+    """Moments laid out in memory as their parameters: a fused step walks through both
+    in one order without asking.
+
+    Args:
+        optimiser: with its moments.
+    """
+    for parameter, kept in optimiser.state.items():
+        for name, value in kept.items():
+            if (
+                isinstance(value, Tensor)
+                and name != "step"  # the count of a scalar is no moment of it
+                and value.shape == parameter.shape
+            ):
+                kept[name] = torch.empty_like(parameter).copy_(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +437,7 @@ class Trainer:
             self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
-            moving.laid_out(optimiser)
+            laid_out(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
@@ -329,7 +473,7 @@ class Trainer:
         self.light.pass_on(self.model.coefficients_rad)
         parallel.average_gradients(p for _, ps in self.groups.values() for p in ps)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
-        finite = finite and moving.has_finite_gradients(
+        finite = finite and has_finite_gradients(
             p for _, ps in self.groups.values() for p in ps
         )
         if not finite:
@@ -346,7 +490,7 @@ class Trainer:
 
     def _batch(self, step: int) -> FrameBatch:
         """The frames of a step, by its number alone."""
-        return parallel.part_of(self.scenes.batch(step, self.inner.batch))
+        return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
 
     def _given(
         self, step: int, batch: FrameBatch, *, live: bool, seen: bool
@@ -444,7 +588,9 @@ class Trainer:
             self.optics, coefficients, error=self._lens_error(step)
         )
         if not every or self.triplets is None:
-            return optics, depth_loss(made, self.optics, energy=self.inner.energy)
+            return optics, texture_depth_loss(
+                made, self.optics, energy=self.inner.energy
+            )
         found = fisher_separability(
             triplet_frames(self.triplets, config, step),
             lambda one: sensor_irradiance(one, optics),
@@ -459,7 +605,7 @@ class Trainer:
         )
         return optics, every * found.loss.value  # of weight optics_weight on average
 
-    def _lens_error(self, step: int | None = None) -> LensError | None:
+    def _lens_error(self, step: int | None = None) -> DrawnLensErrors | None:
         return self.optics.spread.draw(self._generator(2, step))
 
     def _members(self, count: Count) -> Sequence[Architecture]:
@@ -521,18 +667,104 @@ class Trainer:
         bad = [
             name
             for name, (_, parameters) in self.groups.items()
-            if not moving.has_finite_gradients(parameters)
+            if not has_finite_gradients(parameters)
         ]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
 
 
-__all__ = [
-    "FrameBatch",
-    "InnerConfig",
-    "LearningRateSchedule",
-    "LogRecord",
-    "SceneSource",
-    "TrainedModel",
-    "Trainer",
-    "make_model",
-]
+def prefetch(
+    work: Callable[[int], Made], steps: range, *, workers: int
+) -> Iterator[Made]:
+    """``work`` of every step in order, up to ``workers`` steps ahead on threads: the
+    same numbers as without.
+
+    Args:
+        work: depends on the step alone. steps: their numbers. workers: threads; 0 works
+            when a step is asked for.
+    """
+    if not workers:
+        yield from map(work, steps)
+        return
+    with ThreadPoolExecutor(workers, "prefetch") as pool:
+        begun: collections.deque[Future[Made]] = collections.deque()
+        for step in steps:
+            begun.append(pool.submit(work, step))
+            if len(begun) > workers:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
+
+
+def renderer_threads(device: torch.device) -> int:
+    """Threads that render for a process that trains on ``device``.
+
+    Beside a GPU half of the processor's cores, eight at most, shared by the processes of
+    ``torchrun`` on this machine; none beside a processor, which trains itself.
+    """
+    if device.type == "cpu":
+        return 0
+    shared = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return max(1, min(8, usable_cores() // (2 * shared)))
+
+
+def device_of(wanted: Place) -> torch.device:
+    """The device of a choice: under ``torchrun`` each process takes the GPU of its
+    local number.
+
+    Args:
+        wanted: "auto", "cpu" or "cuda".
+
+    Raises:
+        ConfigError: a GPU is asked for where PyTorch finds none.
+    """
+    found = torch.cuda.is_available()
+    if wanted == "cuda" and not found:
+        raise ConfigError(
+            "device 'cuda': PyTorch finds no GPU here; install a build of torch with CUDA, or give --device cpu"
+        )
+    if wanted == "cpu" or not found:
+        return torch.device("cpu")
+    return torch.device(
+        "cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
+    )
+
+
+def place_on_device(trainer: Trainer, device: torch.device) -> None:
+    """Let a trainer image and train on a device: its network and what its optimiser
+    remembers move there.
+    """
+    if device.type == "cpu":
+        return
+    trainer.light.device = device
+    torch.backends.cudnn.deterministic = True
+    net = trainer.model.net
+    net.to(device)
+    for optimiser in trainer.optimisers.values():
+        optimiser.load_state_dict(
+            optimiser.state_dict()
+        )  # casts what it holds to its parameters' devices
+    follow_device(net, device)
+
+
+def follow_device(net: nn.Module, device: torch.device) -> None:
+    """From now on frames on the processor are taken to ``device``, and what is
+    predicted of those is brought back.
+
+    Args:
+        net: network.
+    """
+    brought = False
+
+    def enter(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
+        nonlocal brought
+        brought = any(isinstance(v, Tensor) and v.device.type == "cpu" for v in given)
+        return tuple(v.to(device) if isinstance(v, Tensor) else v for v in given)
+
+    def leave(_: nn.Module, __: tuple[Any, ...], answer: Prediction) -> Prediction:
+        parts = (getattr(answer, name) for name in Prediction.__slots__)
+        return Prediction(
+            *(part.cpu() if brought and part is not None else part for part in parts)
+        )
+
+    net.register_forward_pre_hook(enter)
+    net.register_forward_hook(leave)

@@ -1,0 +1,131 @@
+"""Settings that command lines show; they need neither torch nor time."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from metalens.core.arrays import Array
+from metalens.core.errors import ConfigError
+
+Part = Literal["optics", "pitch", "architecture"]
+Place = Literal["auto", "cpu", "cuda"]
+Points = Literal["random", "spread"]
+
+
+@dataclass(frozen=True, slots=True)
+class RetrainConfig:
+    """How to train on.
+
+    steps: of the inner loop; its batch and loss weights are those of the run. rate:
+    largest learning rate.
+    draws: lenses from the posterior that training sees; judge: other ones that judge it
+    where the truth is not known.
+    test_batches: frames that judge, in batches of the run. seed: of draws, frames and
+    noise.
+    budget_mmacs: which network of the run; 0 for the one of the largest budget.
+    """
+
+    steps: int = 200
+    rate: float = 1.5e-3
+    draws: int = 8
+    judge: int = 4
+    test_batches: int = 16
+    seed: int = 0
+    budget_mmacs: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (
+            min(self.steps, self.draws, self.judge, self.test_batches) < 1
+            or self.seed < 0
+            or not self.rate > 0
+        ):
+            raise ConfigError(
+                f"{self}: need steps, draws, judge and test_batches of 1 or more, a seed of 0 or more, a rate above 0"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentConfig:
+    """What is shown to whom, and how gaze is calibrated.
+
+    subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that
+    they span.
+    axial_mm, lateral_mm: slippage states beside the origin, along z and x.
+    share: of the stimuli that a subject is calibrated on; the rest is judged. points:
+    whether these stimuli are drawn
+        at random or spread over the field, as a calibration screen would show them.
+    people: who calibrated before, and tell what readings mean for all of them: the
+    prior of every subject.
+    hidden: neurons of the regressor, of networks that tell no axis.
+    fixation_deg: standard deviation of where a subject really looks.
+    image: "true", what the device shows, whatever the run was trained on; "trained",
+    the image that the run knows.
+    pupil_sd: relative change of the pupil's radius from frame to frame. seed: of
+    subjects, fixation and calibration.
+    snr_db: dim light under a strong ambient one, so that a pixel of the first run has
+    this signal-to-noise ratio behind a lens that images all light; the exposure and the
+    background are the same for every run. None for good light.
+    """
+
+    subjects: int = 20
+    grid: tuple[int, int] = (7, 7)
+    field_deg: tuple[float, float] = (35.0, 25.0)
+    axial_mm: tuple[float, ...] = (-5.0, -2.5, 2.5, 5.0)
+    lateral_mm: tuple[float, ...] = (-2.5, -5.0)
+    share: float = 0.2
+    points: Points = "random"
+    people: int = 32
+    hidden: int = 10
+    fixation_deg: float = 0.3
+    pupil_sd: float = 0.05
+    seed: int = 0
+    snr_db: float | None = None
+    image: Literal["true", "trained"] = "true"
+
+    def __post_init__(self) -> None:
+        points = self.grid[0] * self.grid[1]
+        if (
+            self.subjects < 1
+            or min(self.grid) < 2
+            or not 3 <= round(self.share * points) < points
+        ):
+            raise ConfigError(
+                f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
+                "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
+            )
+        if self.people < 2:
+            raise ConfigError(
+                f"people {self.people}: need two or more, to tell how people differ"
+            )
+        if min(self.hidden, self.seed, self.fixation_deg, self.pupil_sd) < 0:
+            raise ConfigError(
+                f"hidden {self.hidden}, seed {self.seed}, fixation_deg {self.fixation_deg:g}, pupil_sd "
+                f"{self.pupil_sd:g}: need 0 or more"
+            )
+        if not all(0 < field < 120 for field in self.field_deg):
+            raise ConfigError(
+                f"field_deg {self.field_deg}: need two angles above 0 and below 120, as eyes turn"
+            )
+
+    @property
+    def stimuli_deg(self) -> Array:
+        """(points, 2) direction of every stimulus, x and y (down)."""
+        x, y = (
+            np.linspace(-f / 2, f / 2, n)
+            for f, n in zip(self.field_deg, self.grid, strict=True)
+        )
+        return np.stack([g.ravel() for g in np.meshgrid(x, y)], 1)
+
+    @property
+    def slips_mm(self) -> Array:
+        """(states, 3): the origin, the lateral and the axial ones."""
+        lateral = [(x, 0.0, 0.0) for x in self.lateral_mm]
+        return np.array(
+            [(0.0, 0.0, 0.0), *lateral, *((0.0, 0.0, z) for z in self.axial_mm)]
+        )
+
+    @property
+    def frames(self) -> int:
+        """Of all subjects."""
+        return self.subjects * len(self.stimuli_deg) * len(self.slips_mm)
