@@ -14,7 +14,6 @@ import numpy as np
 from benchmarks import Row, fastest
 from layout import solids
 from layout.mask import cells, fields
-from layout.pec import correct as dose
 from layout.process.process import EtchProfile, ExposureSettings, Process
 from layout.study import focus, stitching, tolerance
 from layout.study.sensitivity import LogSensitivities
@@ -89,20 +88,10 @@ def _process_rows() -> list[Row]:
     made = BIASED.made_diameter_nm(BIASED.written_diameter_nm(TABLE_UM * 1e3))
     times = {
         "bias": fastest(lambda: cells.quantise_diameters(source, BIASED)),
-        "dose": fastest(lambda: dose.correct_table(found.classes, table, 0.4, BIASED)),
         "fields": fastest(lambda: fields.split_write_fields(written, BIASED)),
     }
-    result = dose.correct(written, BIASED)
-    wide = dataclasses.replace(
-        BIASED, exposure=dataclasses.replace(BEAM, maximum_classes=4)
-    )
-    few = dose.correct(written, wide)
-    total = sum(times.values())
-    case, exact = "4.9 M pillars", "exposure against exact discs, relative"
-    edges, cut = (
-        "1 - exposure at the edge of all pillars",
-        fields.split_write_fields(written, BIASED).cut_before,
-    )
+    case = "4.9 M pillars"
+    cut = fields.split_write_fields(written, BIASED).cut_before
     return [
         Row(
             case,
@@ -113,41 +102,10 @@ def _process_rows() -> list[Row]:
         ),
         Row(
             case,
-            f"dose, {len(result.factors)} classes",
-            times["dose"],
-            result.error,
-            exact,
-        ),
-        Row(
-            case,
-            "dose: worst edge, one dose",
-            times["dose"],
-            result.before.worst,
-            edges,
-        ),
-        Row(
-            case,
-            f"dose: worst edge, {len(result.factors)} classes",
-            times["dose"],
-            result.after.worst,
-            edges,
-            goal="0.01",
-        ),
-        Row(case, "dose: worst edge, 4 classes", times["dose"], few.after.worst, edges),
-        Row(
-            case,
             "field split",
             times["fields"],
             0.0,
             f"pillars cut; an unshifted raster cuts {cut}",
-        ),
-        Row(
-            case,
-            "bias + dose + field split",
-            total,
-            result.error,
-            exact,
-            goal=f"<= 0.5 s: {'met' if total <= 0.5 else 'missed'}",
         ),
     ]
 

@@ -16,7 +16,7 @@ from layout.formats.dxf import DxfWindow
 from layout.mask import build
 from layout.mask.fields import FieldPlan
 from layout.mask.plan import MaskPlan
-from layout.pec.correct import DoseSolution
+from layout.pec.correct import DoseLadder
 from layout.process import process as processes
 from layout.process.process import LayerNumber
 from layout.verify.as_written import LensRows
@@ -104,7 +104,7 @@ class LayoutJob:
     source: Lens
     process: processes.Process
     made: build.DrawnMask
-    dose: DoseSolution | None
+    dose: DoseLadder | None
     fields: FieldPlan
     plan: MaskPlan
     drc: DrcReport

@@ -30,8 +30,8 @@ from layout.formats.library import MaskLibrary
 from layout.mask import build, fields
 from layout.mask.field_figure import with_fields
 from layout.mask.plan import MaskPlan
-from layout.pec import dosed
-from layout.pec.correct import DoseSolution
+from layout.pec import correct
+from layout.pec.correct import DoseLadder
 from layout.process import process as processes
 from layout.process.process import LayerNumber
 from layout.verify.as_written import LensRows
@@ -50,7 +50,7 @@ KEPT = (
     1 << 16
 )  # placements of a cell that are kept when a file is read back; of more only sums are
 MOST_READ = 2**40
-SolvedPlan = tuple[MaskPlan, DoseSolution | None]  # dose None: every dose is 1
+SolvedPlan = tuple[MaskPlan, DoseLadder | None]  # dose None: every dose is 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,7 +108,7 @@ def correct_doses(
     """
     if not (corrected and plans):
         return [(plan, None) for plan in plans]
-    return list(dosed.correct_plans(plans, process.exposure, process.layers))
+    return list(correct.correct_plans(plans, process.exposure, process.layers))
 
 
 def make_mask(
@@ -141,9 +141,7 @@ def make_mask(
     return job
 
 
-def _checked(
-    drawing: DrawnLens, plan: MaskPlan, dose: DoseSolution | None
-) -> LayoutJob:
+def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
     source, rules, stages = drawing.source, drawing.process, drawing.stages
     made = drawing.made

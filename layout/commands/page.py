@@ -14,7 +14,7 @@ from layout.formats import handover
 from layout.formats.dxf import DxfWindow
 from layout.formats.library import MaskLibrary, library_of
 from layout.mask.plan import MaskPlan
-from layout.pec.psf import PointExposure
+from layout.pec.psf import PointExposure, point_exposure
 from layout.process.process import ExposureSettings, Process
 from layout.shapes import polygon
 from metalens.core import report
@@ -192,15 +192,14 @@ def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
 
 def _exposure(job: LayoutJob) -> list[Section]:
     """Doses, and what the written files and their dose table make."""
-    solution = job.dose
     sections = []
-    if solution is not None:
+    if job.dose is not None:
         used = [made.dose for made in job.plan.classes]
         text = (
             "Proximity effect correction of lens, dose test, witness cells, marks and "
             f"label together: relative dose {min(used):.3f} to {max(used):.3f} in "
-            f"{len(solution.ladder.factors)} steps, a datatype each (doses.csv)."
-            f"{_fit_text(job.process.exposure, solution.point)}"
+            f"{len(job.dose.factors)} steps, a datatype each (doses.csv)."
+            f"{_fit_text(job.process.exposure, point_exposure(job.process.exposure))}"
         )
         sections.append(Section("Dose", text))
     if not job.verified:

@@ -13,36 +13,9 @@ from layout.pec.psf import PointExposure
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
 
-NONE = 255  # dose class of a site without pillar
 _FAINT = 0.02  # least exposure of its own edge at which a pillar can be corrected
 _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
 COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ExposedRectangles:
-    """Rectangles that are written in the same exposure, a dose each.
-
-    box_um: (n, 4) left, bottom, right, top. group: (n,) which shape each is a piece of.
-    goal: (n,) as in Table.
-    """
-
-    box_um: Array
-    group: Array
-    goal: Array
-
-    @classmethod
-    def none(cls) -> "ExposedRectangles":
-        """No rectangle."""
-        return cls(np.empty((0, 4)), np.empty(0, np.int64), np.empty(0))
-
-    @property
-    def area_um2(self) -> Array:
-        """(n,) areas."""
-        return np.asarray(
-            (self.box_um[:, 2] - self.box_um[:, 0])
-            * (self.box_um[:, 3] - self.box_um[:, 1])
-        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

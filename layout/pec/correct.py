@@ -1,17 +1,19 @@
-"""Proximity correction: a dose for each shape, so that all edges receive the exposure
-that clears the resist.
+"""Proximity effect correction: a dose for every shape, so that all edges are exposed at
+dose to size.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask.plan import PillarArray
-from layout.pec import assign, bodies, psf, rects
-from layout.pec.assign import DoseLadder
-from layout.pec.bodies import ExposedRectangles, ExposureTable, ScatterRanges
-from layout.pec.drawn import DrawnKinds
+from layout.mask.build import check_layers
+from layout.mask.held import hold_on_disk
+from layout.mask.plan import EXPOSED, FigureCell, MaskPlan, PillarArray, PillarClass
+from layout.pec import bodies, psf, rects
+from layout.pec.bodies import ExposureTable, ScatterRanges
+from layout.pec.drawn import DrawnDiscs, DrawnKinds, DrawnOutlines
 from layout.pec.fracture import fracture_boxes
 from layout.pec.nodes import (
     NodeGrid,
@@ -21,205 +23,344 @@ from layout.pec.nodes import (
     interpolate_from_nodes,
 )
 from layout.pec.psf import THRESHOLD, PointExposure
-from layout.process.process import ExposureSettings
+from layout.process.process import ExposureSettings, LayerNumber, LayerTable
+from layout.shapes import rectilinear
 from metalens.core.arrays import Array
 from metalens.core.errors import ProcessError
+from metalens.core.units import nm
 
 _MOST_SITES = 40_000_000  # of a lattice with a middle range
-_SPOTS = 10  # of a piece on the nodes, along the same
+_SPOTS = 10  # of a piece on the nodes, along the narrowest Gaussian of these
+_ROUNDED = 0.75  # of the tolerance, for doses rounded to the ladder
+_SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
+NONE = 255  # dose class of a site without pillar
+
+
+def correct(mask: MaskPlan, exposure: ExposureSettings) -> MaskPlan:
+    """Proximity effect correction: a plan with a dose for every shape.
+
+    Args:
+        mask: of a die, every dose 1.
+        exposure: point exposure, tolerance and number of doses.
+
+    Raises:
+        ProcessError: no plan; as :func:`correct_plans`.
+
+    Accuracy:
+        Edges of all shapes are at dose to size within the tolerance, as
+        :func:`layout.verify.exposure.verify_exposure` finds.
+    """
+    if not isinstance(mask, MaskPlan):
+        raise ProcessError(
+            f"{type(mask).__name__} is no plan: doses are found for plans of lenses; "
+            "lay a doses.csv beside a file made elsewhere"
+        )
+    return correct_plans([mask], exposure)[0][0]
+
+
+def correct_plans(
+    plans: Sequence[MaskPlan],
+    exposure: ExposureSettings,
+    layers: LayerTable | None = None,
+) -> list[tuple[MaskPlan, "DoseLadder"]]:
+    """Plans that are written in one job, with a dose for every shape.
+
+    Args:
+        plans: each with the lens, if any, as its first lattice.
+        exposure: point exposure, tolerance and number of doses.
+        layers: whose numbers no dose may take; None: not checked.
+
+    Returns:
+        The dosed plans, every dose rounded to the nearest of one geometric series for
+        all of them, and that series.
+
+    Raises:
+        ProcessError: a negative tone; no pillar; no or an unreadable point exposure;
+            pillars finer than its core; a lens too large for a middle range of the
+            point exposure; datatypes of the doses that are layers of something else.
+    """
+    wanted = [solve_doses(plan, exposure) for plan in plans]
+    ladder = dose_ladder([one.spans(exposure) for one in wanted], exposure)
+    dosed = [apply_dose_classes(one, ladder) for one in wanted]
+    for plan in dosed:
+        if layers is not None:
+            check_layers(plan, layers)
+    return [(plan, ladder) for plan in dosed]
+
+
+# doses
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class DoseSolution:
-    """Doses of everything on a die.
+class DoseLadder:
+    """Doses of a job, in equal steps of the logarithm.
 
-    ladder: the doses.
+    factors: (doses,) relative doses, rising.
     needed: number of doses that the tolerance needs; the writer may hold fewer.
-    pairs: (entries, doses) pillars of each, over all bodies.
-    rect_class: (n,) dose class of each piece of a mark.
-    point: point exposure that was used.
     """
 
-    ladder: DoseLadder
+    factors: Array
     needed: int
-    pairs: Array
-    rect_class: Array
-    point: PointExposure
-    _fields: assign.ExposedBodies
 
-    def classes(self, number: int, first: int, block: Array) -> Array:
-        """(rows, columns) uint8 dose class of the pillars of a block of body
-        ``number``, 255 where there is none.
+    def nearest(self, dose: Array) -> Array:
+        """Class of the nearest dose."""
+        span = float(np.log(self.factors[-1] / self.factors[0]))
+        per_log = (len(self.factors) - 1) / span if span > 0 else 0.0
+        level = np.rint(np.log(np.maximum(dose, 1e-9) / self.factors[0]) * per_log)
+        return np.asarray(np.clip(level, 0, len(self.factors) - 1), np.uint8)
+
+
+def dose_ladder(
+    spans: Sequence[tuple[float, float, float]], settings: ExposureSettings
+) -> DoseLadder:
+    """The doses of a job, at most ``maximum_classes``.
+
+    A quarter of the tolerance is left for the background of rounded doses and for what
+    changes across a piece of a mark.
+
+    Args:
+        spans: of all dies of a job, from :meth:`WantedDoses.spans`.
+        settings: tolerance, and number of doses.
+    """
+    least = min(low for low, _, _ in spans)
+    span = max(high for _, high, _ in spans) / least
+    step = 2 * np.log1p(_ROUNDED / max(share for _, _, share in spans))
+    needed = max(1, int(np.ceil(np.log(span) / step - 1e-9)))
+    count = min(needed, settings.maximum_classes)
+    return DoseLadder(least * span ** ((np.arange(count) + 0.5) / count), needed)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ExposedMarks:
+    """Marks and labels in pieces of one dose each, as masses on the nodes.
+
+    boxes: (pieces, 4) left, bottom, right, top, database units.
+    figure: (pieces, 2) number of the figure, and of the layer in it.
+    own: (pieces,) exposure of the outer edges by their own shape at unit dose.
+    points, piece: (n, 2) points on the outer edges, and (n,) whose they are.
+    spots: points, areas and pieces of what stands for the pieces on the nodes.
+    """
+
+    grid: NodeGrid
+    boxes: Array
+    figure: Array
+    own: Array
+    points: Array
+    piece: Array
+    spots: tuple[Array, Array, Array]
+
+    def deposited(self, dose: Array) -> Array:
+        """(y, x) masses of doses (pieces,)."""
+        points, area, piece = self.spots
+        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[piece])
+
+    def doses(self, field: Array) -> Array:
+        """(pieces,) doses that give the outer edges their exposure on a background (y,
+        x) of the nodes.
         """
-        return assign.dose_class_map(self._fields, number, first, block, self.ladder)
+        if not len(self.own):
+            return np.empty(0)
+        count = len(self.own)
+        total = np.bincount(
+            self.piece, self.grid.sample(field, *self.points.T), minlength=count
+        )
+        around = total / np.bincount(self.piece, minlength=count)
+        return np.asarray((THRESHOLD - around) / self.own)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WantedDoses:
-    """Doses that give every edge its exposure, before they are rounded to classes.
+    """Doses that give every edge of a plan its exposure, before they are rounded.
 
-    fields: backgrounds that belong to them. range: what they need of a ladder.
+    lattices: of pillars, in um.
+    table: what each kind of pillar exposes.
+    ranges: of the point exposure.
+    far: (y, x) background on the nodes of ``marks.grid`` that belongs to the doses.
+    near: (rows, columns) of each lattice, of the middle ranges; empty for none.
     """
 
-    fields: assign.ExposedBodies
-    range: assign.DoseRange
-    point: PointExposure
+    plan: MaskPlan
+    lattices: Sequence[PillarArray]
+    table: ExposureTable
+    ranges: ScatterRanges
+    far: Array
+    near: Sequence[Array]
+    marks: ExposedMarks
+
+    def of_pillars(self, number: int, first: int, block: Array) -> Array:
+        """(rows, columns) wanted doses of rows of a lattice; what stands where there is
+        no pillar means nothing.
+
+        Args:
+            number: of the lattice.
+            first: row of the block.
+            block: (rows, columns) classes.
+        """
+        lattice, grid, table = self.lattices[number], self.marks.grid, self.table
+        field = np.empty(block.shape, np.float32)
+        down = grid.y.at(lattice.rows_um(first, len(block)))
+        interpolate_from_nodes(self.far, *down, *grid.x.at(lattice.columns_um), field)
+        if self.near:
+            field += self.near[number][first : first + len(block)]
+        own = np.where(table.used, table.own, 1.0)
+        return np.asarray(((THRESHOLD * table.goal)[block] - field) / own[block])
+
+    def classes(
+        self, number: int, first: int, block: Array, ladder: DoseLadder
+    ) -> Array:
+        """(rows, columns) uint8 dose class of rows of a lattice; 255: no pillar."""
+        level = ladder.nearest(self.of_pillars(number, first, block))
+        return np.where(block > 0, level, np.uint8(NONE))
+
+    def spans(self, settings: ExposureSettings) -> tuple[float, float, float]:
+        """Least and largest dose, and the largest ratio of two relative changes of an
+        edge's exposure: of one that the dose changes, and of the one allowed.
+
+        Where the edge is so soft that the tolerance moves it by more than a nanometre
+        of width, less is allowed.
+        """
+        table, tolerance = self.table, settings.tolerance
+        found = []
+        for number, lattice in enumerate(self.lattices):
+            for first, block in lattice.blocks():
+                kind = block[block > 0]
+                dose = self.of_pillars(number, first, block)[block > 0]
+                goal = THRESHOLD * table.goal[kind]
+                steep = _SOFTEST_UM * table.slope[kind] / 2 / goal
+                share = dose * table.own[kind] / goal
+                found.append((dose, share / np.minimum(tolerance, steep * dose)))
+        near = (
+            self.ranges.near if len(self.ranges.near.widths_um) else self.ranges.middle
+        )
+        dose = self.marks.doses(self.far)
+        allowed = np.minimum(tolerance, straight_edge_error(near) * dose)
+        found.append((dose, dose * self.marks.own / THRESHOLD / allowed))
+        return (
+            min(float(dose.min(initial=np.inf)) for dose, _ in found),
+            max(float(dose.max(initial=0.0)) for dose, _ in found),
+            max(float(share.max(initial=0.0)) for _, share in found),
+        )
 
 
-def solve_doses(
-    parts: Sequence[PillarArray],
-    kinds: DrawnKinds,
-    goal: Array,
-    settings: ExposureSettings,
-    *,
-    cut: ExposedRectangles | None = None,
-) -> WantedDoses:
-    """The wanted doses of pillars and rectangles that are exposed together.
+def straight_edge_error(point: PointExposure) -> float:
+    """Relative error of the exposure that moves both edges of a line of dose 1 by what
+    rounded doses may.
 
     Args:
-        parts: lattices; the first is the lens, over which uniformity is told.
-        kinds, goal: (entries,) of the table, entry 0 for none.
-        cut: rectangles along whose outer sides the background hardly changes
-            (:func:`fracture_boxes`).
-        settings: point exposure and tolerance.
+        point: narrow terms of the point exposure.
+    """
+    steep = float((point.weights / point.widths_um).sum()) / np.sqrt(np.pi)
+    return float(_SOFTEST_UM * steep / 2 / THRESHOLD)
+
+
+def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
+    """The doses that everything on a plan needs, before they are rounded to classes.
+
+    Args:
+        plan: every dose 1.
+        exposure: point exposure and tolerance.
 
     Raises:
-        ProcessError: no pillar; no or an unreadable point exposure; pillars finer than
-            its core; a lens too large for a middle range of the point exposure.
+        ProcessError: as :func:`correct_plans`.
     """
-    point = psf.point_exposure(settings)
-    number = bodies.count_pillars(parts, len(goal))
-    densest = min(parts, key=lambda body: body.nearest_um)
+    if plan.standing is not None:
+        raise ProcessError(
+            "a dose per pillar needs drawn pillars, but tone is 'negative' (the gaps "
+            "are drawn); draw the pillars, or set exposure.correct = false"
+        )
+    unit = plan.unit_nm * nm
+    lattices = [dataclasses.replace(l, unit_um=unit) for l in plan.lattices]
+    point = psf.point_exposure(exposure)
+    goal = np.array([1.0, *(made.goal for made in plan.classes)])
+    kinds, number = _drawn(plan, unit), bodies.count_pillars(lattices, len(goal))
+    densest = min(lattices, key=lambda lattice: lattice.nearest_um)
     ranges = bodies.split_ranges(point, kinds, number, densest)
-    drawn = bodies.exposure_table(
+    table = bodies.exposure_table(
         kinds, goal, number, point=point, ranges=ranges, body=densest
     )
-    fields = _fields(parts, drawn, ranges, cut or ExposedRectangles.none())
-    return WantedDoses(fields, assign.dose_range(fields, settings), point)
-
-
-def round_doses(wanted: WantedDoses, ladder: DoseLadder, needed: int) -> DoseSolution:
-    """Every wanted dose rounded to the nearest of a ladder.
-
-    Args:
-        wanted: of one die.
-        ladder: of :func:`layout.pec.assign.dose_ladder`, for all that is written in one
-            job.
-        needed: number of doses that its tolerance needs.
-    """
-    pairs, rect_class = assign.assign_dose_classes(wanted.fields, ladder)
-    return DoseSolution(ladder, needed, pairs, rect_class, wanted.point, wanted.fields)
-
-
-def fracture_by_surroundings(
-    boxes: Array,
-    parts: Sequence[PillarArray],
-    settings: ExposureSettings,
-    *,
-    step_um: float,
-) -> tuple[Array, Array]:
-    """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and
-    (m,) the box of each.
-
-    Args:
-        boxes: whole grid steps.
-        parts: lattices of pillars.
-        settings: point exposure and tolerance.
-
-    Raises:
-        ProcessError: too many pieces.
-    """
-    around = np.array([body.box_um for body in parts])
-    point = psf.point_exposure(settings)
-    most = min(settings.tolerance, assign.straight_edge_error(point))
-    return fracture_boxes(boxes, around, step_um=step_um, point=point, tolerance=most)
-
-
-def _box(
-    parts: Sequence[PillarArray], cut: ExposedRectangles
-) -> tuple[float, float, float, float]:
-    boxes = np.array([*(body.box_um for body in parts), *cut.box_um])
-    return *boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()
-
-
-def _fields(
-    parts: Sequence[PillarArray],
-    drawn: ExposureTable,
-    ranges: ScatterRanges,
-    cut: ExposedRectangles,
-) -> assign.ExposedBodies:
-    """Backgrounds that belong to the wanted doses."""
+    boxes, figure, group = _pieces(plan, lattices, point, exposure.tolerance)
     width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
-    grid = NodeGrid.over(_box(parts, cut), width)
-    beside = PointExposure(
+    ends = np.array([*(lattice.box_um for lattice in lattices), *(boxes * unit)])
+    box = (*ends[:, :2].min(0).tolist(), *ends[:, 2:].max(0).tolist())
+    grid = NodeGrid.over(box, width)
+    close = PointExposure(
         np.r_[ranges.near.widths_um, ranges.middle.widths_um],
         np.r_[ranges.near.weights, ranges.middle.weights],
     )
-    own, points, piece = rects.self_exposure(cut, beside)
-    pads = _Pads(
-        cut, own, (points, piece), rects.rectangle_samples(cut, width / _SPOTS), grid
+    own = rects.self_exposure(boxes * unit, group, close)
+    spots = rects.rectangle_samples(boxes * unit, width / _SPOTS)
+    marks = ExposedMarks(grid, boxes, figure, *own, spots)
+    far, near = _backgrounds(lattices, table, ranges, marks)
+    return WantedDoses(plan, lattices, table, ranges, far, near, marks)
+
+
+def _drawn(plan: MaskPlan, unit: float) -> DrawnKinds:
+    """The classes as discs where all stand for one, else as polygons."""
+    if all(made.round for made in plan.classes):
+        return DrawnDiscs(
+            np.array([0.0, *(made.diameter_nm * nm for made in plan.classes)])
+        )
+    return DrawnOutlines(
+        [(), *([c * unit for c in made.contours] for made in plan.classes)]
     )
-    masses = _masses(parts, drawn, grid)
+
+
+# backgrounds
+
+
+def _backgrounds(
+    lattices: Sequence[PillarArray],
+    table: ExposureTable,
+    ranges: ScatterRanges,
+    marks: ExposedMarks,
+) -> tuple[Array, list[Array]]:
+    """Far field on the nodes and middle field on the sites that belong to the wanted
+    doses, in turn until they rest.
+    """
+    grid = marks.grid
+    mass, goal = _masses(lattices, table, grid)
     spacing = grid.y.spacing_um, grid.x.spacing_um
     reach = gaussian_convolution(grid.shape, spacing, point=ranges.far, hollow=False)
-    middles = (
-        [middle_convolution(body, ranges) for body in parts]
+    middles = [
+        middle_convolution(lattice, ranges)
+        for lattice in lattices
         if len(ranges.middle.widths_um)
-        else []
-    )
-    field, near = _backgrounds(parts, drawn, grid, reach, masses, middles, pads)
-    return assign.ExposedBodies(
-        parts, drawn, ranges, grid, field, near, cut, own, points, piece
-    )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Pads:
-    """Pieces of marks as masses on the nodes; the dose of each is the one that its
-    outer edges need.
-
-    own: (pieces,) exposure by its shape at unit dose; edges: points (n, 2), and the
-    piece of each; spots: points,
-    areas and pieces that stand for them.
-    """
-
-    rects: ExposedRectangles
-    own: Array
-    edges: tuple[Array, Array]
-    spots: tuple[Array, Array, Array]
-    grid: NodeGrid
-
-    def deposited(self, dose: Array) -> Array:
-        """(y, x) masses of doses (pieces,)."""
-        points, area, of = self.spots
-        return self.grid.deposit(points[:, 0], points[:, 1], area * dose[of])
-
-    def wanted(self, field: Array) -> Array:
-        """(y, x) masses of the doses that a background (y, x) asks for."""
-        if not len(self.own):
-            return np.zeros(self.grid.shape)
-        points, piece = self.edges
-        number = np.bincount(piece, minlength=len(self.own))
-        around = (
-            np.bincount(
-                piece, self.grid.sample(field, *points.T), minlength=len(self.own)
-            )
-            / number
-        )
-        return self.deposited((THRESHOLD * self.rects.goal - around) / self.own)
+    ]
+    field = _relaxed(reach, mass, THRESHOLD * goal, marks=marks)
+    near: list[Array] = []
+    for _ in range(12 if middles else 0):
+        near, taken = [], np.zeros(grid.shape)
+        for lattice, middle in zip(lattices, middles, strict=True):
+            index = np.concatenate([block for _, block in lattice.blocks()])
+            across = grid.x.at(lattice.columns_um)
+            down = grid.y.at(lattice.rows_um(0, lattice.rows))
+            far = np.empty(index.shape, np.float32)
+            interpolate_from_nodes(field, *down, *across, far)
+            per_own = table.per_own.take(index)
+            drive = (THRESHOLD * table.goal.take(index) - far) * per_own
+            own = _relaxed(middle, per_own, drive, bound_below=0.9)
+            near.append(own.astype(np.float32))
+            rows, columns = np.nonzero(index)
+            x, y = lattice.columns_um[columns], lattice.rows_um(0, lattice.rows)[rows]
+            taken += grid.deposit(x, y, (own * per_own)[rows, columns])
+        before = field
+        field = _relaxed(reach, mass, THRESHOLD * goal - taken, marks=marks)
+        if np.abs(field - before).max() < 1e-7:
+            break
+    return field, near
 
 
 def _masses(
-    parts: Sequence[PillarArray], drawn: ExposureTable, grid: NodeGrid
+    lattices: Sequence[PillarArray], table: ExposureTable, grid: NodeGrid
 ) -> tuple[Array, Array]:
     """Node sums of area / own, and goal area / own."""
-    value = np.stack([drawn.per_own, drawn.per_own * drawn.goal])
+    value = np.stack([table.per_own, table.per_own * table.goal])
     out = np.zeros((2, *grid.shape))
-    for body in parts:
-        xn, xw = grid.x.at(body.columns_um)
-        for first, block in body.blocks():
-            yn, yw = grid.y.at(body.rows_um(first, len(block)))
-            gather_to_nodes(block, value, yn, yw, xn, xw, out)
+    for lattice in lattices:
+        across = grid.x.at(lattice.columns_um)
+        for first, block in lattice.blocks():
+            down = grid.y.at(lattice.rows_um(first, len(block)))
+            gather_to_nodes(block, value, *down, *across, out)
     return out[0], out[1]
 
 
@@ -230,6 +371,9 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
     Args:
         body: lattice of pillars.
         ranges: point exposure by reach.
+
+    Raises:
+        ProcessError: more than 40 million sites.
     """
     if body.rows * body.columns > _MOST_SITES:
         raise ProcessError(
@@ -245,70 +389,219 @@ def middle_convolution(body: PillarArray, ranges: ScatterRanges) -> RadialConvol
     )
 
 
-def _backgrounds(
-    parts: Sequence[PillarArray],
-    drawn: ExposureTable,
-    grid: NodeGrid,
-    reach: RadialConvolution,
-    masses: tuple[Array, Array],
-    middles: Sequence[RadialConvolution],
-    pads: _Pads,
-) -> tuple[Array, list[Array]]:
-    """Far field on the nodes and middle field on the sites that belong to the wanted
-    doses, in turn until they rest.
-    """
-    wanted, goal = masses
-    field = _relaxed(reach, wanted, THRESHOLD * goal, pads=pads)
-    near: list[Array] = []
-    for _ in range(12 if middles else 0):
-        near, taken = [], np.zeros(grid.shape)
-        for body, middle in zip(parts, middles, strict=True):
-            index = np.concatenate([block for _, block in body.blocks()])
-            xn, xw = grid.x.at(body.columns_um)
-            yn, yw = grid.y.at(body.rows_um(0, body.rows))
-            far = np.empty(index.shape, np.float32)
-            interpolate_from_nodes(field, yn, yw, xn, xw, far)
-            mass = drawn.per_own.take(index)
-            own = _relaxed(
-                middle,
-                mass,
-                (THRESHOLD * drawn.goal.take(index) - far) * mass,
-                bound_below=0.9,
-            )
-            near.append(own.astype(np.float32))
-            rows, columns = np.nonzero(index)
-            x, y = body.columns_um[columns], body.rows_um(0, body.rows)[rows]
-            taken += grid.deposit(x, y, (own * mass)[rows, columns])
-        before, field = (
-            field,
-            _relaxed(reach, wanted, THRESHOLD * goal - taken, pads=pads),
-        )
-        if np.abs(field - before).max() < 1e-7:
-            break
-    return field, near
-
-
 def _relaxed(
     reach: RadialConvolution,
     mass: Array,
     drive: Array,
     *,
     bound_below: float = 0.0,
-    pads: _Pads | None = None,
+    marks: ExposedMarks | None = None,
 ) -> Array:
-    """B = K * [drive - B mass + pads(B)], to 1e-8; eigenvalues of K * mass lie between
-    -bound_below and the largest
-    row sum.
+    """B = K * [drive - B mass + marks(B)], to 1e-8, by relaxation; eigenvalues of K *
+    mass lie between -bound_below and the largest row sum.
     """
-    all_mass = mass if pads is None else mass + pads.deposited(1 / pads.own)
+    has_marks = marks is not None and len(marks.own) > 0
+    all_mass = mass
+    if marks is not None and has_marks:
+        all_mass = mass + marks.deposited(1 / marks.own)
     bound = float(reach(all_mass).max())
     step = 2 / (2 + bound - bound_below)
     rate = max(1 - step * (1 - bound_below), step * (1 + bound) - 1, 1e-3)
     field = np.zeros_like(mass)
     for _ in range(int(np.ceil(np.log(1e-8) / np.log(rate)))):
         given = drive - field * mass
-        change = reach(given if pads is None else given + pads.wanted(field)) - field
+        if marks is not None and has_marks:
+            given = given + marks.deposited(marks.doses(field))
+        change = reach(given) - field
         field += step * change
         if np.abs(change).max() < 1e-9:
             break
     return field
+
+
+# marks
+
+
+def _pieces(
+    plan: MaskPlan,
+    lattices: Sequence[PillarArray],
+    point: PointExposure,
+    tolerance: float,
+) -> tuple[Array, Array, Array]:
+    """Rectangles of all exposed figures, fractured to pieces of one dose each: (n, 4)
+    boxes, (n, 2) figure and layer number, (n,) shape.
+    """
+    whole, of, group = (
+        [np.empty((0, 4), np.int64)],
+        [np.empty((0, 2), np.int64)],
+        [np.empty(0, np.int64)],
+    )
+    shapes = 0
+    for f, figure in enumerate(plan.figures):
+        if figure.name not in EXPOSED:
+            continue
+        for m, polygons in enumerate(figure.polygons.values()):
+            boxes = np.concatenate([rectilinear.split_rectilinear(p) for p in polygons])
+            whole.append(boxes)
+            of.append(np.tile([f, m], (len(boxes), 1)))
+            group.append(shapes + _touching(boxes))
+            shapes = int(group[-1].max()) + 1
+    cut, box = fracture_boxes(
+        np.concatenate(whole) // plan.grid,
+        np.array([lattice.box_um for lattice in lattices]),
+        step_um=plan.grid * plan.unit_nm * nm,
+        point=point,
+        tolerance=min(tolerance, straight_edge_error(point)),
+    )
+    return cut * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
+
+
+def _touching(boxes: Array) -> Array:
+    """(n,) number of the connected shape that each rectangle belongs to.
+
+    A sweep along the longer side of them all: memory grows with the touching pairs.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    axis = int(np.argmax(boxes[:, 2:].max(0) - boxes[:, :2].min(0)))
+    order = np.argsort(boxes[:, axis], kind="stable")
+    swept = boxes[order]
+    ends = np.searchsorted(swept[:, axis], swept[:, 2 + axis], side="right")
+    other, first, second = 1 - axis, [], []
+    for n, end in enumerate(ends.tolist()):
+        ahead = swept[n + 1 : end]
+        met = (ahead[:, other] <= swept[n, 2 + other]) & (
+            ahead[:, 2 + other] >= swept[n, other]
+        )
+        touched = order[n + 1 : end][met]
+        second.append(touched)
+        first.append(np.full(len(touched), order[n]))
+    i, j = np.concatenate(first), np.concatenate(second)
+    pairs = coo_matrix((np.ones(len(i)), (i, j)), (len(boxes), len(boxes)))
+    return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
+
+
+# the dosed plan
+
+
+def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
+    """The plan with corrected doses: classes of diameter and dose, marks and labels in
+    pieces of one dose each.
+
+    Args:
+        wanted: doses of the plan.
+        ladder: of all that is written in one job.
+    """
+    plan = wanted.plan
+    classes, lookup, names = _classes(wanted, ladder)
+    lattices = tuple(
+        _redrawn(wanted, ladder, number, lookup) for number in range(len(plan.lattices))
+    )
+    figures, more = _figures(wanted, ladder)
+    replaced = {made.layer for made in plan.classes} | {
+        layer
+        for figure in plan.figures
+        if figure.name in EXPOSED
+        for layer in figure.polygons
+    }
+    kept, named = (
+        {layer: value for layer, value in old.items() if layer not in replaced}
+        for old in (plan.doses, plan.layer_names)
+    )
+    kinds = {number: name for (number, _), name in reversed(plan.layer_names.items())}
+    titles = {
+        layer: layer_title(kinds.get(layer[0], "shape"), dose)
+        for layer, dose in more.items()
+    }
+    return plan.replace(
+        classes=classes,
+        lattices=lattices,
+        figures=figures,
+        doses={**kept, **{made.layer: made.dose for made in classes}, **more},
+        layer_names={**named, **names, **titles},
+    )
+
+
+def layer_title(kind: str, level: float) -> str:
+    """Name of a layer that says its relative dose.
+
+    Args:
+        kind: of shapes.
+        level: relative dose.
+    """
+    return f"{kind}_dose_{level:.4f}"
+
+
+def _classes(
+    wanted: WantedDoses, ladder: DoseLadder
+) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
+    """Classes of diameter and dose, (old class, dose) -> new class number, and names of
+    their layers.
+    """
+    plan = wanted.plan
+    occurs = np.zeros((len(plan.classes) + 1, NONE + 1), bool)
+    for number, lattice in enumerate(wanted.lattices):
+        for first, block in lattice.blocks():
+            occurs[block, wanted.classes(number, first, block, ladder)] = True
+    used = np.argwhere(occurs[:, :NONE])
+    bases: dict[str, LayerNumber] = {}
+    datatypes: dict[str, set[int]] = {}
+    for made in plan.classes:
+        bases[made.role] = min(made.layer, bases.get(made.role, made.layer))
+    for k, j in used.tolist():
+        datatypes.setdefault(plan.classes[k - 1].role, set()).add(j)
+    lookup = np.zeros(occurs.shape, np.uint8 if len(used) <= 255 else np.uint16)
+    classes, names = [], {}
+    digits = max(6, len(str(len(used))))
+    for n, (k, j) in enumerate(used.tolist(), 1):
+        old = plan.classes[k - 1]
+        kind, level = old.role, float(ladder.factors[j])
+        layer = (bases[kind][0], bases[kind][1] + sorted(datatypes[kind]).index(j))
+        names[layer] = layer_title({"dose": "dose_test"}.get(kind, kind), level)
+        name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
+        classes.append(dataclasses.replace(old, name=name, layer=layer, dose=level))
+        lookup[k, j] = n
+    return tuple(classes), lookup, names
+
+
+def _redrawn(
+    wanted: WantedDoses, ladder: DoseLadder, number: int, lookup: Array
+) -> PillarArray:
+    """A lattice with the classes of diameter and dose, in blocks of rows."""
+    lattice = wanted.plan.lattices[number]
+
+    def blocks() -> Iterator[tuple[int, Array]]:
+        for first, block in lattice.blocks():
+            yield first, lookup[block, wanted.classes(number, first, block, ladder)]
+
+    kept = hold_on_disk((lattice.rows, lattice.columns), lookup.dtype, blocks())
+    return kept.within(lattice)
+
+
+def _figures(
+    wanted: WantedDoses, ladder: DoseLadder
+) -> tuple[tuple[FigureCell, ...], dict[LayerNumber, float]]:
+    """The exposed figures in pieces, each on the datatype of its dose, and the doses of
+    these.
+    """
+    plan, marks = wanted.plan, wanted.marks
+    level = ladder.nearest(marks.doses(wanted.far))
+    table = [[layer[0] for layer in figure.polygons] for figure in plan.figures]
+    on = np.array([table[f][m] for f, m in marks.figure.tolist()], np.int64)
+    doses: dict[LayerNumber, float] = {}
+    figures = list(plan.figures)
+    for f, figure in enumerate(plan.figures):
+        if figure.name not in EXPOSED:
+            continue
+        shapes: dict[LayerNumber, tuple[Array, ...]] = {}
+        for m, layer in enumerate(figure.polygons):
+            mine = (marks.figure == (f, m)).all(1)
+            for n, j in enumerate(np.unique(level[on == layer[0]]).tolist()):
+                some = marks.boxes[mine & (level == j)]
+                if len(some):
+                    own = (layer[0], layer[1] + n)
+                    shapes[own] = tuple(rectilinear.box_corners(box) for box in some)
+                    doses[own] = float(ladder.factors[j])
+        figures[f] = dataclasses.replace(figure, polygons=shapes)
+    return tuple(figures), doses

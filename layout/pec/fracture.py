@@ -16,11 +16,9 @@ MOST_PIECES = 500_000
 # of the tolerance, which the background may change from the middle of a side to its end
 _SHARE = 0.2
 _SHORTEST = 64  # pieces along the range, at most
-_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece, the first that the limits allow
-_FEW_PIECES = 100_000
-# ranges: where longer pieces meet, doses change so far into a shape that edges are 1 to
-# 2 % off
-_EVEN = 1.0
+# ranges: of a piece; where longer ones meet, doses change so far into a shape that
+# edges are 1 to 2 % off
+_LONGEST = 0.5
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
@@ -87,38 +85,41 @@ def fracture_boxes(
     )
     change = _SHARE * tolerance * THRESHOLD
     usual, corners = _ranges(around, change)
-    sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
-    for ranges in _LONGEST:
-        most = MOST_PIECES if ranges >= _EVEN else min(_FEW_PIECES, MOST_PIECES)
-        if np.ceil(sides / (ranges * usual)).prod(1).sum() > most:
-            continue
-        caps = _Caps(
-            shortest,
-            ranges * usual,
-            [(_FEW * width, ranges * width) for width in corners],
-            change,
+    every = np.asarray(boxes) * step_um
+    whole = np.asarray(boxes, np.int64)
+    pairs = pairs_near(every, np.zeros(len(every)), around)
+    first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
+    done: list[_Pieces] = []
+    count, outer = 0, np.ones((len(boxes), 4), bool)
+    open_ = _Pieces(whole, outer, np.arange(len(boxes)))
+    while len(open_.box):
+        _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
+        longest = np.full(len(open_.box), _LONGEST * usual)
+        _shorten(longest, open_.box * step_um, every[open_.of], corners)
+        _shorten_beside(longest, open_.box * step_um, lattices, around)
+        ratio = _change(open_, every, pairs, step_um, around) / change
+        side = open_.box[:, 2:] - open_.box[:, :2]
+        split = (side >= 2 * shortest) & (
+            (side > longest[:, None] / step_um) | (ratio > 1)
         )
-        every = _halved(boxes, lattices, step_um, around, caps, most=most)
-        if every is not None:
-            order = np.argsort(every.of, kind="stable")
-            return every.box[order], every.of[order]
-    raise ProcessError(
-        f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
-        f"backscatter ranges {usual:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Caps:
-    """shortest: side in grid steps, which is halved no more. longest_um: of a piece,
-    and ``corners`` how near to a
-    corner it is what, um. change: of the background from the middle of a piece.
-    """
-
-    shortest: float
-    longest_um: float
-    corners: list[tuple[float, float]]
-    change: float
+        # the longer side where both need it
+        across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))
+        done.append(open_.some(np.asarray(~split.any(1))))
+        count += len(done[-1].box)
+        open_ = _joined(
+            [
+                open_.some(across[:, 0]).halved(0),
+                open_.some(across[:, 1] & ~across[:, 0]).halved(1),
+            ]
+        )
+        if count + len(open_.box) > MOST_PIECES:
+            raise ProcessError(
+                f"marks and labels need more than {MOST_PIECES:,} pieces of one dose each for a point exposure whose "
+                f"backscatter ranges {usual:.3g} um; draw smaller marks (die.mark_um), or set exposure.correct = false"
+            )
+    pieces = _joined(done)
+    order = np.argsort(pieces.of, kind="stable")
+    return pieces.box[order], pieces.of[order]
 
 
 def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
@@ -126,61 +127,13 @@ def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
     whose energy counts at corners.
 
     There a Gaussian gives an eighth of its weight less than in the middle of what it
-    changes by. All that together
-    change by less than ``change`` are left out: the doses beside them are as even
-    without.
+    changes by. All that together change by less than ``change`` are left out: the doses
+    beside them are as even without.
     """
     order = np.argsort(around.widths_um)
     widths, total = around.widths_um[order], np.cumsum(around.weights[order])
     usual = float(widths[np.searchsorted(total, total[-1] / 2)])
     return usual, widths[(widths < usual) & (total > 8 * change)][::-1].tolist()
-
-
-def _halved(
-    boxes: Array,
-    lattices: Array,
-    step_um: float,
-    around: PointExposure,
-    caps: _Caps,
-    *,
-    most: int,
-) -> _Pieces | None:
-    """Boxes halved until they keep the limits; None where that takes more than
-    ``most``.
-    """
-    every = np.asarray(boxes) * step_um
-    pairs, whole = (
-        pairs_near(every, np.zeros(len(every)), around),
-        np.asarray(boxes, np.int64),
-    )
-    first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
-    done: list[_Pieces] = []
-    open_ = _Pieces(
-        np.asarray(boxes, np.int64),
-        np.ones((len(boxes), 4), bool),
-        np.arange(len(boxes)),
-    )
-    while len(open_.box):
-        if len(open_.box) + sum(len(p.box) for p in done) > most:
-            return None
-        _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
-        longest = _longest(open_, lattices, every, step_um, around, caps)
-        change = _change(open_, every, pairs, step_um, around) / caps.change
-        side = open_.box[:, 2:] - open_.box[:, :2]
-        split = (side >= 2 * caps.shortest) & (
-            (side > longest[:, None] / step_um) | (change > 1)
-        )
-        across = split & ~(
-            split[:, ::-1] & (side < side[:, ::-1])
-        )  # the longer side where both need it
-        done.append(open_.some(np.asarray(~split.any(1))))
-        open_ = _joined(
-            [
-                open_.some(across[:, 0]).halved(0),
-                open_.some(across[:, 1] & ~across[:, 0]).halved(1),
-            ]
-        )
-    return _joined(done)
 
 
 @compile_loop
@@ -222,32 +175,27 @@ def _joined(parts: list[_Pieces]) -> _Pieces:
     )
 
 
-def _longest(
-    pieces: _Pieces,
-    lattices: Array,
-    every: Array,
-    step_um: float,
-    around: PointExposure,
-    caps: _Caps,
-) -> Array:
-    """(n,) largest side, um: that of ``caps``, less near a corner of the box it is of,
-    least beside a lens.
+def _shorten(longest: Array, box: Array, whole: Array, corners: list[float]) -> None:
+    """Shorter pieces near the corners of the box (n, 4) that each is of, for ranges
+    that count there.
     """
-    box, whole = pieces.box * step_um, every[pieces.of]
-    out = np.full(len(box), caps.longest_um)
     ends = [
         np.minimum(box[:, k] - whole[:, k], whole[:, k + 2] - box[:, k + 2])
         for k in (0, 1)
     ]
-    from_corner = np.hypot(*ends)
-    for near, most in caps.corners:
-        out[from_corner < near] = most
+    for width in corners:
+        longest[np.hypot(*ends) < _FEW * width] = _LONGEST * width
+
+
+def _shorten_beside(
+    longest: Array, box: Array, lattices: Array, around: PointExposure
+) -> None:
+    """Shorter pieces beside a lens."""
     for width in np.sort(around.widths_um)[::-1].tolist():
-        for left, bottom, right, top in np.asarray(lattices, float).tolist():
+        for left, bottom, right, top in lattices.tolist():
             x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)
             y = np.maximum(np.maximum(bottom - box[:, 3], box[:, 1] - top), 0)
-            out[np.hypot(x, y) < _FEW * width] = width / _BESIDE
-    return out
+            longest[np.hypot(x, y) < _FEW * width] = width / _BESIDE
 
 
 def _change(

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from layout.pec.bodies import ExposedRectangles
 from layout.pec.psf import PointExposure
 from layout.process.jit import compile_loop
 from metalens.core import threads
@@ -19,13 +18,14 @@ CORNER = 2.0  # widths of the core: an edge is round that near its ends
 
 
 def self_exposure(
-    rects: ExposedRectangles, near: PointExposure
+    boxes: Array, group: Array, near: PointExposure
 ) -> tuple[Array, Array, Array]:
     """What a shape gives to its own edges by the Gaussians that are not summed on
     nodes, exact.
 
     Args:
-        rects: pieces of shapes.
+        boxes: (pieces, 4) left, bottom, right, top, um.
+        group: (pieces,) shape that each is a piece of.
         near: Gaussians that are not summed on nodes.
 
     Returns:
@@ -34,13 +34,13 @@ def self_exposure(
         its middle, less half), and the points (n, 2) of the outer edges with (n,) the
         piece of each.
     """
-    boxes, count = rects.box_um, len(rects.box_um)
+    count = len(boxes)
     if not count:
         return np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
-    one, two = pairs_near(boxes, rects.group, near)
+    one, two = pairs_near(boxes, group, near)
     starts = np.searchsorted(one, np.arange(count + 1))
     core_um = float(near.widths_um.min()) if len(near.widths_um) else 0.0
-    points, piece = _outer(rects, starts, two, CORNER * core_um)
+    points, piece = _outer(boxes, group, starts, two, CORNER * core_um)
     inner = np.bincount(piece, minlength=count) == 0
     at = np.concatenate([points, (boxes[inner, :2] + boxes[inner, 2:]) / 2])
     of = np.concatenate([piece, np.flatnonzero(inner)])
@@ -183,7 +183,7 @@ def _sum(
 
 
 def _outer(
-    rects: ExposedRectangles, starts: Array, near: Array, corner_um: float
+    boxes: Array, group: Array, starts: Array, near: Array, corner_um: float
 ) -> tuple[Array, Array]:
     """Points (n, 2) on those parts of the sides of each piece that no other piece of
     its shape covers, and the piece.
@@ -194,15 +194,15 @@ def _outer(
     left of the part beyond (nothing:
     the nearest place beyond). Runs of twice that length are round: left out.
     """
-    room = 4 * (len(near) + len(rects.box_um))
+    room = 4 * (len(near) + len(boxes))
     part, piece, side = (
         np.empty((room, 3)),
         np.empty(room, np.int64),
         np.empty(room, np.int64),
     )
-    count = _free(rects.box_um, starts, near, _OUTSIDE_UM, part, piece, side)
+    count = _free(boxes, starts, near, _OUTSIDE_UM, part, piece, side)
     part, piece, side = part[:count], piece[:count], side[:count]
-    low, high = _run(part, rects.group[piece], side)
+    low, high = _run(part, group[piece], side)
     low, high = low + corner_um, high - corner_um
     straight = high > low
     middle = (np.clip(part[:, 1], low, high) + np.clip(part[:, 2], low, high)) / 2
@@ -273,17 +273,14 @@ def _free(
     return count
 
 
-def rectangle_samples(
-    rects: ExposedRectangles, step_um: float
-) -> tuple[Array, Array, Array]:
+def rectangle_samples(box: Array, step_um: float) -> tuple[Array, Array, Array]:
     """Points (n, 2) that stand for the rectangles on nodes, their areas (n,), and the
     rectangle of each (n,).
 
     Args:
-        rects: pieces of shapes.
+        box: (pieces, 4) left, bottom, right, top, um.
         step_um: between the points, at most.
     """
-    box = rects.box_um
     counts = np.maximum(np.ceil((box[:, 2:] - box[:, :2]) / step_um - 1e-9), 1).astype(
         np.int64
     )
