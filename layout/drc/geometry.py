@@ -211,11 +211,14 @@ def find_close_boxes(
     boxes = np.asarray(boxes, float)
     heights = boxes[:, 3] - boxes[:, 1]
     typical = np.median(heights[which[:: max(1, len(which) // 10_000)]])
-    copies = boxes, which, np.ascontiguousarray(shift)
+    shift = np.ascontiguousarray(shift)
     order = stable_order(boxes[which, 0] + shift[:, 0])
-    bands = _fill_bands(*copies, order, float(typical + distance), distance)
+    low, height, start, member = _fill_bands(
+        boxes, which, shift, order, float(typical + distance), distance
+    )
+    bands = np.array([low, height, distance])
     pairs = np.empty((len(which), 2), np.int64)
-    count = _sweep_bands(*copies, *bands, distance, pairs)
+    count = _sweep_bands(boxes, which, shift, bands, start, member, pairs)
     if count > MAX_PAIRS:
         raise MaskFileError(
             f"{count:,} pairs of shapes closer than {distance:g} units, at most "
@@ -223,7 +226,7 @@ def find_close_boxes(
         )
     if count > len(pairs):
         pairs = np.empty((count, 2), np.int64)
-        _sweep_bands(*copies, *bands, distance, pairs)
+        _sweep_bands(boxes, which, shift, bands, start, member, pairs)
     return pairs[:count].copy()
 
 
@@ -267,17 +270,16 @@ def _sweep_bands(
     boxes: Array,
     which: Array,
     shift: Array,
-    low: float,
-    height: float,
+    bands: Array,
     start: Array,
     member: Array,
-    distance: float,
     pairs: Array,
 ) -> int:
     """Count the close pairs, and store as many as ``pairs`` holds; a pair belongs to
-    its lowest common band.
+    its lowest common band. ``bands``: bottom and height of them, and the distance.
     """
     count = 0
+    low, height, distance = bands
     for band in range(len(start) - 1):
         for k in range(start[band], start[band + 1]):
             i = member[k]

@@ -285,9 +285,9 @@ class MaskCell:
             if one.child in among:
                 yield one.child, one.turn, *one.places()
         if self.pillars is not None and among.intersection(self.pillars.children):
-            for child, x, y in self.pillars.places():
-                if child in among:
-                    yield child, QUARTERS[0], x, y
+            for name, x, y in self.pillars.places():
+                if name in among:
+                    yield name, QUARTERS[0], x, y
 
     def drawn(self) -> dict[LayerNumber, list[Array]]:
         """Polygons of each layer, true circles as polygons of 64 corners."""

@@ -213,8 +213,8 @@ def _listed(
 def _block(child: Array, x: Array, y: Array, turn: Array, level: int) -> bytes:
     """Compressed block of placements of quarter turns."""
     out = np.empty(len(x) * LARGEST_RECORD + 2, np.uint8)
-    columns = (column.astype(np.int64) for column in (child, x, y, turn))
-    used = encode_list(*columns, out)
+    child, x, y, turn = (column.astype(np.int64) for column in (child, x, y, turn))
+    used = encode_list(child, x, y, turn, out)
     return oasis.compressed_block(out[:used].data, level)
 
 

@@ -509,7 +509,9 @@ def apply_dose_classes(wanted: WantedDoses, ladder: DoseLadder) -> MaskPlan:
         {layer: value for layer, value in old.items() if layer not in replaced}
         for old in (plan.doses, plan.layer_names)
     )
-    kinds = {number: name for (number, _), name in reversed(plan.layer_names.items())}
+    kinds: dict[int, str] = {}
+    for (number, _), name in plan.layer_names.items():
+        kinds.setdefault(number, name)
     titles = {
         layer: layer_title(kinds.get(layer[0], "shape"), dose)
         for layer, dose in more.items()
