@@ -17,7 +17,7 @@ import torch
 from metalens import fisher
 from metalens.design import Focus
 from metalens.design.free_form import search as design_fisher
-from metalens.design.free_form.search import FisherSettings
+from metalens.design.free_form.settings import FisherSettings
 from metalens.image import pupil
 from metalens.image.pupil import Pupil
 

@@ -315,7 +315,6 @@ def test_help_loads_neither_numpy_nor_torch():
 EXTRAS = {  # what only some commands need
     *(
         "torch",
-        "nlopt",
         "cv2",
         "tifffile",
         "colour",

@@ -112,7 +112,6 @@ def nearest_name_hint(
 
 EXTRAS = {
     "torch": "optics",
-    "nlopt": "optics",
     "astropy": "fits",
     "cv2": "bench",
     "tifffile": "bench",

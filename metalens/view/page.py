@@ -3,6 +3,7 @@ them, in one file.
 """
 
 import base64
+import dataclasses
 import json
 import math
 import zlib
@@ -16,17 +17,7 @@ import numpy as np
 from metalens import __version__
 from metalens.core import store
 from metalens.core.arrays import Array
-from metalens.view.panels import (
-    ClassMapPanel,
-    CurvePanel,
-    DrawingPanel,
-    ImagePanel,
-    OutlinePanel,
-    Panel,
-    PointPanel,
-    SliderAxis,
-    TablePanel,
-)
+from metalens.view.panels import CurvePanel, ImagePanel, OutlinePanel, Panel
 
 DTYPES = {
     "float32": "Float32Array",
@@ -87,73 +78,40 @@ def _data(name: str) -> str:
     )
 
 
-def _plain(panel: Panel) -> dict[str, Any]:
-    shared = {
-        "type": type(panel).__name__,
-        "title": panel.title,
-        "caption": panel.caption,
-    }
-    if isinstance(panel, ImagePanel):
-        return shared | {
-            "values": pack_array(np.asarray(panel.values, np.float32)),
-            "axes": [_axis(axis) for axis in panel.axes],
-            "step": panel.step_um,
-            "unit": panel.unit,
-            "signed": panel.signed,
-            "optics": panel.optics,
-            "across": panel.across,
-            "fromLeast": panel.from_least,
-        }
-    if isinstance(panel, CurvePanel):
-        return shared | {
-            "x": pack_array(np.asarray(panel.x, np.float32)),
-            "xName": panel.x_name,
-            "yName": panel.y_name,
-            "lines": {
-                name: pack_array(np.asarray(line, np.float32))
-                for name, line in panel.lines.items()
-            },
-            "errors": {
-                name: pack_array(np.asarray(line, np.float32))
-                for name, line in panel.errors.items()
-            },
-            "axes": [_axis(axis) for axis in panel.axes],
-            "bands": [list(band) for band in panel.bands],
-            "scale": panel.scale,
-        }
-    if isinstance(panel, ClassMapPanel):
-        return shared | {
-            "index": pack_array(panel.index),
-            "sizes": [_number(v) for v in panel.sizes],
-            "pitch": panel.pitch_um,
-            "unit": panel.unit,
-            "columns": {
-                name: [_number(v) for v in column]
-                for name, column in panel.columns.items()
-            },
-            "marks": [list(mark) for mark in panel.marks],
-        }
-    if isinstance(panel, DrawingPanel):
-        return shared | {
-            "outlines": [_outline(outline) for outline in panel.outlines],
-            "unit": panel.unit_um,
-            "marks": [list(mark) for mark in panel.marks],
-        }
-    return shared | (_points(panel) if isinstance(panel, PointPanel) else _table(panel))
+# fields whose numbers go to the page packed, in single precision
+_PACKED: dict[type, tuple[str, ...]] = {
+    ImagePanel: ("values",),
+    CurvePanel: ("x", "lines", "errors"),
+}
 
 
-def _points(panel: PointPanel) -> dict[str, Any]:
-    notes = panel.notes or [{}] * len(panel.x)
-    return {
-        "x": [_number(v) for v in panel.x],
-        "y": [_number(v) for v in panel.y],
-        "xName": panel.x_name,
-        "yName": panel.y_name,
-        "groups": list(panel.groups),
-        "front": list(panel.front),
-        "frontName": panel.front_name,
-        "notes": [{name: _number(v) for name, v in note.items()} for note in notes],
-    }
+def _plain(value: Any) -> Any:
+    """A panel, or a part of one, as JSON has it: records by their fields, maps of
+    classes packed.
+    """
+    if isinstance(value, OutlinePanel):
+        return _outline(value)
+    if dataclasses.is_dataclass(value):
+        packed = _PACKED.get(type(value), ())
+        return {"type": type(value).__name__} | {
+            field.name: (_packed if field.name in packed else _plain)(
+                getattr(value, field.name)
+            )
+            for field in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, np.ndarray) and value.ndim == 2:
+        return pack_array(value)
+    if isinstance(value, list | tuple | range | np.ndarray):
+        return [_plain(part) for part in value]
+    return _number(value)
+
+
+def _packed(value: Any) -> dict[str, Any]:
+    if isinstance(value, Mapping):
+        return {name: _packed(part) for name, part in value.items()}
+    return pack_array(np.asarray(value, np.float32))
 
 
 def _outline(outline: OutlinePanel) -> dict[str, Any]:
@@ -167,25 +125,7 @@ def _outline(outline: OutlinePanel) -> dict[str, Any]:
         "corners": pack_array(np.asarray(outline.corners, np.float32)),
         "dx": pack_array(np.asarray(steps[:, 0], np.int32)),
         "dy": pack_array(np.asarray(steps[:, 1], np.int32)),
-        "notes": {name: _number(value) for name, value in outline.notes.items()},
-    }
-
-
-def _table(panel: TablePanel) -> dict[str, Any]:
-    return {
-        "head": list(panel.head),
-        "rows": [[_number(v) for v in row] for row in panel.rows],
-    }
-
-
-def _axis(axis: SliderAxis) -> dict[str, Any]:
-    values = [_number(v) for v in axis.values]
-    return {
-        "name": axis.name,
-        "values": values,
-        "unit": axis.unit,
-        "blink": axis.blink,
-        "first": axis.first,
+        "notes": _plain(outline.notes),
     }
 
 

@@ -122,17 +122,17 @@ async function images(panel, section) {
   for (const v of values) if (Math.abs(v) > all) all = Math.abs(v);
   const place = sliders(panel, controls, () => draw());
   const tick = (name, start, act) => { const l = element("label", controls, { class: "tick" }), b = element("input", l, { type: "checkbox" }); b.checked = start; l.append(name); b.addEventListener("change", () => { act(b.checked); draw(); }); };
-  if (!panel.signed && !panel.fromLeast) tick("logarithmic", false, (v) => { log = v; });
+  if (!panel.signed && !panel.from_least) tick("logarithmic", false, (v) => { log = v; });
   tick("own scale", true, (v) => { own = v; });
   const image = () => values.subarray(place() * size, (place() + 1) * size);
-  const um = (k, n) => (k - (n - 1) / 2) * panel.step;
+  const um = (k, n) => (k - (n - 1) / 2) * panel.step_um;
   function draw() {
     const at = image(), context = canvas.getContext("2d"), out = context.createImageData(nx, ny);
     let top = 0;
     if (own) for (const k of place.others()) for (const v of values.subarray(k * size, (k + 1) * size)) top = Math.max(top, Math.abs(v));
     else top = all;
     top = top || 1;
-    const low = panel.fromLeast ? at.reduce((a, b) => Math.min(a, b), Infinity) : 0, over = top - low || 1;
+    const low = panel.from_least ? at.reduce((a, b) => Math.min(a, b), Infinity) : 0, over = top - low || 1;
     for (let i = 0; i < size; i++) {
       let t = panel.signed ? 0.5 + at[i] / top / 2 : (at[i] - low) / over;
       if (log) t = 1 + Math.log10(Math.max(t, 1e-4)) / 4;
@@ -140,14 +140,14 @@ async function images(panel, section) {
       out.data.set([c[0], c[1], c[2], 255], 4 * i);
     }
     stamped(context, out);
-    ends(panel.signed ? -top : log ? 1e-4 * top : low, top, `${panel.unit}; ${text(nx * panel.step)} × ${text(ny * panel.step)} ${panel.across}`);
+    ends(panel.signed ? -top : log ? 1e-4 * top : low, top, `${panel.unit}; ${text(nx * panel.step_um)} × ${text(ny * panel.step_um)} ${panel.across}`);
     context.fillStyle = "#ffffff50";
     context.fillRect(0, cross[0], nx, 0.5); context.fillRect(cross[1], 0, 0.5, ny);
     const x = Array.from({ length: nx }, (_, k) => um(k, nx));
     profile(x, { "along x": { y: at.subarray(cross[0] * nx, (cross[0] + 1) * nx) }, ...(nx === ny ? { "along y": { y: x.map((_, k) => at[k * nx + cross[1]]) } } : {}) });
     readout.textContent = `x ${text(um(cross[1], nx))} ${panel.across}, y ${text(um(cross[0], ny))} ${panel.across}: ${text(at[cross[0] * nx + cross[1]])} ${panel.unit}` + (log ? "; four decades shown" : "");
     if (optics) {
-      const t = transfer(at, ny, nx, panel.step), e = encircled(at, ny, nx, panel.step);
+      const t = transfer(at, ny, nx, panel.step_um), e = encircled(at, ny, nx, panel.step_um);
       optics.mtf(t.f, { "along x": { y: t.x }, "along y": { y: t.y } });
       optics.energy(e.r, { share: { y: e.share } });
     }
@@ -187,12 +187,12 @@ async function curves(panel, section) {
   for (const [name, p] of Object.entries(panel.lines)) lines[name] = (await unpacked(p)).values;
   for (const [name, p] of Object.entries(panel.errors)) errors[name] = (await unpacked(p)).values;
   const controls = element("div", section, { class: "controls" }), box = element("div", section, { class: "plot" });
-  const show = plot(box, "", panel.xName, panel.yName, panel.scale === "log"), n = x.length;
+  const show = plot(box, "", panel.x_name, panel.y_name, panel.scale === "log"), n = x.length;
   const place = sliders(panel, controls, () => draw());
   const slice = (a) => a.subarray(place() * n, (place() + 1) * n);
   const now = () => Object.fromEntries(Object.entries(lines).map(([name, y]) => [name, { y: slice(y), error: errors[name] && slice(errors[name]) }]));
   const draw = () => show(x, now(), panel.bands);
-  tableOf(section, [panel.xName, ...Object.keys(lines).flatMap((name) => (errors[name] ? [name, `error bar of ${name}`] : [name]))], () => {
+  tableOf(section, [panel.x_name, ...Object.keys(lines).flatMap((name) => (errors[name] ? [name, `error bar of ${name}`] : [name]))], () => {
     const at = now();
     return Array.from(x, (v, i) => [v, ...Object.values(at).flatMap((l) => (l.error ? [l.y[i], l.error[i]] : [l.y[i]]))]);
   });
@@ -206,18 +206,18 @@ async function points(panel, section) {
   const box = element("div", section, { class: "plot pick", tabindex: 0, role: "group", "aria-label": `${panel.title}; arrow keys step through the points` });
   const readout = element("p", section, { class: "readout", "aria-live": "polite" });
   let chart = null, at = front.length ? front[front.length - 1] : order[0];
-  const noted = (i) => Object.entries(notes[i]).map(([name, v]) => `, ${name} ${text(v)}`).join("");
-  const pick = (i) => { at = i; readout.textContent = `${groups[i]}${front.includes(i) ? ` (in the ${panel.frontName})` : ""}: ${panel.xName} ${text(x[i])}, ${panel.yName} ${text(y[i])}${noted(i)}`; chart.redraw(); };
+  const noted = (i) => Object.entries(notes[i] ?? {}).map(([name, v]) => `, ${name} ${text(v)}`).join("");
+  const pick = (i) => { at = i; readout.textContent = `${groups[i]}${front.includes(i) ? ` (in the ${panel.front_name})` : ""}: ${panel.x_name} ${text(x[i])}, ${panel.y_name} ${text(y[i])}${noted(i)}`; chart.redraw(); };
   const place = (u, i) => [u.valToPos(x[i], "x", true), u.valToPos(y[i], "y", true)];
   const ring = { hooks: { draw: (u) => { const c = u.ctx, r = devicePixelRatio || 1; c.save(); c.strokeStyle = css("--ink"); c.lineWidth = 2 * r; c.beginPath(); c.arc(...place(u, at), 9 * r, 0, 7); c.stroke(); c.restore(); } } };
   const joined = uPlot.paths.stepped({ align: 1 }), none = () => null;
   function draw() {
     const colours = ["--a", "--b", "--c", "--d"].map(css), held = new Set(front);
-    const series = [{ label: panel.xName }, ...kinds.map((name, i) => ({ label: name, paths: none, stroke: colours[i % 4], points: { show: true, size: 8, fill: colours[i % 4] } }))], data = [order.map((i) => x[i]), ...kinds.map((name) => order.map((i) => (groups[i] === name ? y[i] : null)))];
-    if (front.length) { series.push({ label: panel.frontName, paths: joined, stroke: css("--ink"), width: 1.5, spanGaps: true, points: { show: false } }); data.push(order.map((i) => (held.has(i) ? y[i] : null))); }
+    const series = [{ label: panel.x_name }, ...kinds.map((name, i) => ({ label: name, paths: none, stroke: colours[i % 4], points: { show: true, size: 8, fill: colours[i % 4] } }))], data = [order.map((i) => x[i]), ...kinds.map((name) => order.map((i) => (groups[i] === name ? y[i] : null)))];
+    if (front.length) { series.push({ label: panel.front_name, paths: joined, stroke: css("--ink"), width: 1.5, spanGaps: true, points: { show: false } }); data.push(order.map((i) => (held.has(i) ? y[i] : null))); }
     chart?.destroy();
     const reach = (all) => { const low = Math.min(...all), high = Math.max(...all), more = 0.06 * (high - low || Math.abs(high) || 1); return () => [low - more, high + more]; };
-    chart = new uPlot({ width: Math.max(260, box.clientWidth), height: 320, series, plugins: [ring], scales: { x: { time: false, range: reach(x) }, y: { range: reach(y) } }, axes: axesOf(panel.xName, panel.yName), cursor: { drag: { x: false, y: false } }, legend: { live: false } }, data, box);
+    chart = new uPlot({ width: Math.max(260, box.clientWidth), height: 320, series, plugins: [ring], scales: { x: { time: false, range: reach(x) }, y: { range: reach(y) } }, axes: axesOf(panel.x_name, panel.y_name), cursor: { drag: { x: false, y: false } }, legend: { live: false } }, data, box);
     pick(at);
   }
   box.addEventListener("click", (e) => { // before the chart, which keeps clicks to itself where the pointer has moved
@@ -227,7 +227,7 @@ async function points(panel, section) {
   }, true);
   box.addEventListener("keydown", (e) => { const step = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[e.key]; if (step) { e.preventDefault(); pick(order[Math.max(0, Math.min(order.length - 1, order.indexOf(at) + step))]); } });
   const names = [...new Set(notes.flatMap((note) => Object.keys(note)))];
-  tableOf(section, ["", panel.xName, panel.yName, panel.frontName, ...names], () => order.map((i) => [groups[i], x[i], y[i], front.includes(i) ? "yes" : "", ...names.map((name) => notes[i][name] ?? "")]));
+  tableOf(section, ["", panel.x_name, panel.y_name, panel.front_name, ...names], () => order.map((i) => [groups[i], x[i], y[i], front.includes(i) ? "yes" : "", ...names.map((name) => notes[i]?.[name] ?? "")]));
   draw();
   addEventListener("resize", draw);
 }
@@ -322,14 +322,14 @@ async function classes(panel, section) {
   const shade = (v) => table[Math.max(0, Math.min(255, Math.round(255 * (v - low) / (high - low || 1))))];
   function paint(c, v) {
     (v.scale >= 6 ? near : far)(c, v);
-    markers(c, panel.marks, (x, y) => [(x / panel.pitch + nx / 2 - v.cx) * v.scale + v.W / 2, (y / panel.pitch + ny / 2 - v.cy) * v.scale + v.H / 2]);
+    markers(c, panel.marks, (x, y) => [(x / panel.pitch_um + nx / 2 - v.cx) * v.scale + v.W / 2, (y / panel.pitch_um + ny / 2 - v.cy) * v.scale + v.H / 2]);
   }
   function near(c, { scale, cx, cy, W, H }) {
     const i0 = Math.max(0, Math.floor(cy - H / 2 / scale)), i1 = Math.min(ny, Math.ceil(cy + H / 2 / scale)), k0 = Math.max(0, Math.floor(cx - W / 2 / scale)), k1 = Math.min(nx, Math.ceil(cx + W / 2 / scale));
     for (let i = i0; i < i1; i++) for (let k = k0; k < k1; k++) {
       const one = index[i * nx + k];
       if (!one) continue;
-      const v = sizes[one - 1], radius = v * (panel.unit === "nm" ? 1e-3 : 1) / panel.pitch / 2 * scale;
+      const v = sizes[one - 1], radius = v * (panel.unit === "nm" ? 1e-3 : 1) / panel.pitch_um / 2 * scale;
       c.fillStyle = `rgb(${shade(v).map(Math.round).join()})`;
       c.beginPath(); c.arc((k + 0.5 - cx) * scale + W / 2, (i + 0.5 - cy) * scale + H / 2, radius, 0, 7); c.fill();
     }
@@ -362,12 +362,12 @@ async function classes(panel, section) {
   function tell(atX, atY, scale) {
     const k = Math.floor(atX), i = Math.floor(atY);
     if (i < 0 || k < 0 || i >= ny || k >= nx) return "";
-    const one = index[i * nx + k], x = (k - (nx - 1) / 2) * panel.pitch, y = (i - (ny - 1) / 2) * panel.pitch;
+    const one = index[i * nx + k], x = (k - (nx - 1) / 2) * panel.pitch_um, y = (i - (ny - 1) / 2) * panel.pitch_um;
     const more = one ? Object.entries(panel.columns).map(([name, column]) => `, ${name} ${text(column[one - 1])}`).join("") : "";
-    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx - x, my - y) < Math.max(panel.pitch, 6 / scale * panel.pitch));
+    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx - x, my - y) < Math.max(panel.pitch_um, 6 / scale * panel.pitch_um));
     return `row ${i}, column ${k} (x ${text(x)}, y ${text(y)} µm): ` + (one ? `${text(sizes[one - 1])} ${panel.unit}${more}` : "nothing here") + (mark ? `. ${mark[2]}` : "");
   }
-  board(panel, section, { w: nx, h: ny }, panel.pitch, 80, paint, tell);
+  board(panel, section, { w: nx, h: ny }, panel.pitch_um, 80, paint, tell);
   bar(section, table)(low, high, panel.unit);
   tableOf(section, [`size / ${panel.unit}`, "sites", ...Object.keys(panel.columns)], () => { const n = new Float64Array(sizes.length + 1); for (const v of index) n[v]++; return sizes.map((v, i) => [v, n[i + 1], ...Object.values(panel.columns).map((c) => c[i])]).filter((row) => row[1]); }, "Sizes and how many sites have them");
 }
@@ -406,7 +406,7 @@ async function drawing(panel, section) {
     }
     blend(c, v, cover);
     for (const o of shown()) if (Math.max(o.own.right - o.own.left, o.own.high - o.own.low) * v.scale >= 2) outlined(c, o, v, palette[names.indexOf(o.layer)]);
-    markers(c, panel.marks, (x, y) => [(x / panel.unit - left - v.cx) * v.scale + v.W / 2, (top - y / panel.unit - v.cy) * v.scale + v.H / 2]);
+    markers(c, panel.marks, (x, y) => [(x / panel.unit_um - left - v.cx) * v.scale + v.W / 2, (top - y / panel.unit_um - v.cy) * v.scale + v.H / 2]);
   }
   const inView = (o, v) => {
     const high = top - (v.cy - v.H / 2 / v.scale), low = top - (v.cy + v.H / 2 / v.scale);
@@ -455,11 +455,11 @@ async function drawing(panel, section) {
       found.push(`${o.layer}, ${Object.entries(o.notes).map(([name, v]) => `${name} ${text(v)}`).join(", ")}`);
       break;
     }
-    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx / panel.unit - x, my / panel.unit - y) < 8 / scale);
-    return `x ${(x * panel.unit).toFixed(3)}, y ${(y * panel.unit).toFixed(3)} µm: ` + (found.slice(0, 3).join("; ") || "nothing here") + (mark ? `. ${mark[2]}` : "");
+    const mark = panel.marks.find(([mx, my]) => Math.hypot(mx / panel.unit_um - x, my / panel.unit_um - y) < 8 / scale);
+    return `x ${(x * panel.unit_um).toFixed(3)}, y ${(y * panel.unit_um).toFixed(3)} µm: ` + (found.slice(0, 3).join("; ") || "nothing here") + (mark ? `. ${mark[2]}` : "");
   }
   const small = Math.min(...outlines.map((o) => Math.max(o.own.right - o.own.left, o.own.high - o.own.low)));
-  const { controls, later } = board(panel, section, box, panel.unit, 40 / small, paint, tell);
+  const { controls, later } = board(panel, section, box, panel.unit_um, 40 / small, paint, tell);
   names.forEach((name) => {
     const label = element("label", controls, { class: "tick" }), tick = element("input", label, { type: "checkbox" });
     tick.checked = true;
@@ -468,7 +468,7 @@ async function drawing(panel, section) {
   });
   tableOf(section, ["layer", "copies", "area / µm²", ...new Set(outlines.flatMap((o) => Object.keys(o.notes)))], () => {
     const notes = [...new Set(outlines.flatMap((o) => Object.keys(o.notes)))];
-    return outlines.map((o) => [o.layer, o.x.length, o.area * panel.unit ** 2, ...notes.map((name) => o.notes[name] ?? "")]);
+    return outlines.map((o) => [o.layer, o.x.length, o.area * panel.unit_um ** 2, ...notes.map((name) => o.notes[name] ?? "")]);
   }, "Shapes and how many copies they have");
 }
 

@@ -1,5 +1,5 @@
-"""What a free-form design is worth: honest figures beside simple lenses tuned as hard;
-as text, numbers and picture.
+"""A free-form design beside simple lenses tuned for the same task, as numbers and as a
+picture.
 """
 
 from dataclasses import dataclass
@@ -10,13 +10,21 @@ import torch
 from torch import Tensor
 
 from metalens.core.report import figure_png, make_figure
-from metalens.design.free_form import simple_lenses as baselines
-from metalens.design.free_form.objective import DesignScore, score_phase
-from metalens.design.free_form.search import FisherPhase, phase_on
-from metalens.design.free_form.settings import ResolvedFisherSettings
+from metalens.design.free_form.search import (
+    DesignScore,
+    FisherPhase,
+    phase_on,
+    score_phase,
+    vortex_phase,
+)
+from metalens.design.free_form.settings import ResolvedFisherSettings, between_mm
 from metalens.image import Field, Pupil
 from metalens.image import pupil as pupils
 
+# foci that simple lenses are tuned over: shares of the range of depths in 1/z, from its
+# near end
+FOCI, HELIX_FOCI = (-0.87, 1.77), (-0.37, 1.21)
+ZONES = (1, 2, 3, 4, 5, 6)
 SHOWN = 3  # times as wide as a PSF in the picture is the window
 STRIP = 6  # depths of them
 
@@ -32,6 +40,11 @@ class JudgedLens:
     focus_um: float
     score: DesignScore
 
+    @property
+    def information(self) -> float:
+        """Mean axial information over depths and angles, per mm²."""
+        return float(self.score.information.mean())
+
 
 def judge_designs(
     made: FisherPhase, pupil: Pupil, settings: ResolvedFisherSettings
@@ -39,41 +52,65 @@ def judge_designs(
     """The design, and the best hyperbolic lens and double helix for the same pixels,
     depths and angles.
 
-    Intensities every ``settings.sample_um``, averaged over sub-pixel positions, at 11
-    depths.
-
     Args:
-        made: what was designed or computed.
+        made: the designed phase.
         pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+
+    Returns:
+        Scores at 11 depths, averaged over positions of the pixels.
     """
-    lenses = [("free form", phase_on(pupil, made), made.focus_um)]
-    for simple in baselines.tune_baselines(pupil, settings):
-        lenses.append(
-            (
-                f"{simple.name}, tuned",
-                baselines.baseline_phase(pupil, simple.zones),
-                simple.focus_um,
-            )
-        )
-    out = []
-    for name, phase, focus in lenses:
-        found = score_phase(phase, pupil, focus_um=focus, settings=settings)
-        rows = [
-            t.reshape(len(settings.angles_deg), -1)
-            for t in (found.information, found.encircled)
-        ]
-        out.append(JudgedLens(name, phase, focus, DesignScore(rows[0], rows[1])))
-    return tuple(out)
+    own = _judge("free form", phase_on(pupil, made), made.focus_um, pupil, settings)
+    plain = _tune(pupil, settings, (0,), FOCI, count=12)
+    return own, plain, _tune(pupil, settings, ZONES, HELIX_FOCI, count=6)
 
 
-def information_gain(lenses: tuple[JudgedLens, ...]) -> float:
-    """Mean information of the first lens over that of the best of the others.
+def _judge(
+    name: str,
+    phase: Tensor,
+    focus_um: float,
+    pupil: Pupil,
+    settings: ResolvedFisherSettings,
+) -> JudgedLens:
+    score = score_phase(phase, pupil, focus_um=focus_um, settings=settings)
+    rows = len(settings.angles_deg), -1
+    score = DesignScore(score.information.reshape(rows), score.encircled.reshape(rows))
+    return JudgedLens(name, phase, focus_um, score)
 
-    Args:
-        lenses: judged designs.
+
+def _tune(
+    pupil: Pupil,
+    settings: ResolvedFisherSettings,
+    zones: tuple[int, ...],
+    shares: tuple[float, float],
+    *,
+    count: int,
+) -> JudgedLens:
+    """Most informative simple lens over zones (0: hyperbolic) and focus: a scan at equal
+    steps of 1/z, then twice a finer one around the best.
     """
-    means = [float(lens.score.information.mean()) for lens in lenses]
-    return means[0] / max(means[1:])
+    near, far = settings.depths_mm
+    low, high = between_mm((1e3 * near, 1e3 * far), *shares)
+    x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
+
+    def judge(rings: int, focus_mm: float) -> JudgedLens:
+        phase = vortex_phase(x, y, radius_um=pupil.radius_um, zones=rings)
+        kind = f"helix of {rings} zone{'s' * (rings > 1)}" if rings else "hyperbolic"
+        name = f"{kind}, {focus_mm:.1f} mm, tuned"
+        return _judge(name, torch.from_numpy(phase), 1e3 * focus_mm, pupil, settings)
+
+    tried: list[JudgedLens] = []
+    for rings in zones:
+        step = (1 / low - 1 / high) / (count - 1)
+        inverse = np.linspace(1 / low, 1 / high, count).tolist()
+        lenses = [judge(rings, 1 / value) for value in inverse]
+        for _ in range(2):
+            best = max(lenses, key=lambda lens: lens.information)
+            step /= 2
+            foci = [1 / (1e3 / best.focus_um + side * step) for side in (-1, 1)]
+            lenses += [judge(rings, focus) for focus in foci if low <= focus <= high]
+        tried += lenses
+    return max(tried, key=lambda lens: lens.information)
 
 
 def report_values(
@@ -92,7 +129,8 @@ def report_values(
         "radius_um": settings.radius_um,
         "step_um": settings.step_um,
         "normalisation": settings.normalisation,
-        "times_the_better_baseline": information_gain(lenses),
+        "times_the_better_baseline": lenses[0].information
+        / max(lens.information for lens in lenses[1:]),
         "lenses": {
             lens.name: {
                 "information_per_mm2": lens.score.information.tolist(),

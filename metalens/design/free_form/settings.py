@@ -18,26 +18,6 @@ FOCI = (
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessVariation:
-    """What the process may do to the lens; the design is made to stand plus and minus
-    these.
-
-    phase: relative error of every pillar's phase within its turn (height, index, or a
-    bias of the diameters).
-    distance_um: error of the lens-to-sensor distance.
-    """
-
-    phase: float = 0.0
-    distance_um: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.phase < 0.5 and 0 <= self.distance_um < 500):
-            raise ConfigError(
-                f"variation of phase = {self.phase}, distance_um = {self.distance_um}: need 0 to 0.5 and 0 to 500"
-            )
-
-
-@dataclass(frozen=True, slots=True)
 class FisherSettings:
     """What a Fisher-designed lens is asked for.
 
@@ -67,9 +47,6 @@ class FisherSettings:
     even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
     0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
-    refine: iterations of NLopt's constrained method of moving asymptotes (MMA) after
-    the last stage.
-    variation: of the process; 0 leaves it out.
     scenes: of the objective of that name. orthogonality: its weight lambda in Eq. 6, of
     the squared cosine of the
         span angle.
@@ -90,8 +67,6 @@ class FisherSettings:
     even: float = 0.1
     normalisation: Literal["sum", "l2"] = "l2"
     seed: int = 0
-    refine: int = 0
-    variation: ProcessVariation = field(default_factory=ProcessVariation)
     scenes: int = 6
     orthogonality: float = 1.0
 
@@ -123,15 +98,10 @@ class FisherSettings:
                 f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids = {self.grids}: need 4 "
                 "or more each, or 0 as the last of several"
             )
-        if (
-            self.refine < 0
-            or self.scenes < 1
-            or self.orthogonality < 0
-            or not self.zones
-        ):
+        if self.scenes < 1 or self.orthogonality < 0 or not self.zones:
             raise ConfigError(
-                f"refine = {self.refine}, scenes = {self.scenes}, orthogonality = {self.orthogonality}, zones = "
-                f"{self.zones}: need 0 or more, 1 or more, 0 or more, and at least one entry"
+                f"scenes = {self.scenes}, orthogonality = {self.orthogonality}, zones "
+                f"= {self.zones}: need 1 or more, 0 or more, and at least one entry"
             )
 
     def about(self, focus: Focus, radius_um: float) -> "ResolvedFisherSettings":

@@ -82,7 +82,7 @@ def test_every_pillar_is_in_the_page(folder):
     index, sizes = _unpacked(panel["index"]), np.array([0.0, *panel["sizes"]])
     # sizes have six digits: half of the last one is 5e-4 nm
     assert np.abs(sizes[index] - 1e3 * design.diameters.diameter_um).max() < 5.1e-4
-    assert panel["pitch"] == 0.3
+    assert panel["pitch_um"] == 0.3
     picked = tuple(np.argwhere(index > 0)[37])
     turns = design.phase_rad()[picked] / (2 * np.pi)
     assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(
@@ -156,7 +156,7 @@ def test_psfs_keep_their_axes(folder):
     assert panel["axes"][1]["values"] == [0.7, 0.9, 1.4]
     scaled = stack.intensity / stack.intensity.max()
     assert np.abs(values - scaled).max() < 1e-7  # float32
-    assert panel["step"] == 0.5
+    assert panel["step_um"] == 0.5
 
 
 def test_nothing_in_a_page_leads_out_of_it(folder):
