@@ -22,14 +22,13 @@ from metalens.core.errors import CellError, FitError, MaterialError
 from metalens.fabrication import (
     Kinds,
     Perturbation,
-    ResponseError,
     Sensitivity,
     Solved,
     inapplicable_names,
-    of_kind,
     own_rates,
     pair_sensitivities,
     proxy_sensitivity,
+    response_errors,
 )
 from metalens.lens import Lens
 
@@ -214,8 +213,8 @@ def _table_slopes(
     rows = np.zeros((len(series), len(diameter_um)), complex)
     unknown = [row.name for row in _unknown() if row.name in wanted]
     rates = own_rates(lens, diameter_um).rates if unknown else rows
-    for n, (_, row) in enumerate(of_kind(ResponseError)):
-        if isinstance(row.acts, ResponseError) and row.acts.exact:
+    for n, (row, acts) in enumerate(response_errors()):
+        if acts.exact:
             rows[n] = series[n, 1] / series[n, 0]
         elif row.name in unknown:
             rows[n] = rates[n]
@@ -224,11 +223,7 @@ def _table_slopes(
 
 def _unknown() -> list[Perturbation]:
     """Answering causes that a table of the modal method lacks."""
-    return [
-        row
-        for _, row in of_kind(ResponseError)
-        if isinstance(row.acts, ResponseError) and not row.acts.exact
-    ]
+    return [row for row, acts in response_errors() if not acts.exact]
 
 
 def _upright(cell: Cell) -> bool:

@@ -14,12 +14,12 @@ from metalens.cell import Cell, Incidence
 from metalens.core import threads
 from metalens.core.arrays import Array
 from metalens.fabrication import (
-    Perturbation,
     ResponseError,
     Solved,
+    changed_pillar,
     designed_transmission,
-    of_kind,
     prior_scale,
+    response_errors,
     wavelength_scale,
 )
 from metalens.lens import Lens
@@ -86,10 +86,10 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / fine) + 1)
     changes = _changes(wavelength_um)
     cells = [
-        row.acts.changed(cell, amount, wavelength_um)
-        if isinstance(row.acts, ResponseError) and row.acts.changed and amount
+        changed_pillar(cell, 0.0, acts.numbers(cell, 0.0), amount, wavelength_um)[0]
+        if amount
         else cell
-        for _, row, amounts in changes
+        for _, acts, amounts in changes
         for amount in amounts
     ]
     apart = list(dict.fromkeys(cells))
@@ -124,24 +124,23 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     )
 
 
-def _changes(wavelength_um: float) -> list[tuple[int, Perturbation, tuple[float, ...]]]:
-    """(place, row, amounts in base units) of the causes that the solver knows."""
+_Change = tuple[int, ResponseError, tuple[float, ...]]
+
+
+def _changes(wavelength_um: float) -> list[_Change]:
+    """(place, response error, amounts in base units) of those that the solver knows."""
     out = []
-    for n, (_, row) in enumerate(of_kind(ResponseError)):
-        if isinstance(row.acts, ResponseError) and row.acts.exact:
+    for n, (row, acts) in enumerate(response_errors()):
+        if acts.exact:
             most = _ROOM * row.high * row.unit * prior_scale(row.name, wavelength_um)
-            out.append(
-                (n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact]))
-            )
+            out.append((n, acts, tuple(most * part for part in _AMOUNTS[acts.exact])))
     return out
 
 
-def _powers(
-    columns: Array, changes: Sequence[tuple[int, Perturbation, tuple[float, ...]]]
-) -> Array:
+def _powers(columns: Array, changes: Sequence[_Change]) -> Array:
     """(causes, orders, diameters) power series through the amounts of each cause."""
     orders = max(len(amounts) for *_, amounts in changes)
-    out = np.zeros((len(list(of_kind(ResponseError))), orders, len(columns)), complex)
+    out = np.zeros((len(response_errors()), orders, len(columns)), complex)
     first = 0
     for n, _, amounts in changes:
         values = columns[:, first : first + len(amounts)].T

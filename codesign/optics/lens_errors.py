@@ -17,14 +17,7 @@ from metalens import library
 from metalens.cell import Cell
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.fabrication import (
-    DRAWN,
-    Draw,
-    ResponseError,
-    State,
-    effective_indices,
-    of_kind,
-)
+from metalens.fabrication import DRAWN, Draw, State, effective_indices, response_errors
 from metalens.library import Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
@@ -231,10 +224,6 @@ def phase_rates(cell: Cell, wavelength_um: float) -> PhaseRates:
     even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
     diameter = np.asarray(proxy.diameter_um(even, wavelength_um))
     seen = effective_indices(cell, proxy, wavelength_um, diameter)
-    quick = [
-        row.acts.quick(seen).imag
-        for _, row in of_kind(ResponseError)
-        if isinstance(row.acts, ResponseError)
-    ]
+    quick = [acts.quick(seen).imag for _, acts in response_errors()]
     rates = np.stack([proxy.dphase_ddiameter(diameter, wavelength_um), *quick])
     return PhaseRates(rates.mean(1), np.cov(rates))

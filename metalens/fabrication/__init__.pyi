@@ -12,11 +12,13 @@ from .perturbations import Guide as Guide
 from .perturbations import Perturbation as Perturbation
 from .perturbations import ResponseError as ResponseError
 from .perturbations import WavefrontError as WavefrontError
+from .perturbations import changed_pillar as changed_pillar
 from .perturbations import derivative_maps as derivative_maps
 from .perturbations import inapplicable_names as inapplicable_names
 from .perturbations import names_of_kind as names_of_kind
 from .perturbations import of_kind as of_kind
 from .perturbations import prior_scale as prior_scale
+from .perturbations import response_errors as response_errors
 from .perturbations import wavelength_scale as wavelength_scale
 from .perturbations import with_missing as with_missing
 from .process import DRAWN as DRAWN

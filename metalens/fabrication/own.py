@@ -2,17 +2,16 @@
 errors, and by their edges.
 """
 
-import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from metalens.cell import Cell, Index, index
+from metalens.cell import Cell
 from metalens.core import executor
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
-from metalens.fabrication.perturbations import Perturbation, ResponseError, of_kind
+from metalens.fabrication.perturbations import changed_pillar, response_errors
 from metalens.library.axes import cell_of_sizes
 
 if TYPE_CHECKING:
@@ -144,17 +143,11 @@ def _derived(
     the edges less by the size.
     """
     (wavelength_um, edges, weights), (cell, size_um, _harmonics) = about, task
-    causes = [row for _, row in of_kind(ResponseError)]
-    rows = [*(_numbers(row, cell, size_um) for row in causes), edges]
-    slopes = [_slopes(numbers, wavelength_um, weights, task) for numbers in rows]
+    changes = [acts.numbers(cell, size_um) for _, acts in response_errors()]
+    slopes = [
+        _slopes(numbers, wavelength_um, weights, task) for numbers in (*changes, edges)
+    ]
     return [list(each) for each in zip(*slopes, strict=True)]
-
-
-def _numbers(row: Perturbation, cell: Cell, size_um: float) -> dict[str, float]:
-    acts = row.acts
-    if isinstance(acts, ResponseError) and acts.numbers:
-        return acts.numbers(cell, size_um)
-    return {}
 
 
 def _slopes(
@@ -190,51 +183,3 @@ def _slopes(
         complex(np.log((w * t_more).sum() / (w * t_less).sum()) / (2 * step))
         for w in weights
     ]
-
-
-def changed_pillar(
-    cell: Cell,
-    size_um: float,
-    numbers: dict[str, float],
-    amount: float,
-    wavelength_um: float,
-) -> tuple[Cell, float]:
-    """A pillar whose numbers have grown.
-
-    Args:
-        cell, size_um: the pillar as designed.
-        numbers: rate of each number, named as in a cell file (``height_um``,
-            ``shape.ratio``, ``layers.0.height_um``, ``pillar.n``); ``size_um``, and
-            ``grow_um`` of all edge pairs.
-        amount: that the rates are multiplied by.
-        wavelength_um: in vacuum, of the refractive index.
-
-    Returns:
-        Cell and size of the changed pillar.
-    """
-    layers = list(cell.layers)
-    for name, rate in numbers.items():
-        first, *rest = name.split(".")
-        change = rate * amount
-        if name == "size_um":
-            size_um += change
-        elif name == "grow_um":
-            layers = [_grown(layer, name, change) for layer in cell.sections]
-        elif name == "pillar.n":
-            n = index(cell.pillar, wavelength_um)
-            cell = dataclasses.replace(cell, pillar=Index(n.real + change, n.imag))
-        elif first == "shape":
-            cell = dataclasses.replace(cell, shape=_grown(cell.shape, rest[0], change))
-        elif first == "layers":
-            layers[int(rest[0])] = _grown(layers[int(rest[0])], rest[1], change)
-        else:
-            cell = _grown(cell, name, change)
-    if layers:
-        height_um = sum(layer.height_um for layer in layers)
-        cell = dataclasses.replace(cell, layers=tuple(layers), height_um=height_um)
-    return cell, size_um
-
-
-def _grown(record: Any, name: str, change: float) -> Any:
-    """A record with one number larger."""
-    return dataclasses.replace(record, **{name: getattr(record, name) + change})

@@ -48,23 +48,19 @@ class CDError:
 
 @dataclass(frozen=True, slots=True)
 class ResponseError:
-    """Derivative of ln t of every pillar alike, by ``unit`` of the row.
+    """Derivative of ln t of every pillar, by ``unit`` of the row.
 
-    quick: from the effective index, (n,) complex for the diameters of a guide. changed:
-        the cell with so much more of the cause; None where a pillar of the same size
-        has no more of it. step: of differences through a solver. exact: the number of
-        the cell that tables of t follow by powers
-        (:class:`metalens.fabrication.Solved`), empty where none does.
+    quick: from the effective index, (n,) complex for the diameters of a guide.
     numbers: rate of each number of a cell, as
-        :func:`metalens.fabrication.own.changed_pillar` names them, by cell and size of
-        the pillar; {} where such a pillar cannot have the cause.
+        :func:`metalens.fabrication.changed_pillar` names them, by cell and size of the
+        pillar; {} where such a pillar cannot have the perturbation.
+    exact: the number of the cell that tables of t follow by powers
+        (:class:`metalens.fabrication.Solved`), empty where none does.
     """
 
     quick: Callable[[Guide], Array]
-    changed: Callable[[Cell, float, float], Cell] | None
-    step: float
+    numbers: Callable[[Cell, float], dict[str, float]]
     exact: Literal["height_um", "n", ""] = ""
-    numbers: Callable[[Cell, float], dict[str, float]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +70,9 @@ class WavefrontError:
     """
 
     terms: Terms
+
+
+Kind = type[CDError] | type[ResponseError] | type[WavefrontError]
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,19 +217,6 @@ def _films(cell: Cell, *, under: bool) -> dict[str, float]:
     return {f"layers.{i}.height_um": cell.layers[i].height_um / whole for i in places}
 
 
-def _taller(cell: Cell, amount: float, wavelength_um: float) -> Cell:
-    return cell.at_height(cell.height_um + amount)
-
-
-def _denser(cell: Cell, amount: float, wavelength_um: float) -> Cell:
-    n = index(cell.pillar, wavelength_um)
-    return dataclasses.replace(cell, pillar=Index(n.real + amount, n.imag))
-
-
-def _leaning(cell: Cell, amount: float, wavelength_um: float) -> Cell:
-    return dataclasses.replace(cell, sidewall_rad=cell.sidewall_rad + amount)
-
-
 def _cd_error(
     name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: Any
 ) -> Perturbation:
@@ -257,7 +243,7 @@ def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
 def _side(
     name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
 ) -> Perturbation:
-    acts = ResponseError(_by_side, None, 2e-3, numbers=numbers)
+    acts = ResponseError(_by_side, numbers)
     return Perturbation(
         name,
         meaning,
@@ -273,9 +259,7 @@ def _side(
 
 
 def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
-    acts = ResponseError(
-        _by_none, None, 1e-2, numbers=lambda cell, size_um: _films(cell, under=under)
-    )
+    acts = ResponseError(_by_none, lambda cell, size_um: _films(cell, under=under))
     return Perturbation(
         name,
         meaning,
@@ -364,7 +348,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         10.0,
         -28.0,
         28.0,
-        ResponseError(_by_height, _taller, 0.01, "height_um", _heights),
+        ResponseError(_by_height, _heights, "height_um"),
         1e-3,
         drawn=Drawn("height_nm", 7.0),
         measured_by="the height (AFM) or the power",
@@ -376,7 +360,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.02,
         -0.075,
         0.075,
-        ResponseError(_by_index, _denser, 0.02, "n", _number("pillar.n")),
+        ResponseError(_by_index, _number("pillar.n"), "n"),
         free=False,
         drawn=Drawn("index", 0.02),
         effect="another refractive index",
@@ -390,7 +374,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.5,
         -1.6,
         1.6,
-        ResponseError(_by_sidewall, _leaning, DEG / 2, numbers=_number("sidewall_rad")),
+        ResponseError(_by_sidewall, _number("sidewall_rad")),
         DEG,
         free=False,
         drawn=Drawn("sidewall_deg", 0.5),
@@ -416,7 +400,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         0.3,
         -3.0,
         3.0,
-        ResponseError(_by_none, None, DEG / 2, numbers=_turn),
+        ResponseError(_by_none, _turn),
         DEG,
         free=False,
         drawn=Drawn("turn_deg", 0.0),
@@ -470,9 +454,14 @@ def prior_scale(name: str, wavelength_um: float) -> float:
     return wavelength_scale(wavelength_um) if name.endswith("_nm") else 1.0
 
 
-def of_kind(
-    kind: type[CDError] | type[ResponseError] | type[WavefrontError],
-) -> Iterator[tuple[int, Perturbation]]:
+def response_errors() -> list[tuple[Perturbation, ResponseError]]:
+    """Rows of the table that change the response of a pillar, and how, in order."""
+    return [
+        (row, row.acts) for row in PERTURBATIONS if isinstance(row.acts, ResponseError)
+    ]
+
+
+def of_kind(kind: Kind) -> Iterator[tuple[int, Perturbation]]:
     """(place in the table, row) of the causes that act in one way, in order.
 
     Args:
@@ -483,9 +472,7 @@ def of_kind(
     )
 
 
-def names_of_kind(
-    kind: type[CDError] | type[ResponseError] | type[WavefrontError],
-) -> tuple[str, ...]:
+def names_of_kind(kind: Kind) -> tuple[str, ...]:
     """Names of the causes that act in one way, in order.
 
     Args:
@@ -499,10 +486,7 @@ def with_missing(rows: Sequence[Array]) -> Array:
     not there are 0.
     """
     return np.stack(
-        [
-            *rows,
-            *[np.zeros_like(rows[0])] * (len(names_of_kind(ResponseError)) - len(rows)),
-        ]
+        [*rows, *[np.zeros_like(rows[0])] * (len(response_errors()) - len(rows))]
     )
 
 
@@ -514,12 +498,9 @@ def inapplicable_names(cell: Cell) -> tuple[str, ...]:
         cell: unit cell with its materials, shape and lattice.
     """
     size = cell.pitch_um / 2
-    rows = [
-        row
-        for _, row in of_kind(ResponseError)
-        if isinstance(row.acts, ResponseError) and row.acts.numbers
-    ]
-    return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]
+    return tuple(
+        row.name for row, acts in response_errors() if not acts.numbers(cell, size)
+    )
 
 
 def polynomial_coefficients(kind: type[CDError] | type[WavefrontError]) -> Array:
@@ -552,3 +533,51 @@ def derivative_maps(
             for each in polynomial_coefficients(kind)
         ]
     )
+
+
+def changed_pillar(
+    cell: Cell,
+    size_um: float,
+    numbers: dict[str, float],
+    amount: float,
+    wavelength_um: float,
+) -> tuple[Cell, float]:
+    """A pillar whose numbers have grown.
+
+    Args:
+        cell, size_um: the pillar as designed.
+        numbers: rate of each number, named as in a cell file (``height_um``,
+            ``shape.ratio``, ``layers.0.height_um``, ``pillar.n``); ``size_um``, and
+            ``grow_um`` of all edge pairs.
+        amount: that the rates are multiplied by.
+        wavelength_um: in vacuum, of the refractive index.
+
+    Returns:
+        Cell and size of the changed pillar.
+    """
+    layers = list(cell.layers)
+    for name, rate in numbers.items():
+        first, *rest = name.split(".")
+        change = rate * amount
+        if name == "size_um":
+            size_um += change
+        elif name == "grow_um":
+            layers = [_grown(layer, name, change) for layer in cell.sections]
+        elif name == "pillar.n":
+            n = index(cell.pillar, wavelength_um)
+            cell = dataclasses.replace(cell, pillar=Index(n.real + change, n.imag))
+        elif first == "shape":
+            cell = dataclasses.replace(cell, shape=_grown(cell.shape, rest[0], change))
+        elif first == "layers":
+            layers[int(rest[0])] = _grown(layers[int(rest[0])], rest[1], change)
+        else:
+            cell = _grown(cell, name, change)
+    if layers:
+        height_um = sum(layer.height_um for layer in layers)
+        cell = dataclasses.replace(cell, layers=tuple(layers), height_um=height_um)
+    return cell, size_um
+
+
+def _grown(record: Any, name: str, change: float) -> Any:
+    """A record with one number larger."""
+    return dataclasses.replace(record, **{name: getattr(record, name) + change})

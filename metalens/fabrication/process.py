@@ -20,11 +20,13 @@ from metalens.fabrication.perturbations import (
     PERTURBATIONS,
     CDError,
     Drawn,
+    Kind,
     ResponseError,
     WavefrontError,
     inapplicable_names,
     of_kind,
     polynomial_coefficients,
+    response_errors,
 )
 
 DIAMETER_STEP_NM = 2  # one class of pillars each
@@ -92,11 +94,9 @@ class State:
         """(pillar-response errors,) amounts in um, rad and 1, as the pillars'
         derivatives take them.
         """
-        return self._of(ResponseError) * [row.unit for _, row in of_kind(ResponseError)]
+        return self._of(ResponseError) * [row.unit for row, _ in response_errors()]
 
-    def _of(
-        self, kind: type[CDError] | type[ResponseError] | type[WavefrontError]
-    ) -> Array:
+    def _of(self, kind: Kind) -> Array:
         return self.amounts[[n for n, _ in of_kind(kind)]]
 
     def _polynomial(self, kind: type[CDError] | type[WavefrontError]) -> Array:

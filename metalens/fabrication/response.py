@@ -13,12 +13,7 @@ from metalens.cell import Cell, Index
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 from metalens.fabrication.own import own_rates
-from metalens.fabrication.perturbations import (
-    Guide,
-    ResponseError,
-    of_kind,
-    with_missing,
-)
+from metalens.fabrication.perturbations import Guide, response_errors, with_missing
 from metalens.fabrication.two_sizes import PairSensitivities
 from metalens.lens import Lens
 from metalens.library import Proxy
@@ -212,9 +207,8 @@ def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     )
     center = float(seen.diameter_um.mean())
     rows = [
-        polynomial.polyfit(seen.diameter_um - center, row.acts.quick(seen), degree)
-        for _, row in of_kind(ResponseError)
-        if isinstance(row.acts, ResponseError)
+        polynomial.polyfit(seen.diameter_um - center, acts.quick(seen), degree)
+        for _, acts in response_errors()
     ]
     return Sensitivity(np.array(rows), center, 0.5, low, high)
 
