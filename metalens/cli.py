@@ -105,14 +105,18 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "info": (
         "metalens.commands.info",
-        "kind, version, provenance and a small picture of any artefact",
+        "kind, version, provenance and arrays of any artefact",
     ),
 }
 
-# objective of ``metalens design``: module with its ``SceneObjective(pupil, settings)``
-OBJECTIVES = {"scenes": "codesign.evaluate.scenes"}
-# and the module that turns PROCESS.toml into its limits
-OBJECTIVES["process"] = "layout.process.limits"
+# modules of the packages above that commands load by name: ``SceneObjective(pupil,
+# settings)`` of free-form designs; the printable limits of PROCESS.toml; the summary of
+# a mask
+ABOVE = {
+    "scenes": "codesign.evaluate.scenes",
+    "process": "layout.process.limits",
+    "mask": "layout.commands.info",
+}
 # source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and
 # its PSFs
 PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}
@@ -129,10 +133,6 @@ VIEWS = {
     "answers": "codesign.commands.view:prediction_panels",
     "budget": "codesign.commands.view:budget_panels",
 }
-# and what ``metalens info`` says of files that are none of the core's: module with
-# ``told`` and ``text``
-TOLD = {"mask": "layout.commands.info"}
-
 # files that a verb reads a part of, and who knows the whole: "module:function" that
 # refuses it
 WHOLE = {
@@ -331,14 +331,8 @@ def _dispatch(verb: str, words: list[str]) -> int:
             )
         module = importlib.import_module(parts[meant][0])
         verb, words = f"{verb} {meant}", words[words[0] in parts :]
-    if verb in ("design", "study"):
-        module.OBJECTIVES.update(OBJECTIVES)
     if verb == "psf":
         module.SOURCES.update(PSF_SOURCES)
-    if verb == "view":
-        module.VIEWS.update(VIEWS)
-    if verb == "info":
-        module.TOLD.update(TOLD)
     try:
         options: Any = tyro.cli(
             module.Options,
@@ -389,6 +383,11 @@ def _refuse_beyond_reach(options: Any) -> None:
                 raise ConfigError(
                     f"--{name} {number:g}: need a finite number of at most {_LARGEST:g} in size"
                 )
+
+
+def load_above(name: str) -> Any:
+    """The module of :data:`ABOVE` with this name."""
+    return importlib.import_module(ABOVE[name])
 
 
 def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:

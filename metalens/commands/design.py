@@ -2,17 +2,17 @@
 of printable pillars.
 """
 
-import importlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 from metalens import design, lens, library
 from metalens.cell import Cell, describe_order_loss
+from metalens.cli import load_above
 from metalens.commands.common import CommonOptions, Output
 from metalens.core import config, store, transaction
 from metalens.core.errors import ConfigError
@@ -28,19 +28,15 @@ from metalens.design import (
     PhaseOf,
     Quality,
 )
-from metalens.design.free_form import FisherSettings, ResolvedFisherSettings
+from metalens.design.free_form import FisherSettings
 from metalens.lens import Lens
 from metalens.lens import picture as lens_plot
 from metalens.library import PillarLibrary, axes
 from metalens.optics import Layers, check_gaps
 
-if TYPE_CHECKING:
-    from metalens.image import Pupil
-
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
 # pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
 MOST_SUMMED = 60_000_000
-OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
 
 
@@ -441,7 +437,7 @@ def _fill_limits(
     if options.process is None:
         return replace(wanted, layers=layers)
     inputs[options.process.name] = store.sha256(options.process)
-    thinnest, gap = importlib.import_module(OBJECTIVES["process"]).printable_limits(
+    thinnest, gap = load_above("process").printable_limits(
         options.process, pitch_um=cell.pitch_um, height_um=cell.height_um
     )
     limits = replace(wanted.limits, min_diameter_nm=thinnest, min_gap_nm=gap)
@@ -476,7 +472,7 @@ def _find_phase(
     settings = wanted.fisher.about(wanted.focus, radius_um)
     pupil = design_pupil(wanted.focus, radius_um, settings)
     scenes = settings.objective == "scenes"
-    objective = _scene_objective(settings, pupil) if scenes else None
+    objective = load_above("scenes").SceneObjective(pupil, settings) if scenes else None
     console.say(f"free form: {settings.starts} starts of {settings.iterations} steps")
     phase, found = fisher_profile(
         wanted.focus, radius_um=radius_um, settings=settings, objective=objective
@@ -495,13 +491,6 @@ def _find_phase(
     picture = reports.report_picture(lenses, pupil, settings)
     write_bytes(draft.with_name(f"{draft.stem}_fisher.png"), picture)
     return phase, focus, {"fisher": reports.report_values(lenses, settings)}
-
-
-def _scene_objective(settings: ResolvedFisherSettings, pupil: "Pupil") -> Any:
-    """Eq. 6 on rendered eyes, of a package above this one: named by the command line,
-    loaded only when asked for.
-    """
-    return importlib.import_module(OBJECTIVES["scenes"]).SceneObjective(pupil, settings)
 
 
 def _meeting_note(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell) -> str:

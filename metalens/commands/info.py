@@ -1,28 +1,20 @@
-"""What a file is: kind, version, provenance, arrays and a small picture of the largest;
-masks and networks as well.
-"""
+"""What a file is: kind, version, provenance and arrays; masks and networks as well."""
 
-import importlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 
+from metalens.cli import load_above
 from metalens.commands.common import MASKS, CommonOptions
 from metalens.core import store, transaction
-from metalens.core.arrays import Array
 from metalens.core.errors import StoreError
 
-_SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
 _DRAWINGS = {*MASKS, ".dxf", ".cif"}  # the latter two are refused by name
 _HDF5 = b"\x89HDF"  # first bytes
-# kind of file: module of a package above with ``told`` and ``text``, filled by the
-# command line
-TOLD: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -31,8 +23,7 @@ class Options(CommonOptions):
 
     Attributes:
         file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or
-            checkpoint (safetensors), a
-            folder with a manifest, or any file of one.
+            checkpoint (safetensors), a folder with a manifest, or any file of one.
         top: cell of a mask to count with all below it; omitted: all top cells.
     """
 
@@ -46,34 +37,42 @@ def run(options: Options) -> int:
     Args:
         options: of the command line.
     """
-    if options.file.is_dir():
-        told = folder_manifest(options.file)
-        options.console.result(told, _folder_text(told))
-        return 0
-    if options.file.suffix == NETWORK:
-        told = safetensors_head(options.file)
-        options.console.result(told, _network_text(told))
-        return 0
-    if _is_drawing(options.file) and "mask" in TOLD:
-        module = importlib.import_module(TOLD["mask"])
-        told = module.mask_summary(options.file, options.top)
-        options.console.result(told, module.mask_summary_text(told))
-        return 0
-    if (listed := manifest_entry(options.file)) is not None:
-        options.console.result(listed, _member_text(listed))
-        return 0
-    stored = store.load(options.file)
-    about = _about(options.file.name, stored)
-    options.console.result(about, _text(stored, about["arrays"]))
+    path = options.file
+    if path.is_dir():
+        values = folder_manifest(path)
+        text = _folder_text(values)
+    elif path.suffix == NETWORK:
+        values = safetensors_head(path)
+        lines = _array_lines(values, values["settings"])
+        text = "\n".join([f"{values['kind']} version {values['version']}", *lines])
+    elif not _DRAWINGS.isdisjoint(suffix.lower() for suffix in path.suffixes):
+        masks = load_above("mask")  # also a compressed one (chip.gds.gz)
+        values = masks.mask_summary(path, options.top)
+        text = masks.mask_summary_text(values)
+    elif (listed := manifest_entry(path)) is not None:
+        values = listed
+        text = (
+            f"{values['file']}: {values['bytes']:,} bytes, as it was written by\n"
+            f"  metalens {values['command']}\n{_versions_line(values)}"
+        )
+    else:
+        stored = store.load(path)
+        values = _stored_values(path.name, stored)
+        text = _stored_text(values)
+    options.console.result(values, text)
     return 0
 
 
-def _is_drawing(path: Path) -> bool:
-    """Whether a file is named as a mask, also a compressed one (chip.gds.gz)."""
-    return not _DRAWINGS.isdisjoint(suffix.lower() for suffix in path.suffixes)
+def _versions_line(about: dict[str, Any]) -> str:
+    return "made with " + ", ".join(f"{k} {v}" for k, v in about["versions"].items())
 
 
-def _about(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
+def _array_lines(values: dict[str, Any], settings: str) -> list[str]:
+    arrays = [f"  {name}: {shape}" for name, shape in values["arrays"].items()]
+    return [*arrays, *(f"  config: {line}" for line in settings.splitlines() if line)]
+
+
+def _stored_values(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
     arrays = {name: f"{a.dtype} {tuple(a.shape)}" for name, a in stored.arrays.items()}
     return {
         "file": name,
@@ -81,13 +80,34 @@ def _about(name: str, stored: store.StoredArtefact) -> dict[str, Any]:
         "version": stored.version,
         "attributes": stored.attributes,
         "arrays": arrays,
-        "provenance": {
-            "config": stored.provenance.config,
-            "inputs": dict(stored.provenance.inputs),
-            "seed": stored.provenance.seed,
-            "versions": dict(stored.provenance.versions),
-        },
+        "provenance": asdict(stored.provenance),
     }
+
+
+def _stored_text(values: dict[str, Any]) -> str:
+    made = values["provenance"]
+    attributes = values["attributes"].items()
+    return "\n".join(
+        [
+            f"{values['kind']} version {values['version']}",
+            *(f"  {name} = {_short(value)}" for name, value in attributes),
+            _versions_line(made),
+            *(f"  from {n} (SHA-256 {h[:16]}…)" for n, h in made["inputs"].items()),
+            *_array_lines(values, made["config"]),
+        ]
+    )
+
+
+def _short(value: object) -> str:
+    """One line; of a float the digits that arithmetic leaves right: 0.94 for
+    0.9400000000000001.
+    """
+    text = (
+        repr(float(f"{value:.12g}"))
+        if isinstance(value, float)
+        else str(value).strip().replace("\n", "; ")
+    )
+    return text if len(text) <= 100 else text[:97] + "..."
 
 
 def manifest_entry(path: Path) -> dict[str, Any] | None:
@@ -119,12 +139,6 @@ def manifest_entry(path: Path) -> dict[str, Any] | None:
     }
 
 
-def _member_text(told: dict[str, Any]) -> str:
-    versions = ", ".join(f"{k} {v}" for k, v in told["versions"].items())
-    first = f"{told['file']}: {told['bytes']:,} bytes, as it was written by\n  metalens {told['command']}"
-    return f"{first}\nmade with {versions}"
-
-
 def folder_manifest(path: Path) -> dict[str, Any]:
     """The manifest of a folder, after its files were compared with it.
 
@@ -152,12 +166,7 @@ def _folder_text(told: dict[str, Any]) -> str:
         f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…"
         for name, e in told["files"].items()
     ]
-    return "\n".join(
-        [
-            *lines,
-            "made with " + ", ".join(f"{k} {v}" for k, v in told["versions"].items()),
-        ]
-    )
+    return "\n".join([*lines, _versions_line(told)])
 
 
 def safetensors_head(path: Path) -> dict[str, Any]:
@@ -213,68 +222,3 @@ def safetensors_head(path: Path) -> dict[str, Any]:
         "settings": about.get("settings", ""),
         "arrays": arrays,
     }
-
-
-def _network_text(told: dict[str, Any]) -> str:
-    lines = [f"{told['kind']} version {told['version']}"]
-    lines += [f"  {name}: {shape}" for name, shape in told["arrays"].items()]
-    return "\n".join(
-        [
-            *lines,
-            *("  config: " + line for line in told["settings"].splitlines() if line),
-        ]
-    )
-
-
-def _text(stored: store.StoredArtefact, arrays: dict[str, str]) -> str:
-    made = stored.provenance
-    lines = [f"{stored.kind} version {stored.version}"]
-    lines += [
-        f"  {name} = {_short(value)}" for name, value in stored.attributes.items()
-    ]
-    lines += [f"  {name}: {shape}" for name, shape in arrays.items()]
-    lines.append("made with " + ", ".join(f"{k} {v}" for k, v in made.versions.items()))
-    lines += [
-        f"  from {name} (SHA-256 {digest[:16]}…)"
-        for name, digest in made.inputs.items()
-    ]
-    lines += ["  config: " + line for line in made.config.splitlines() if line]
-    picture = max(
-        stored.arrays.values(), key=lambda a: a.size if a.ndim >= 2 else 0, default=None
-    )
-    if picture is not None and picture.ndim >= 2 and picture.dtype.kind in "fiu":
-        lines += text_sketch(picture)
-    return "\n".join(lines)
-
-
-def _short(value: object) -> str:
-    """One line; of a float the digits that arithmetic leaves right: 0.94 for
-    0.9400000000000001.
-    """
-    text = (
-        repr(float(f"{value:.12g}"))
-        if isinstance(value, float)
-        else str(value).strip().replace("\n", "; ")
-    )
-    return text if len(text) <= 100 else text[:97] + "..."
-
-
-def text_sketch(array: Array, *, columns: int = 48) -> list[str]:
-    """Lines of characters that show a (…, y, x) array, its first image, darkest for the
-    largest value.
-
-    Args:
-        columns: panels or characters along a row.
-    """
-    image = np.asarray(array.reshape(-1, *array.shape[-2:])[0], float)
-    rows = max(1, round(columns * image.shape[0] / image.shape[1] / 2))
-    picked = image[
-        np.ix_(_spread(image.shape[0], rows), _spread(image.shape[1], columns))
-    ]
-    low, high = float(np.nanmin(picked)), float(np.nanmax(picked))
-    level = np.nan_to_num((picked - low) / (high - low or 1.0)) * (len(_SHADES) - 1)
-    return ["".join(_SHADES[int(v)] for v in row) for row in level]
-
-
-def _spread(length: int, count: int) -> Array:
-    return np.linspace(0, length - 1, min(length, count)).astype(int)

@@ -5,20 +5,18 @@ Cells that are solved are kept beside the output (NAME.resume): after an interru
 the same command goes on.
 """
 
-import importlib
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
 
+from metalens.cli import load_above
 from metalens.commands.common import DistributedOptions, Output
 from metalens.core import config
 from metalens.core.units import nm
 from metalens.library import CellStudy, SweepJournal, plots
 from metalens.library import study as cell_study
-
-OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ def _printable(path: Path, study: CellStudy) -> CellStudy:
     """The study with the limits of a process file, through a package above this one
     that the command line names.
     """
-    module = importlib.import_module(OBJECTIVES["process"])
+    module = load_above("process")
     shapes = itertools.product(study.pitches_um, study.heights_um)
     found = [
         module.printable_limits(path, pitch_um=pitch, height_um=height)

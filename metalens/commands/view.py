@@ -9,14 +9,12 @@ from pathlib import Path
 
 import tyro
 
+from metalens.cli import VIEWS
 from metalens.commands.common import MASKS, CommonOptions, MaybeOutput
 from metalens.core import store, transaction
 from metalens.core.errors import ConfigError
 from metalens.view import Panel, write_page
 
-VIEWS: dict[
-    str, str
-] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
 # what tells the kind of a folder: names of files in it, any of them
 FOLDERS = {
     "mask": tuple(f"*{end}" for end in MASKS),

@@ -276,24 +276,5 @@ def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():
             )
 
 
-def test_a_ring_about_a_vortex_lies_eight_samples_from_it_at_most():
-    """Of charge m, neighbours on the nearest side of a ring of h samples differ by 2 m
-    atan(1 / (2 h - 1)): less than a
-    third of a turn for m of 15.7 at h = 8, and of 13.6 at 7 or 17.8 at 9."""
-    x = np.arange(24) - 11.5
-    for charge, known in ((13, True), (15, True), (16, False)):
-        phase = np.angle(np.exp(1j * charge * np.arctan2(x[:, None], x)))
-        found = phase_map._vortex(phase, 11.3, 11.6)
-        assert found == (phase[11, 12] if known else None)
 
 
-def test_no_more_than_256_places_stand_beside_vortices():
-    """A quarter of a sample about one, where the phasor between samples is short."""
-    phase = np.arctan2(x := (np.arange(16) - 7.5)[:, None], x.T)
-    samples = phase_map.PhaseSamples(phase, (1.0, 1.0))
-    few = np.linspace(-0.11, 0.12, 256)
-    assert phase_map.interpolate_phase(samples, few, np.array([0.07])).shape == (1, 256)
-    with pytest.raises(LensError, match="finer pitch"):
-        phase_map.interpolate_phase(
-            samples, np.linspace(-0.11, 0.12, 257), np.array([0.07])
-        )
