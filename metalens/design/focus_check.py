@@ -59,33 +59,6 @@ class FocusCheck:
         """In its place, at 0.8 of the expected Strehl ratio or more."""
         return self.placed and self.strehl >= 0.8 * self.expected
 
-    @property
-    def text(self) -> str:
-        """One line for a person."""
-        beyond = (
-            " or farther"
-            if abs(self.z_um) >= _SHIFTS[-1] * self.depth_um * (1 - 1e-9)
-            else ""
-        )
-        axial = (
-            ""
-            if math.isnan(self.z_um)
-            else f", {self.z_um:+.2f} um{beyond} from the sensor plane"
-        )
-        dim = f"FOCUS IN ITS PLACE BUT DIM (a Strehl ratio of {0.8 * self.expected:.3f} is asked for)"
-        verdict = (
-            "focus"
-            if self.passed
-            else dim
-            if self.placed
-            else "NO FOCUS WHERE IT SHOULD BE"
-        )
-        return (
-            f"{verdict}: peak at ({self.x_um:+.3f}, {self.y_um:+.3f}) um"
-            f"{axial}, Strehl ratio {self.strehl:.3f} (resolution {self.resolution_um:.2f} um, "
-            f"depth of focus {self.depth_um:.1f} um)"
-        )
-
 
 def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> FocusCheck:
     """Sum the light of every pillar on a cross of points around the axis, and along it.

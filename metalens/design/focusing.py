@@ -40,29 +40,23 @@ def has_focus(
         pitch_um: lattice constant, um.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
-    if inside.sum() < RAYS:
+    count = inside.sum()
+    if count < RAYS:
         return True  # a few pillars: every phase is a lens
+    places, shifts = _trace_rays(phase, focus, radius_um, pitch_um)
+    if places.shape[1] < (1 - SPREAD) * count:
+        return False
+    meets = places + shifts
+    spread = np.linalg.norm(meets.std(axis=1)) / np.linalg.norm(places.std(axis=1))
+    if spread > SPREAD:
+        return False
     k = 2 * np.pi / focus.wavelength_um
-    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
-    after = focus.layers.after(focus.sensor_distance_um, focus.wavelength_um)
-    w = px**2 + py**2
-    if (w[inside] >= after.layers[0][0] ** 2).mean() > SPREAD:
-        return False
-    inside &= w < 0.999 * after.layers[0][0] ** 2
-    bend = media.reach_per_direction(after.layers, np.where(inside, w, 0.0))
-    meets = [(a + bend * p)[inside] for a, p in ((x, px), (y, py))]
-    if np.hypot(*(m.std() for m in meets)) > SPREAD * np.hypot(
-        x[inside].std(), y[inside].std()
-    ):
-        return False
-    lit = np.exp(1j * (phase(axis, axis) + k * focus.path_um(x**2 + y**2)))[
-        np.hypot(x, y) <= radius_um
-    ]
-    centred = (
-        np.hypot(*(m.mean() for m in meets)) * radius_um * k / focus.sensor_distance_um
-        < 1
-    )
-    return bool(not centred or abs(lit.mean()) ** 2 > DARK)
+    middle_um = np.linalg.norm(meets.mean(axis=1))
+    if middle_um * radius_um * k / focus.sensor_distance_um >= 1:
+        return True
+    errors = phase(axis, axis) + k * focus.path_um(x**2 + y**2)
+    light = np.exp(1j * errors[np.hypot(x, y) <= radius_um]).mean()
+    return bool(abs(light) ** 2 > DARK)
 
 
 def lens_has_focus(lens: Lens) -> bool:
@@ -121,22 +115,13 @@ def meeting_um(
         radius_um: radius of the aperture, um.
         pitch_um: lattice constant, um.
     """
-    axis, x, y, inside = _grid(radius_um, pitch_um)
-    if inside.sum() < RAYS:
+    places, shifts = _trace_rays(phase, focus, radius_um, pitch_um)
+    if places.shape[1] < RAYS:
         return None
-    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
-    after = focus.layers.after(focus.sensor_distance_um, focus.wavelength_um)
-    w = px**2 + py**2
-    inside &= w < 0.999 * after.layers[0][0] ** 2
-    if inside.sum() < RAYS:
-        return None
-    # sideways way to the sensor over p; through air that of the slope u times z
-    bend = media.reach_per_direction(after.layers, np.where(inside, w, 0.0))[inside]
     z_um = focus.sensor_distance_um
-    places = np.stack([x[inside], y[inside]])
-    slopes = np.stack([px[inside], py[inside]]) * bend / z_um
+    slopes = shifts / z_um
     centred, turned = (a - a.mean(axis=1, keepdims=True) for a in (places, slopes))
-    if len(after.layers) == 1:
+    if len(focus.layers.after(z_um, focus.wavelength_um).layers) == 1:
         power = float((turned**2).sum())
         if power < 1e-18 * turned.size:  # parallel to rounding
             return None
@@ -155,13 +140,14 @@ def _grid(radius_um: float, pitch_um: float) -> tuple[Array, Array, Array, Array
     return axis, x, y, np.hypot(x, y) <= radius_um - pitch_um
 
 
-def _leaving(
-    phase: PhaseOf, focus: Focus, pitch_um: float, at: tuple[Array, Array, Array]
+def _trace_rays(
+    phase: PhaseOf, focus: Focus, radius_um: float, pitch_um: float
 ) -> tuple[Array, Array]:
-    """Direction cosines behind the lens, in air; the slope of the phase is its
+    """(2, n) places of rays on the lens and their lateral shifts to the sensor, by the
+    local grating equation; evanescent ones are left out. The slope of the phase is its
     difference over one pitch, wrapped.
     """
-    axis, x, y = at
+    axis, x, y, inside = _grid(radius_um, pitch_um)
     half, k = pitch_um / 2, 2 * np.pi / focus.wavelength_um
     steps = [
         phase(axis + half, axis) - phase(axis - half, axis),
@@ -169,7 +155,12 @@ def _leaving(
     ]
     slope = [((s + np.pi) % (2 * np.pi) - np.pi) / pitch_um / k for s in steps]
     away = np.sqrt(x**2 + y**2 + focus.source_distance_um**2)
-    return slope[0] + x / away, slope[1] + y / away
+    p = np.stack([slope[0] + x / away, slope[1] + y / away])
+    square = (p**2).sum(axis=0)
+    after = focus.layers.after(focus.sensor_distance_um, focus.wavelength_um).layers
+    inside &= square < 0.999 * after[0][0] ** 2
+    reach = media.reach_per_direction(after, square[inside])
+    return np.stack([x, y])[:, inside], p[:, inside] * reach
 
 
 def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:

@@ -67,7 +67,6 @@ def test_a_lens_that_focuses_to_the_side_is_told_which_side(proxy):
         lens, sensor_distance_um=lens.sensor_distance_um - 8.0
     )
     assert not check_focus(half_micron_further).passed
-    assert "NO FOCUS" in check_focus(half_micron_further).text
 
 
 def test_a_lens_of_less_than_a_fresnel_zone_is_judged_in_the_sensor_plane_only(proxy):

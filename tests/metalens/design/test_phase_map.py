@@ -274,7 +274,3 @@ def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():
             phase_map.interpolate_phase(
                 samples, np.arange(-20, 20) * 0.3 + 0.25, np.arange(-20, 20) * 0.3
             )
-
-
-
-
