@@ -27,20 +27,16 @@ if TYPE_CHECKING:
     from metalens.psf import FarField
 
 TAKES = (
-    "lens",
-    "output",
     "sources_mm",
     "angles_deg",
     "angles_y_deg",
     "wavelengths_nm",
     "samples",
-    "far_field",
-    "report",
+    *("lens", "output", "far_field", "report", "quiet", "json", "force"),
 )
 SAMPLES = 401
 PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are told
 HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y")
-Directions = list[tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -68,39 +64,33 @@ def far_field_request(options: Any, made: lens.Lens) -> FarFieldRequest:
             or wavelength.
     """
     for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        if value not in (None, False) and field.name not in (
-            *TAKES,
-            "quiet",
-            "json",
-            "force",
-        ):
+        stated = getattr(options, field.name) not in (None, False)
+        if stated and field.name not in TAKES:
             raise ConfigError(
-                f"{field.name}: not for a far field, which takes {', '.join(TAKES[2:7])}"
+                f"{field.name}: not for a far field, which takes {', '.join(TAKES[:5])}"
             )
-    sources, waves = (
-        options.sources_mm or (math.inf,),
-        options.wavelengths_nm or (1e3 * made.wavelength_um,),
-    )
+    (source, *sources) = options.sources_mm or (math.inf,)
+    (wave, *waves) = options.wavelengths_nm or (1e3 * made.wavelength_um,)
     along_x = options.angles_deg or (0.0,)
     along_y = options.angles_y_deg or (0.0,) * len(along_x)
-    if len(sources) != 1 or len(waves) != 1 or len(along_x) != len(along_y):
+    if sources or waves or len(along_x) != len(along_y):
         raise ConfigError(
-            f"sources_mm = {sources}, wavelengths_nm = {waves}, {len(along_x)} angles along x, {len(along_y)} along y: "
-            "a far field takes one depth, one wavelength, and as many angles along y as along x"
+            f"sources_mm = {options.sources_mm}, wavelengths_nm = "
+            f"{options.wavelengths_nm}, {len(along_x)} angles along x, {len(along_y)} "
+            "along y: a far field takes one depth, one wavelength, and as many angles "
+            "along y as along x"
         )
     tilted = max(map(abs, (*along_x, *along_y)))
-    if not (sources[0] > 0 and 0 < waves[0] < math.inf and tilted < 90):
+    if not (source > 0 and 0 < wave < math.inf and tilted < 90):
         raise ConfigError(
-            f"sources_mm = {sources[0]}, wavelengths_nm = {waves[0]}, angles to {tilted} deg: need a depth and a "
-            "wavelength above 0, and angles within 90 degrees"
+            f"sources_mm = {source}, wavelengths_nm = {wave}, angles to {tilted} deg: "
+            "need a depth and a wavelength above 0, and angles within 90 degrees"
         )
     samples = SAMPLES if options.samples is None else options.samples
     if not 3 <= samples <= 4001:
         raise ConfigError(f"samples = {samples}: need 3 to 4001 across a far field")
-    return FarFieldRequest(
-        tuple(zip(along_x, along_y, strict=True)), sources[0], waves[0], samples
-    )
+    angles = tuple(zip(along_x, along_y, strict=True))
+    return FarFieldRequest(angles, source, wave, samples)
 
 
 def compute_far_fields(
@@ -190,31 +180,24 @@ def far_field_values(
         wanted: what the command asks for.
         found: what was computed.
     """
-    fields = []
-    for (x, y), one in zip(wanted.angles_deg, found, strict=True):
-        beams = [
-            dataclasses.asdict(b)
-            | {"angle_deg": b.angle_deg, "azimuth_deg": b.azimuth_deg}
-            for b in one.beams
-        ]
-        fields.append(
-            {
-                "angle_x_deg": x,
-                "angle_y_deg": y,
-                "transmitted": one.transmitted,
-                "beyond": one.beyond,
-                "within_deg": {f"{part:g}": _cone(one, part) for part in PARTS},
-                "beams": beams,
-                "error": one.error,
-            }
-        )
-    first = found[0]
-    return {
-        "beam_sine": first.beam_sine,
-        "beam_holds": first.beam_holds,
-        "steepest": first.steepest,
-        "fields": fields,
-    }
+    fields = [
+        {
+            "angle_x_deg": x,
+            "angle_y_deg": y,
+            "transmitted": one.transmitted,
+            "beyond": one.beyond,
+            "within_deg": {f"{part:g}": _cone(one, part) for part in PARTS},
+            "beams": [
+                dataclasses.asdict(beam)
+                | {"angle_deg": beam.angle_deg, "azimuth_deg": beam.azimuth_deg}
+                for beam in one.beams
+            ],
+            "error": one.error,
+        }
+        for (x, y), one in zip(wanted.angles_deg, found, strict=True)
+    ]
+    common = ("beam_sine", "beam_holds", "steepest")
+    return {name: getattr(found[0], name) for name in common} | {"fields": fields}
 
 
 def far_field_text(
@@ -232,31 +215,24 @@ def far_field_text(
         if math.isinf(wanted.source_mm)
         else f"a source at {wanted.source_mm:g} mm"
     )
+    worst = max(one.error for one in found)
     lines = [
-        f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {max(o.error for o in found):.1g}"
+        f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {worst:.1g}"
     ]
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
-        cones = [(part, _cone(one, part)) for part in PARTS]
-        told = ", ".join(
-            f"{part:.0%} within {angle:.3g}"
-            for part, angle in cones
-            if angle is not None
-        )
+        cones = ((part, _cone(one, part)) for part in PARTS)
+        shares = ", ".join(f"{p:.0%} within {a:.3g}" for p, a in cones if a is not None)
+        lost = f", {one.beyond:.2g} does not leave into air"
         lines.append(
-            f"  from ({x:g}, {y:g}) deg: {one.transmitted:.3f} of the light on the pillars passes, of that {told} deg "
-            "of the axis"
-            + (
-                f", {one.beyond:.2g} does not leave into air"
-                if one.beyond > 1e-4
-                else ""
-            )
+            f"  from ({x:g}, {y:g}) deg: {one.transmitted:.3f} of the light on the "
+            f"pillars passes, of that {shares} deg of the axis"
+            f"{lost if one.beyond > 1e-4 else ''}"
         )
         lines += [
-            f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, {b.sine_y:+.5f})"
+            f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, "
+            f"{b.sine_y:+.5f})"
             for b in one.beams
-        ]
-        if not one.beams:
-            lines.append("    no direction holds 1 % of it")
+        ] or ["    no direction holds 1 % of it"]
     return "\n".join([*lines, f"  {_counted(found[0])}"])
 
 
@@ -295,8 +271,8 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
         2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
     )
     for column, ((x, y), one) in enumerate(zip(wanted.angles_deg, found, strict=True)):
-        edge = float(one.sines[-1] + (one.sines[1] - one.sines[0]) / 2)
-        top = float(one.share.max())
+        step = float(one.sines[1] - one.sines[0])
+        edge, top = float(one.sines[-1]) + step / 2, float(one.share.max())
         panel = panels[0, column]
         low = max(1e-6 * top, 1e-300)
         shown = panel.imshow(
@@ -311,13 +287,8 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
         figure.colorbar(
             shown, ax=panel, label="share of the light in a square", shrink=0.85
         )
-        angles = np.degrees(
-            np.arcsin(
-                np.minimum(
-                    np.arange(1, len(one.rings) + 1) * 2 * edge / len(one.sines), 1.0
-                )
-            )
-        )
+        sines = step * np.arange(1, len(one.rings) + 1)
+        angles = np.degrees(np.arcsin(np.minimum(sines, 1.0)))
         panels[1, column].plot(angles, np.cumsum(one.rings))
         panels[1, column].set(
             xlabel="angle from the axis / deg",
