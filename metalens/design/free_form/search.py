@@ -530,41 +530,26 @@ def _shares(settings: FisherSettings) -> list[int]:
 
 
 class _Phase:
-    """Controls to the phase on the pupil's nodes: a sparse product for a spline,
-    themselves for a grid of 0.
+    """Controls to the phase on the pupil's nodes: of a spline, or themselves for a grid
+    of 0.
     """
 
     def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:
-        px, py = (a.numpy() for a in pupils.coordinates(pupil))
-        self.base = torch.from_numpy(
-            vortex_phase(px, py, radius_um=pupil.radius_um, zones=zones)
-        )
-        self.matrix: Tensor | None = None
-        if grid == 0:
-            return
-        x, y = px.ravel() / pupil.radius_um, py.ravel() / pupil.radius_um
-        across, down = bspline_weights(x, grid), bspline_weights(y, grid)
-        rows, columns, values = [], [], []
-        for k in range(len(x)):
-            i, j = np.nonzero(down[k])[0], np.nonzero(across[k])[0]
-            rows.append(np.full(len(i) * len(j), k))
-            columns.append((i[:, None] * grid + j).ravel())
-            values.append((down[k, i][:, None] * across[k, j]).ravel())
-        index = torch.from_numpy(
-            np.stack([np.concatenate(rows), np.concatenate(columns)])
-        )
-        entries = torch.from_numpy(np.concatenate(values))
-        self.matrix = torch.sparse_coo_tensor(
-            index, entries, (len(x), grid * grid), check_invariants=True
-        )
+        x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
+        vortices = vortex_phase(x, y, radius_um=pupil.radius_um, zones=zones)
+        self.base = torch.from_numpy(vortices)
+        self.weights = [
+            torch.from_numpy(bspline_weights(axis.ravel() / pupil.radius_um, grid))
+            for axis in (y, x)
+            if grid
+        ]
 
     def __call__(self, controls: Tensor) -> Tensor:
-        if self.matrix is None:
+        if not self.weights:
             return self.base + controls
-        phase: Tensor = torch.sparse.mm(self.matrix, controls.reshape(-1, 1)).reshape(
-            self.base.shape
-        )
-        return self.base + phase
+        down, across = self.weights
+        spline = ((down @ controls) * across).sum(dim=1)
+        return self.base + spline.reshape(self.base.shape)
 
 
 def _refined(controls: Tensor, grid: int) -> Tensor:
