@@ -28,9 +28,8 @@ from metalens import lens as lenses
 from metalens.core import config, reading, store
 from metalens.core.errors import ConfigError, PropagationError
 from metalens.core.report import Figure, Section, Table, write_report
-from metalens.design import Focus
-from metalens.design.free_form import FisherSettings, design_pupil
-from metalens.design.free_form import simple_lenses as baselines
+from metalens.design import DoubleHelix, Focus
+from metalens.design.free_form import FisherSettings, design_pupil, tune_baselines
 from metalens.lens import Lens
 
 SPREAD = "brings no light together in one bright spot of the sensor: its beams are shown by psf --far-field"
@@ -206,8 +205,10 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
         normalisation="sum" if setting.normalisation == "sum" else "l2",
     ).about(focus, radius)
     out = []
-    for found in baselines.tune_baselines(design_pupil(focus, radius, wanted), wanted):
-        phase, mine = found.phase(focus, radius_um=radius)
+    for found in tune_baselines(design_pupil(focus, radius, wanted), wanted):
+        mine = dataclasses.replace(focus, source_distance_um=found.focus_um)
+        helix = DoubleHelix(zones=found.zones) if found.zones else None
+        phase = design.phase_of(helix, mine, radius_um=radius)
         kind = "double-helix" if found.zones else "hyperbolic"
         simple, _ = design.make(
             phase, mine, aperture_um=2 * radius, cell=lens.cell, proxy=lens.proxy, profile=kind

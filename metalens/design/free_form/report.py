@@ -2,7 +2,7 @@
 picture.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,14 +31,17 @@ STRIP = 6  # depths of them
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JudgedLens:
-    """A lens on the quick pupil. phase_rad: (nodes, nodes) without its focus. score:
-    over (angles, depths).
+    """A lens on the quick pupil.
+
+    phase_rad: (nodes, nodes) without its focus. score: over (angles, depths). zones: of
+    the double helix, 0 for none.
     """
 
     name: str
     phase_rad: Tensor
     focus_um: float
     score: DesignScore
+    zones: int
 
     @property
     def information(self) -> float:
@@ -60,22 +63,33 @@ def judge_designs(
     Returns:
         Scores at 11 depths, averaged over positions of the pixels.
     """
-    own = _judge("free form", phase_on(pupil, made), made.focus_um, pupil, settings)
+    phase = phase_on(pupil, made)
+    score = _score(phase, made.focus_um, pupil, settings)
+    own = JudgedLens("free form", phase, made.focus_um, score, made.zones)
+    simple = tune_baselines(pupil, settings)
+    return own, *(replace(lens, name=f"{lens.name}, tuned") for lens in simple)
+
+
+def tune_baselines(
+    pupil: Pupil, settings: ResolvedFisherSettings
+) -> tuple[JudgedLens, JudgedLens]:
+    """The most informative hyperbolic lens and double helix.
+
+    Args:
+        pupil: sampled pupil of the lens.
+        settings: resolved settings of the design.
+    """
     plain = _tune(pupil, settings, (0,), FOCI, count=12)
-    return own, plain, _tune(pupil, settings, ZONES, HELIX_FOCI, count=6)
+    return plain, _tune(pupil, settings, ZONES, HELIX_FOCI, count=6)
 
 
-def _judge(
-    name: str,
-    phase: Tensor,
-    focus_um: float,
-    pupil: Pupil,
-    settings: ResolvedFisherSettings,
-) -> JudgedLens:
+def _score(
+    phase: Tensor, focus_um: float, pupil: Pupil, settings: ResolvedFisherSettings
+) -> DesignScore:
+    """Over (angles, depths), also of one angle."""
     score = score_phase(phase, pupil, focus_um=focus_um, settings=settings)
     rows = len(settings.angles_deg), -1
-    score = DesignScore(score.information.reshape(rows), score.encircled.reshape(rows))
-    return JudgedLens(name, phase, focus_um, score)
+    return DesignScore(score.information.reshape(rows), score.encircled.reshape(rows))
 
 
 def _tune(
@@ -94,10 +108,11 @@ def _tune(
     x, y = (axis.numpy() for axis in pupils.coordinates(pupil))
 
     def judge(rings: int, focus_mm: float) -> JudgedLens:
-        phase = vortex_phase(x, y, radius_um=pupil.radius_um, zones=rings)
+        vortices = vortex_phase(x, y, radius_um=pupil.radius_um, zones=rings)
+        phase, focus_um = torch.from_numpy(vortices), 1e3 * focus_mm
+        score = _score(phase, focus_um, pupil, settings)
         kind = f"helix of {rings} zone{'s' * (rings > 1)}" if rings else "hyperbolic"
-        name = f"{kind}, {focus_mm:.1f} mm, tuned"
-        return _judge(name, torch.from_numpy(phase), 1e3 * focus_mm, pupil, settings)
+        return JudgedLens(f"{kind}, {focus_mm:.1f} mm", phase, focus_um, score, rings)
 
     tried: list[JudgedLens] = []
     for rings in zones:
