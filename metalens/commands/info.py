@@ -1,10 +1,13 @@
-"""What a file is: kind, version, provenance and arrays; masks and networks as well."""
+"""What a file is: kind, version, provenance, arrays and a small picture of the largest;
+masks and networks as well.
+"""
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from metalens.cli import load_above
@@ -14,6 +17,7 @@ from metalens.core.errors import StoreError
 
 NETWORK = ".safetensors"
 _DRAWINGS = {*MASKS, ".dxf", ".cif"}  # the latter two are refused by name
+_SHADES = " .:-=+*#%@"
 _HDF5 = b"\x89HDF"  # first bytes
 
 
@@ -58,7 +62,7 @@ def run(options: Options) -> int:
     else:
         stored = store.load(path)
         values = _stored_values(path.name, stored)
-        text = _stored_text(values)
+        text = "\n".join([_stored_text(values), *_sketch_largest(stored)])
     options.console.result(values, text)
     return 0
 
@@ -108,6 +112,24 @@ def _short(value: object) -> str:
         else str(value).strip().replace("\n", "; ")
     )
     return text if len(text) <= 100 else text[:97] + "..."
+
+
+def _sketch_largest(stored: store.StoredArtefact) -> list[str]:
+    """Lines of characters that show the first image of the largest (…, y, x) array,
+    darkest for the largest value.
+    """
+    arrays = [a for a in stored.arrays.values() if a.ndim >= 2]
+    largest = max(arrays, key=lambda array: array.size, default=np.zeros((0, 0), bool))
+    if not largest.size or largest.dtype.kind not in "fiu":
+        return []
+    rows, columns = largest.shape[-2:]
+    y = np.linspace(0, rows - 1, min(rows, max(1, round(24 * rows / columns))))
+    x = np.linspace(0, columns - 1, min(columns, 48))
+    first = largest.reshape(-1, rows, columns)[0]
+    picked = first[np.ix_(y.astype(int), x.astype(int))].astype(float)
+    low, high = float(np.nanmin(picked)), float(np.nanmax(picked))
+    shade = np.nan_to_num((picked - low) / (high - low or 1.0)) * (len(_SHADES) - 1)
+    return ["".join(_SHADES[int(v)] for v in row) for row in shade]
 
 
 def manifest_entry(path: Path) -> dict[str, Any] | None:
