@@ -235,7 +235,7 @@ def _guarded(words: list[str], *, debug: bool) -> int:
     """Run the command; its exit status, with one line for whatever stopped it."""
     from metalens.core import store
 
-    told = store.COMMAND.set(" ".join(words))
+    token = store.COMMAND.set(" ".join(words))
     try:
         return _shown(words) if debug else _dispatch(words[0], words[1:])
     except FitRefused as error:
@@ -264,7 +264,7 @@ def _guarded(words: list[str], *, debug: bool) -> int:
             signal.setitimer(
                 signal.ITIMER_REAL, 0
             )  # an interrupt that was dropped and came otherwise comes no more
-        store.COMMAND.reset(told)
+        store.COMMAND.reset(token)
 
 
 def _shown(words: list[str]) -> int:
@@ -345,9 +345,9 @@ def _dispatch(verb: str, words: list[str]) -> int:
         return SUCCESS
     except SystemExit as end:
         if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):
-            apart = parted.replace(",", " ").replace("=", " ")
+            separated = parted.replace(",", " ").replace("=", " ")
             return _refuse(
-                f"{parted}: part the numbers of a list by blanks, as {apart}; a decimal has a point"
+                f"{parted}: part the numbers of a list by blanks, as {separated}; a decimal has a point"
             )
         raise
     _refuse_beyond_reach(options)
@@ -413,12 +413,12 @@ def _stop(number: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _not_lost(told: Any) -> None:
+def _not_lost(dropped: Any) -> None:
     """An interrupt that came where Python drops every exception (a callback of an
     import, a finaliser) comes again.
     """
-    if issubclass(told.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
+    if issubclass(dropped.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _stop)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     else:
-        _OTHERWISE[0](told)
+        _OTHERWISE[0](dropped)

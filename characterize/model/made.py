@@ -62,7 +62,7 @@ def as_built_transmission(
         t = _of_two_sizes(lens, response, bias, made.answers())
     else:
         t = _of_one_size(lens, response, x, bias, angle_rad)
-    if made.bends():
+    if made.has_wavefront_error():
         t = t * np.exp(1j * _on_pillars(d, made.phase_rad))
     return np.asarray(
         np.where(

@@ -310,7 +310,7 @@ class MadeLens:
             d.pitch_um,
             lambda: self.pillars(made, factor=factor),
             (centre[0], centre[1]),
-            added if made.bends() else None,
+            added if made.has_wavefront_error() else None,
         )
 
     def _aberration(self, known: State, nodes_x: Array, nodes_y: Array) -> Array:

@@ -66,7 +66,7 @@ class SpreadModel:
             moments = (at_nodes * self.moments).sum(0)
             found.append(
                 moments * np.exp(1j * state.phase_rad(x, y))
-                if state.bends()
+                if state.has_wavefront_error()
                 else moments
             )
         return np.stack(found)

@@ -27,7 +27,7 @@ SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are gi
 BEYOND = 4.0
 STEPS = 2.0  # of a depth of focus, wavelength index / NA²
 MOST_STEPS = 400
-SETTLED = 1e-3  # of a depth of focus
+CONVERGED = 1e-3  # of a depth of focus
 PATCHES = 512  # along an axis, over what a stop lights
 
 
@@ -117,8 +117,8 @@ def over_field(
         frequencies_per_mm(lens) if frequencies is None else frequencies, float
     )
     _check(angles_deg, depth, wanted)
-    told: list[str] = []
-    origin = _chief(lens, 0.0, depth, told)
+    failures: list[str] = []
+    origin = _chief(lens, 0.0, depth, failures)
     base = math.nan
     if origin is not None:
         base = _brightness(lens, 0.0, depth, origin) * float(
@@ -126,15 +126,15 @@ def over_field(
         )
     rows = []
     for angle in angles_deg:
-        chief = origin if angle == 0 else _chief(lens, angle, depth, told)
+        chief = origin if angle == 0 else _chief(lens, angle, depth, failures)
         rows.append(_row(lens, angle, depth, (origin, chief), wanted / 1e3))
         rows[-1]["illumination"] = rows[-1]["illumination"] / base
         if np.isnan(rows[-1]["sharpest_um"]).any():
-            told.append(f"no sharpest line about the sensor at {angle:g} degrees")
+            failures.append(f"no sharpest line about the sensor at {angle:g} degrees")
     columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     return OverField(
         np.array(angles_deg, float), depth, lens.sensor_distance_um, frequencies_per_mm=wanted,
-        left_out=tuple(dict.fromkeys(told)), **columns,
+        left_out=tuple(dict.fromkeys(failures)), **columns,
     )  # fmt: skip
 
 
@@ -156,12 +156,12 @@ def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -
 
 
 def _chief(
-    lens: Lens, angle_deg: float, depth_um: float, told: list[str]
+    lens: Lens, angle_deg: float, depth_um: float, failures: list[str]
 ) -> ChiefRay | None:
     try:
         return chief_ray(lens, (math.radians(angle_deg), 0.0), depth_um)
     except PropagationError as error:
-        told.append(str(error))
+        failures.append(str(error))
         return None
 
 
@@ -233,7 +233,7 @@ def _brightness(
 def vignetted_share(
     lens: Lens, angle_rad: tuple[float, float], depth_um: float
 ) -> float:
-    """Share of the light through the stop's hole that falls beside the pillars; 0
+    """Share of the light through the stop's hole that misses the pillars; 0
     without a stop.
 
     Shares of patches of the pillars' plane that the hole lights
@@ -266,10 +266,10 @@ def vignetted_share(
         * float(step) ** 2
     )
     sites = d.x_um, d.y_um[:, None]
-    lit = lens.layers.stop_share(
+    share = lens.layers.stop_share(
         tangents, depth_um, wave, sites, math.sqrt(d.site_um2)
     ) * (np.asarray(d.diameter_um) > 0)
-    return max(0.0, 1 - float(lit.sum()) * d.site_um2 / hole)
+    return max(0.0, 1 - float(share.sum()) * d.site_um2 / hole)
 
 
 def _sharpest(
@@ -300,20 +300,20 @@ def _sharpest(
         row[:] = [sharpness_per_um(light, field, axis) for axis in (0, 1)]
         field = field * ahead
     return np.array(
-        [_settled(light, places, found[:, axis], axis, deep) for axis in (0, 1)]
+        [_refine_maximum(light, places, found[:, axis], axis, deep) for axis in (0, 1)]
     )
 
 
-def _settled(
+def _refine_maximum(
     light: FieldPlaneWaves, places: Array, sharp: Array, axis: int, deep: float
 ) -> float:
-    """The best of a scan, settled between its neighbours."""
+    """The best of a scan, refined between its neighbours."""
     best = int(np.argmax(sharp))
     if best in (0, len(places) - 1):
         return math.nan
     ends = float(places[best - 1]), float(places[best + 1])
     less = minimize_scalar(
         lambda z: -sharpness_per_um(light, light.at(float(z)), axis),
-        bounds=ends, method="bounded", options={"xatol": SETTLED * deep},
+        bounds=ends, method="bounded", options={"xatol": CONVERGED * deep},
     )  # fmt: skip
     return float(less.x)

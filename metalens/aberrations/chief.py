@@ -75,7 +75,7 @@ def chief_ray(
 
     Accuracy: landing and foci to ``focus_error_um`` where pillars err at random; of a
     smooth phase 2e-6 of the distance
-        and a twentieth of a wavelength. The factor of unlike neighbours
+        and a twentieth of a wavelength. The factor of non-identical neighbours
         (``lens.neighbours``) is left out.
     """
     source = source_at(lens, angle_rad, depth_um)
@@ -105,7 +105,10 @@ def chief_ray(
     step = STEP if math.isinf(depth_um) else STEP * depth_um
     moved = _change(lambda s: _arriving(lens, at, s, depth_um), source, step)
     walks = _change(lambda s: middle_um(lens, s, depth_um), source, step)
-    moves = _bent(after, p) @ moved + (np.eye(2) + _bent(after, p) @ q) @ walks
+    moves = (
+        _reach_derivative(after, p) @ moved
+        + (np.eye(2) + _reach_derivative(after, p) @ q) @ walks
+    )
     return ChiefRay(
         at,
         p,
@@ -192,7 +195,7 @@ def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:
     return np.stack(columns, axis=1)
 
 
-def _bent(after: Media, p: Array) -> Array:
+def _reach_derivative(after: Media, p: Array) -> Array:
     """(2, 2) B of the heading."""
     w, outer = float(p @ p), np.outer(p, p)
     return np.asarray(
@@ -209,7 +212,7 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
     """
     w, cover = float(p @ p), after.index[0]
     per_um = np.eye(2) / (cover**2 - w) ** 0.5 + np.outer(p, p) / (cover**2 - w) ** 1.5
-    rest, change = np.eye(2) + _bent(after, p) @ q, per_um @ q
+    rest, change = np.eye(2) + _reach_derivative(after, p) @ q, per_um @ q
     power = (change**2).sum(1)
     more = np.divide(
         -(rest * change).sum(1),
@@ -314,14 +317,14 @@ def _guessed(
     how that differs some pillars on. twice_um: twice the middle (x, y) of the map from
     where the slopes are wanted."""
     hop, found = 2 if centred else 1, {}
-    beside, below = (
+    next_x, next_y = (
         turn[:, hop:] * turn[:, :-hop].conj(),
         turn[hop:] * turn[:-hop].conj(),
     )
     far = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
-    across = beside[:, far[0] :] * beside[:, : -far[0]].conj()
-    down = below[far[1] :] * below[: -far[1]].conj()
-    mixed = beside[far[1] :] * beside[: -far[1]].conj()
+    across = next_x[:, far[0] :] * next_x[:, : -far[0]].conj()
+    down = next_y[far[1] :] * next_y[: -far[1]].conj()
+    mixed = next_x[far[1] :] * next_x[: -far[1]].conj()
     bent = [
         np.angle(across.sum()) / (hop * far[0] * steps[0] ** 2),
         np.angle(down.sum()) / (hop * far[1] * steps[1] ** 2),
@@ -329,12 +332,12 @@ def _guessed(
     twist = np.angle(mixed.sum()) / (hop * far[1] * steps[0] * steps[1])
     found = {(2, 0): bent[0] / 2, (1, 1): twist, (0, 2): bent[1] / 2}
     found[1, 0] = (
-        np.angle(beside.sum()) / (hop * steps[0])
+        np.angle(next_x.sum()) / (hop * steps[0])
         - bent[0] * twice_um[0] / 2
         - twist * twice_um[1] / 2
     )
     found[0, 1] = (
-        np.angle(below.sum()) / (hop * steps[1])
+        np.angle(next_y.sum()) / (hop * steps[1])
         - bent[1] * twice_um[1] / 2
         - twist * twice_um[0] / 2
     )

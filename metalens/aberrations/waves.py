@@ -94,11 +94,11 @@ def plane_waves_of_source(
             behind the stop.
     """
     wave, d = lens.wavelength_um, lens.diameters
-    after, lit = (
+    after, light_rows = (
         lens.layers.after(lens.sensor_distance_um, wave),
         _lighting(lens, angle_rad, depth_um),
     )
-    low, high = _directions(lens, lit)
+    low, high = _directions(lens, light_rows)
     found = []
     for n, step, ends in zip(
         d.diameter_um.shape[::-1], d.steps_um, zip(low, high, strict=True), strict=True
@@ -116,7 +116,7 @@ def plane_waves_of_source(
             (count, spacing, round(centre / spacing) + np.arange(-reach, reach + 1))
         )
     (nx, dx, at_x), (ny, dy, at_y) = found
-    rows, power = _rows(lit, d.diameter_um.shape[0], nx, at_x % nx)
+    rows, power = _rows(light_rows, d.diameter_um.shape[0], nx, at_x % nx)
     amplitude = scipy.fft.fft(rows, ny, axis=0)[at_y % ny]
     p_x, p_y = at_x * dx, at_y * dy
     w = p_x**2 + p_y[:, None] ** 2
@@ -166,7 +166,9 @@ def _lighting(
     return light
 
 
-def _directions(lens: Lens, lit: Callable[[Array], Array]) -> tuple[Array, Array]:
+def _directions(
+    lens: Lens, light_rows: Callable[[Array], Array]
+) -> tuple[Array, Array]:
     """Least and largest n sin θ along x and y behind the pillars, (2,) each: slopes of
     the phase over short pieces of
     some rows; pieces where pillars do not go together, and those in the dark, are
@@ -174,11 +176,11 @@ def _directions(lens: Lens, lit: Callable[[Array], Array]) -> tuple[Array, Array
     d, hop = lens.diameters, 2 if lens.diameters.lattice.centred else 1
     ny, nx = d.diameter_um.shape
     rows = np.unique(np.linspace(0, max(ny - 1 - hop, 0), PIECES).astype(int))
-    near, far = lit(rows), lit(np.minimum(rows + hop, ny - 1))
+    near, far = light_rows(rows), light_rows(np.minimum(rows + hop, ny - 1))
     first = np.arange(0, nx, max(1, nx // PIECES))
     low, high = np.zeros(2), np.zeros(2)
-    beside = np.concatenate([near[:, hop:], np.zeros((len(rows), hop))], axis=1)
-    for axis, other in enumerate((beside, far)):
+    next_x = np.concatenate([near[:, hop:], np.zeros((len(rows), hop))], axis=1)
+    for axis, other in enumerate((next_x, far)):
         product = other * near.conj()
         total = np.add.reduceat(product, first, axis=1)
         power = np.add.reduceat(np.abs(product), first, axis=1)
@@ -195,7 +197,7 @@ def _directions(lens: Lens, lit: Callable[[Array], Array]) -> tuple[Array, Array
 
 
 def _rows(
-    lit: Callable[[Array], Array], ny: int, count: int, kept: Array
+    light_rows: Callable[[Array], Array], ny: int, count: int, kept: Array
 ) -> tuple[Array, float]:
     """(y, kept) transforms of the rows of the light behind the pillars, and Σ |light|²
     over the map.
@@ -203,7 +205,7 @@ def _rows(
     out, power = np.empty((ny, len(kept)), complex), 0.0
     for start in range(0, ny, ROWS):
         rows = np.arange(start, min(start + ROWS, ny))
-        light = lit(rows)
+        light = light_rows(rows)
         power += float((np.abs(light) ** 2).sum())
         out[rows] = scipy.fft.fft(light, count, axis=1)[:, kept]
     return out, power

@@ -57,10 +57,10 @@ def run(options: Options) -> int:
     how = ""
     if grid:
         how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"
-    told = {
+    values = {
         "file": options.output.name,
         "bytes": options.output.stat().st_size,
         "interpolation_error_rad": error,
     }
-    options.console.result(told, f"{options.output}: {told['bytes']:,} bytes{how}")
+    options.console.result(values, f"{options.output}: {values['bytes']:,} bytes{how}")
     return 0

@@ -35,7 +35,7 @@ TAKES = (
     *("lens", "output", "far_field", "report", "quiet", "json", "force"),
 )
 SAMPLES = 401
-PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are told
+PARTS = (0.5, 0.8, 0.95)  # of the light, whose cones about the axis are reported
 HEAD = ("from / deg", "share", "angle / deg", "azimuth / deg", "sine x", "sine y")
 
 

@@ -49,7 +49,7 @@ class Options(CommonOptions):
         samples: points along the pitch.
         tolerance: of the relative root-mean-square error of E over the points of a cut,
             up to 0.5; left out, 0.1 is
-            sought, and what is reached is told.
+            sought, and what is reached is reported.
     """
 
     config: tyro.conf.Positional[Path]
@@ -205,11 +205,11 @@ def run(options: Options) -> int:
             if failed and all(one.error <= UNKNOWN for one in found)
             else ""
         )
-        told = f"{above}{cure}fields at edges converge slowly"
+        text = f"{above}{cure}fields at edges converge slowly"
         if failed:
-            failures.append(told)
+            failures.append(text)
         else:
-            words.append(f"  {told}")
+            words.append(f"  {text}")
     title = f"{options.output}: field of {wanted.cell.described}, {NM * wanted.wavelength_um:g} nm"
     numbers = {"orders": found[0].orders, "tolerance": wanted.tolerance, "cuts": values}
     return options.console.judged(numbers, "\n".join([title, *words]), failures)

@@ -179,16 +179,16 @@ def folder_manifest(path: Path) -> dict[str, Any]:
     return {"folder": str(path), **found}
 
 
-def _folder_text(told: dict[str, Any]) -> str:
+def _folder_text(found: dict[str, Any]) -> str:
     lines = [
-        f"{told['folder']}: {len(told['files'])} files, each as it was written",
-        f"  metalens {told['command']}",
+        f"{found['folder']}: {len(found['files'])} files, each as it was written",
+        f"  metalens {found['command']}",
     ]
     lines += [
         f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…"
-        for name, e in told["files"].items()
+        for name, e in found["files"].items()
     ]
-    return "\n".join([*lines, _versions_line(told)])
+    return "\n".join([*lines, _versions_line(found)])
 
 
 def safetensors_head(path: Path) -> dict[str, Any]:

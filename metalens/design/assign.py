@@ -332,7 +332,7 @@ def assign_polarization_multiplexed(
         DomainError: a wavelength that the library lacks.
     """
     limits, cell = limits or Limits(), library.cell
-    at, alike = library.at(focuses[0].wavelength_um), phases[1] is None
+    at, isotropic = library.at(focuses[0].wavelength_um), phases[1] is None
     printed = library.usable[at] & _is_printable(library, limits)
     if not printed.any():
         x, y = library.x_um, library.y_um
@@ -345,7 +345,7 @@ def assign_polarization_multiplexed(
     jones = library.t[at, row, column]
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]])
     sizes = np.array([library.x_um[row], library.y_um[column]], np.float32)
-    table = make_candidates(t, np.ones(2), common_piston=alike)
+    table = make_candidates(t, np.ones(2), common_piston=isotropic)
     used = np.zeros(t.shape[1], int)
 
     def choose(block: Array) -> tuple[Array, list[tuple[Array, Array]]]:
@@ -384,8 +384,8 @@ def assign_polarization_multiplexed(
         quality[1],
         (errors[0], errors[1]),
         (leaked[0], leaked[1]),
-        _covered_share(t, alike=alike),
-        not alike,
+        _covered_share(t, isotropic=isotropic),
+        not isotropic,
         int(np.count_nonzero(used)),
     )
 
@@ -659,11 +659,11 @@ def _is_printable(library: AxesLibrary, limits: Limits) -> Array:
     return np.asarray(wide & (np.array(gaps)[row[:, None], column] >= least))
 
 
-def _covered_share(t: Array, *, alike: bool) -> float:
+def _covered_share(t: Array, *, isotropic: bool) -> float:
     """Share of the phases, or of pairs of them, that a pillar of (2, n) t gives."""
-    steps = 72 if alike else 36
+    steps = 72 if isotropic else 36
     turn = 2 * np.pi * np.arange(steps) / steps
-    x, y = (turn, turn) if alike else (v.ravel() for v in np.meshgrid(turn, turn))
+    x, y = (turn, turn) if isotropic else (v.ravel() for v in np.meshgrid(turn, turn))
     wanted = np.stack([x, y])
     chosen = t[:, make_candidates(t, np.ones(2)).nearest(wanted)]
     error = np.abs(np.angle(chosen * np.exp(-1j * wanted))).max(axis=0)

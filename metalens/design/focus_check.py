@@ -94,7 +94,7 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
         after.index[0] * lens.wavelength_um / aperture**2,
     )
     zones = radius**2 / (lens.wavelength_um * after.reduced_um)
-    phase, level = lens.phase_rad(), lens.transmission() * _lit(lens)
+    phase, level = lens.phase_rad(), lens.transmission() * _illumination(lens)
     case = _case(lens, resolution, 0.0)
     axial = axial and after.thickness_um[0] > depth / 2
     arm, rest = _ARM * resolution, np.zeros_like(_ARM)
@@ -143,7 +143,7 @@ def focus_figures(lens: Lens) -> FocusMetrics:
     return figures
 
 
-def _lit(lens: Lens) -> Any:
+def _illumination(lens: Lens) -> Any:
     """(y, x) share of the design source's light that passes the stop in front of every
     pillar; 1 without one.
     """

@@ -22,7 +22,10 @@ _APART = (
 SPREAD = 0.2
 # of the peak of a perfect lens, below which the place where they meet is dark: a vortex
 DARK = 1e-3
-PLACES, SEARCHED = 61, 121  # points across the lit part of a lens, and to look for it
+PLACES, SEARCHED = (
+    61,
+    121,
+)  # points across the illuminated part of a lens, and to look for it
 HALF_LIGHT = 0.5  # of the light at angle 0, below which the field behind a stop ends
 
 
@@ -104,7 +107,7 @@ def meeting_um(
 
     Rays go from (x, y) along (p, q, sqrt(1 - p² - q²)); the sum of squared distances
     from their middle is least at
-    z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v alike, all less
+    z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v likewise, all less
     their means. Behind films: their middle on the sensor. None where they
     spread there as widely as on the lens (:data:`SPREAD`), or never meet in front of
     the lens.
@@ -189,8 +192,8 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
 
 
 def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
-    """The largest of light from four sides, by turns of a stop beside the axis; of one
-    where all are alike.
+    """The largest of light from four sides, by turns of a stop off the axis; of one
+    where all are equal.
     """
     stop, found = focus.layers.stop, []
     for _ in range(4 if stop is not None and not stop.centred else 1):
@@ -206,8 +209,11 @@ def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> flo
 
 
 def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
-    x, y, lit_um2 = _lit(focus, radius_um, math.tan(angle_rad))
-    if lit_um2 <= 0 or lit_um2 < HALF_LIGHT * _lit(focus, radius_um, 0.0)[2]:
+    x, y, lit_um2 = _illuminated_places(focus, radius_um, math.tan(angle_rad))
+    if (
+        lit_um2 <= 0
+        or lit_um2 < HALF_LIGHT * _illuminated_places(focus, radius_um, 0.0)[2]
+    ):
         return math.inf
     path = hyperbolic_phase(x, y, focus)
     for one in focus.paths_from(x, y, math.tan(angle_rad)):
@@ -218,7 +224,9 @@ def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
     return float((residual**2).mean())
 
 
-def _lit(focus: Focus, radius_um: float, tangent: float) -> tuple[Array, Array, float]:
+def _illuminated_places(
+    focus: Focus, radius_um: float, tangent: float
+) -> tuple[Array, Array, float]:
     """Places (x,) and (y,) of the lens that an angle's light falls on, ``PLACES``
     across, and their area in um².
     """

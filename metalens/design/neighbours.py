@@ -44,29 +44,31 @@ def estimate_neighbour_coupling(
             lattice.
     """
     cover = materials.index(lens.cell.cover, lens.wavelength_um).real
-    aside = (
+    diagonal_counts = (
         sorted({2 * max(1, round(count / math.sqrt(2))) for count in counts})
         if diagonal
         else []
     )
-    rows = [(count, False) for count in counts] + [(count, True) for count in aside]
+    rows = [(count, False) for count in counts] + [
+        (count, True) for count in diagonal_counts
+    ]
     sines = [
         lens.wavelength_um / (n * block_of(lens.cell.pitch_um, turned).spacing_um)
         for n, turned in rows
     ]
-    told = [
+    propagating = [
         (row, sine)
         for row, sine in zip(rows, sines, strict=True)
         if sine < STEEPEST * cover
     ]
     found = [
-        [_mean(lens, *row, reach) for row, _ in told]
+        [_mean(lens, *row, reach) for row, _ in propagating]
         for reach in (harmonics, harmonics - 1)
     ]
     fine, coarse = ([factor for factor, _ in one] for one in found)
     return NeighbourRows(
-        np.array([sine for _, sine in told]),
-        np.array([turned for (_, turned), _ in told], bool),
+        np.array([sine for _, sine in propagating]),
+        np.array([turned for (_, turned), _ in propagating], bool),
         np.array(fine).reshape(-1, 2).T,
         np.array(coarse).reshape(-1, 2).T,
         np.array([lost for _, lost in found[0]]),

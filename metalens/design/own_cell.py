@@ -1,4 +1,4 @@
-"""What a lens's own pillars leave out of its PSF: unlike neighbours and the angle of
+"""What a lens's own pillars leave out of its PSF: non-identical neighbours and the angle of
 the light, solved for its cell.
 """
 
@@ -21,7 +21,7 @@ FEWEST, MOST = (
     2,
     12,
 )  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
-# (with two, light to both sides is told apart by rows whose phases begin elsewhere)
+# (with two, light to both sides is separated by rows whose phases begin elsewhere)
 DIAMETERS = 5
 TOLERANCE = 1e-2  # of t
 

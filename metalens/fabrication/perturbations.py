@@ -97,13 +97,13 @@ class Perturbation:
     meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma:
         prior knowledge without metrology.
     low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name.
-    free: fitted unless told otherwise. drawn: how the process spreads it, where it
-        does. plausible: standard deviation that is reckoned with where it is neither
+    free: fitted unless stated otherwise. drawn: how the process spreads it, where it
+        does. plausible: standard deviation that is assumed where it is neither
         fitted nor stated; sigma where 0. effect: as a cause in words, where it is
         looked for while it is not fitted; probe: so much of it is tried then.
     extra: fitted too where the usual ones do not explain the frames. reversible: near
-        focus the images of a lens with the opposite sign look alike. measured_by: what
-        settles it beside the frames.
+        focus the images of a lens with the opposite sign look equal. measured_by: what
+        measures it besides the frames.
     """
 
     name: str
@@ -434,7 +434,7 @@ def wavelength_scale(wavelength_um: float) -> float:
     wavelength / 0.85 um, 1 at least.
 
     Pillars, their height and what their tools are asked to hold grow with the
-    wavelength, so that errors of one kind turn the phase alike; lenses of shorter waves
+    wavelength, so that errors of one kind turn the phase equally; lenses of shorter waves
     come from the same writers and etchers, with their nanometres.
 
     Args:

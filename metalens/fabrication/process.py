@@ -86,7 +86,7 @@ class State:
             np.polynomial.polynomial.polyval2d(u, v, self._polynomial(WavefrontError))
         )
 
-    def bends(self) -> bool:
+    def has_wavefront_error(self) -> bool:
         """Whether the wave front has any phase of its own."""
         return bool(self._of(WavefrontError).any())
 
@@ -143,9 +143,9 @@ class Spread(_Entries):  # type: ignore[misc]
         Raises:
             ProcessError: naming the entry.
         """
-        apart = {row.drawn.name: row.name for row in PERTURBATIONS if row.drawn}
+        row_names = {row.drawn.name: row.name for row in PERTURBATIONS if row.drawn}
         for name, value in self.stated.items():
-            if value and apart[name] in inapplicable_names(cell):
+            if value and row_names[name] in inapplicable_names(cell):
                 raise ProcessError(
                     f"spread.{name} = {value:g}: {cell.described} has none; need 0"
                 )
@@ -225,7 +225,7 @@ class Printed:
 
 
 def of_process(path: str | Path) -> Printed:
-    """These entries of a PROCESS.toml; CSV files that it names lie beside it. The rest
+    """These entries of a PROCESS.toml; CSV files that it names lie in its folder. The rest
     is left to ``layout``.
 
     Args:

@@ -39,7 +39,7 @@ class Solved:
     powers: (causes, orders, n) of t in powers of the amount of each pillar-response
         error (um, rad, 1), in the table's order; the first is the designed t, the
         others are 0 for a cause that was not solved. Between the amounts that were
-        solved a series misses resonances that move by: up to 0.03 of t beside them.
+        solved a series misses resonances that move by: up to 0.03 of t near them.
     """
 
     wavelength_um: float
@@ -68,7 +68,7 @@ class Sensitivity:
         on along their tangents.
     solved: t itself under large changes, where a solver was asked; it stands for the
         proxy then.
-    edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size,
+    edges: (1, degree + 1) likewise of d ln t by a bias of all edges less that by the size,
         per um: a proxy knows pillars that keep their form as they grow, which a biased
         rectangle does not; None for those that do.
     pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
@@ -395,7 +395,7 @@ def perturbed_transmission(
 
     Args:
         answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
-            bias_um: what of the diameters is bias, of all edges alike, and no size of
+            bias_um: what of the diameters is bias, of all edges equally, and no size of
             the design (:func:`bias_ratio`).
         proxy: phase and |T| over the diameter.
         d_um: (*shape) diameters, um.

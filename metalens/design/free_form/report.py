@@ -1,4 +1,4 @@
-"""A free-form design beside simple lenses tuned for the same task, as numbers and as a
+"""A free-form design and simple lenses tuned for the same task, as numbers and as a
 picture.
 """
 

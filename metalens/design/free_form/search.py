@@ -67,7 +67,7 @@ class Objective(Protocol):
 
 class AxialObjective:
     """Minus the log of I(z) at random depths, field directions and positions of the
-    pixels; alike for every angle.
+    pixels; equally for every angle.
     """
 
     def __init__(self, pupil: Pupil, settings: ResolvedFisherSettings) -> None:

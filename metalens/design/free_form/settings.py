@@ -28,7 +28,7 @@ class FisherSettings:
         distance to as many on the other.
     angles_deg: field angles that the lens is made for, each in every direction; the
     energy is held at all of them, and
-        the information of each counts alike.
+        the information of each counts equally.
     pixel_um: pixels that the information is read with: the sensor's pitch, or 2 or 3
     times it for 2 x 2 or 3 x 3
         binning; left out, 0.88 wavelength / NA.

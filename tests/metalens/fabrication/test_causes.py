@@ -40,7 +40,7 @@ def test_biases_over_the_lens_by_hand():
     want = 10 - 4 * U + 7 * V + 3 * bow + 2 * (U**2 - V**2) - 5 * 2 * U * V
     assert made.bias_um(U, V) == pytest.approx(want * 1e-3, rel=1e-12)
     assert made["bias_y_nm"] == 7.0
-    assert not made.bends()
+    assert not made.has_wavefront_error()
     assert not made.phase_rad(U, V).any()
     assert perturbations.derivative_maps(CDError, U, V)[1] == pytest.approx(
         1e-3 * U, rel=1e-12
@@ -79,7 +79,7 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
     assert made.phase_rad(U, V) == pytest.approx(
         0.3 * want[3] - 0.2 * want[4], rel=1e-9
     )
-    assert made.bends()
+    assert made.has_wavefront_error()
 
 
 def test_answers_travel_in_micrometres_radians_and_one():
