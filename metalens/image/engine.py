@@ -2,9 +2,8 @@
 
 import contextlib
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -14,14 +13,13 @@ from metalens.core.errors import SceneError
 from metalens.image import left_out
 from metalens.image.forming import Imager, build_imager
 from metalens.image.low_rank import PsfField, frame_maps, plane_images, psf_nodes
-from metalens.image.plan import Grid, Plan, depth_nodes, plan_nodes, sum_over_spectrum
-from metalens.image.points import SPARE, Optics, Window, sampling
+from metalens.image.plan import Grid, Plan, plan_nodes, sum_over_spectrum
+from metalens.image.points import Optics, sampling
 from metalens.image.scene import Frames
 from metalens.image.splines import spline_matrix
 from metalens.image.stray import stray_of
 from metalens.image.texture import CONTRAST, scene_error
-from metalens.image.through import aperture_transmission
-from metalens.image.waves import PillarWave, SmoothWave, Wave, wave_of
+from metalens.image.waves import SmoothWave, Wave, wave_of
 from metalens.lens import Lens
 from metalens.optics import Layers
 from metalens.psf import Polarisation, Source, SpectralNodes, blur_um
@@ -29,15 +27,7 @@ from metalens.psf import spectrum as spectra
 
 # pixels of the frame at which the PSFs that are used are compared with true ones
 HELD_OUT = 16
-NEGLECTED = (
-    5  # of them at which the transform and the components of the field are judged
-)
-ALL = 2  # of them at which pillars taken together are
-# field points along an axis that tell how deep an image lies in the shadow of a stop
-SHADED = 6
-# by how much an image may be dimmer than its frame and still be prepared to its own
-# light: what a shadow's ripples leave out is more than the rest there
-DEEPEST = 8.0
+FEW = 5  # of them at which the transform and the components of the field are judged
 
 
 def imager(
@@ -103,21 +93,25 @@ def imager(
         isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
     )
     round_ = round_ and (layers.stop is None or layers.stop.centred)
-    shaded = _shaded(optics, scene_grid, focus.wavelength_um, middle)
     given = optics, scene_grid, source, middle
-    found = _planned(given, tolerance, shaded, folds=round_, polarisation=polarisation)
-    stack, energy = node_psfs(optics, found.plan, device)
-    about = scene_grid, found.plan, stack, energy
+
+    def build(within: float) -> Imager:
+        about = {"folds": round_, "polarisation": polarisation}
+        plan = plan_nodes(*given, tolerance=within, **about)
+        stack, energy = node_psfs(optics, plan, device)
+        with torch.no_grad():
+            return build_imager(scene_grid, plan, stack, energy, tolerance=within)
+
+    made = build(tolerance)
+    if layers.stop is not None and (dimmer := image_dimming(made)) > 1:
+        # an image in the shadow of the stop is prepared to its own light, where enough
+        # nodes for that are allowed
+        with contextlib.suppress(SceneError):
+            made = build(tolerance / min(dimmer, 8))
     with torch.no_grad():
-        made = build_imager(*about, tolerance=found.tolerance)
-        parts = {**kernel_errors(made), **_held_out(optics, made)}
-    if isinstance(wave, PillarWave):
-        parts["unknown"] = spectra.share_outside_library(
-            source, wave.lens.proxy.wavelengths_um
-        )
-    stray = stray_of(
-        optics, scene_grid, float(1 / (1 / found.plan.depths_um).mean()), middle
-    )
+        parts = _error_parts(optics, made)
+    depth = float(1 / (1 / made.plan.depths_um).mean())
+    stray = stray_of(optics, scene_grid, depth, middle)
     return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
 
 
@@ -131,56 +125,6 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
         raise SceneError(
             f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}"
         )
-
-
-class _Planned(NamedTuple):
-    """A plan, and the tolerance that it keeps over the frame's light."""
-
-    plan: Plan
-    tolerance: float
-
-
-def _planned(
-    given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any
-) -> _Planned:
-    """To the light of an image that is so many times dimmer than the frame, or where no
-    number of nodes meets that to
-    the frame's."""
-    if shaded > 1 and tolerance < 1:
-        with contextlib.suppress(SceneError):
-            return _Planned(
-                plan_nodes(*given, tolerance=tolerance / shaded, **about),
-                tolerance / shaded,
-            )
-    return _Planned(plan_nodes(*given, tolerance=tolerance, **about), tolerance)
-
-
-def _shaded(
-    optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]
-) -> float:
-    """:func:`_dimmer` of the middle depth by a few field points, before there is a
-    plan; 1 without a stop.
-    """
-    if optics.layers.stop is None:
-        return 1.0
-    y, x = (
-        m + h * torch.linspace(-1, 1, SHADED, dtype=torch.float64)
-        for m, h in zip(middle_um[::-1], grid.half_um, strict=True)
-    )
-    depth = 1 / (1 / depth_nodes(grid, 2)).mean(0, keepdim=True)
-    window = Window(grid.window, grid.step_um, period=2 * SPARE)
-    coarse = Plan(
-        y,
-        x,
-        depth,
-        SpectralNodes(np.array([wavelength_um]), np.ones(1), 0.0),
-        window,
-        folds=False,
-    )
-    with torch.no_grad():
-        stack, energy = node_psfs(optics, coarse)
-    field = PsfField(stack.nan_to_num(), energy, coarse.depths_um)
-    return min(_dimmer(field, grid), DEEPEST)
 
 
 def node_psfs(
@@ -254,44 +198,6 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     return out
 
 
-def kernel_errors(made: Imager) -> dict[str, float]:
-    """Errors of the kernels beside the interpolated PSFs of the nodes.
-
-    Of a textured scene, at places drawn at random, and of planes that are evenly lit,
-    root mean square at the worst depth; depths are the nodes and those half-way.
-
-    Args:
-        made: what was designed or computed.
-    """
-    near, far = made.light.vergence
-    count = 2 * len(made.plan.depths_um) - 1
-    depths = 1 / torch.linspace(near, far, count, dtype=torch.float64)
-    pixels = _pixels(made, HELD_OUT)
-    used = psfs_used(made, pixels, depths)
-    kernels = scene_error(used, psfs_between(made, pixels, depths))
-    field = made.field
-    deep = spline_matrix(torch.linspace(0, 1, count), len(made.plan.depths_um))
-    light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
-    even = PsfField(light, torch.ones_like(light[..., 0, 0]), depths)
-    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
-    wanted = crop_image(plane_images(even, maps), made.grid)
-    one = torch.ones(1, *made.grid.frame).to(field.psf)
-    found = [
-        crop_image(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
-        for depth in depths.tolist()
-    ]
-    wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
-    level = wanted.square().mean((1, 2)).max().clamp_min(1e-30)
-    return {"kernels": kernels, "planes": float(torch.sqrt(wrong / level))}
-
-
-def _pixels(made: Imager, count: int) -> Tensor:
-    """(count, [row, column]) samples of the frame, drawn at random."""
-    draw = np.random.default_rng(7)
-    place = np.floor(draw.random((count, 2)) * made.grid.frame)
-    return torch.from_numpy(place).long()
-
-
 def textured_frames(grid: Grid) -> Frames:
     """One frame of two sheets over all depths, of mean 1 with a 1/f texture of standard
     deviation 0.3.
@@ -320,112 +226,118 @@ def textured_frames(grid: Grid) -> Frames:
     return Frames((cover * texture)[None], cover[None], depth[None])
 
 
-def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
-    """Errors at places, depths and wavelengths that no node holds: interpolation of
-    PSFs and of their light,
-    transform, components of the field that are left out, pillars taken together; light
-    left outside.
+def _error_parts(optics: Optics, made: Imager) -> dict[str, float]:
+    """Errors by cause, at places, depths and wavelengths that no node holds.
 
     Those that count by the light of a place are over the whole frame's light: more of
     an image that is dimmer than it.
     """
-    plan = made.plan
-    pixels = _pixels(made, HELD_OUT)
+    plan, draw = made.plan, np.random.default_rng(7)
+    pixels = np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame).astype(int)
     rows, columns = (
-        torch.linspace(float(nodes[0]), float(nodes[-1]), n, dtype=torch.float64)
+        np.linspace(float(nodes[0]), float(nodes[-1]), n)
         for n, nodes in zip(made.grid.frame, (plan.y_um, plan.x_um), strict=True)
     )
-    at = torch.stack([columns[pixels[:, 1]], rows[pixels[:, 0]]], -1)
-    ends = 1 / plan.depths_um[[0, -1]]
-    depths = 1 / (
-        ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64)
-    )
+    at = torch.from_numpy(np.stack([columns[pixels[:, 1]], rows[pixels[:, 0]]], -1))
+    near, far = 1 / plan.depths_um[[0, -1]]
+    depths = 1 / (near + (far - near) * torch.tensor([0, 0.13, 0.58, 1]).double())
     true = sum_over_spectrum(optics, at, depths, plan.waves, plan.window).detach()
-    wave = float(plan.waves.wavelengths_um[0])
-    whole = aperture_transmission(
-        optics, at, depths_um=depths, wavelength_um=wave, window=plan.window
-    )
-    light = true.sum((-1, -2))
-    level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[
-        ..., None, None
-    ]
-    got = psfs_between(made, pixels, depths).cpu()
-    dimmer = _dimmer(made.field, made.grid)
-    nodes = scene_error(got, (true * level).to(got)) * dimmer
-    few = at[:NEGLECTED], depths
+    middle_wave = float(plan.waves.wavelengths_um.mean())
+    level = _cosine4(optics, at, depths, middle_wave)[..., None, None]
+    used = psfs_used(made, torch.from_numpy(pixels), depths).cpu()
+    dimmer, light = image_dimming(made), true.sum((-1, -2))
+    few = at[:FEW], depths[1:-1]
     # of the brightest of few places in the image
-    share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
-    seen = left_out.JudgedPsfs(optics, plan.waves, plan.window, few)
-    transform = left_out.transform_error(seen) * share
-    edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
-    found = {
-        "nodes": nodes,
+    share = float(light[:FEW].max() / (light**2).mean().sqrt()) * dimmer
+    judged = left_out.JudgedPsfs(optics, plan.waves, plan.window, few)
+    wave = float(plan.waves.wavelengths_um[0])
+    pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
+    parts = {
+        "psfs": scene_error(used, (true * level).to(used)) * dimmer,
+        "planes": _plane_error(made),
         "spectrum": max(plan.waves.error, 0.0),
-        "transform": transform,
+        "transform": left_out.transform_error(judged) * share,
+        "folded": left_out.folding_error(judged) * share,
+        "polarisation": left_out.polarisation_error(judged) * share,
+        "pillars": left_out.gathering_error(*pillars) * dimmer,
+        "edge": sampling(optics, plan.window, wave).beyond / 2,
     }
-    found["folded"] = left_out.folding_error(seen) * share
-    found["polarisation"] = left_out.polarisation_error(seen) * share
-    found["pillars"] = (
-        left_out.gathering_error(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
-    )
     if optics.layers.stop is not None:
-        shown = [
-            part[:NEGLECTED]
-            for part in (
-                true / light[..., None, None],
-                light / whole,
-                light / light.amax(0),
-            )
-        ]
-        found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um) * dimmer
-    return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
+        seen = true[:FEW, 1:-1], light[:FEW, 1:-1], light.amax(0)[1:-1]
+        ripples = _shadow_error(optics, wave, few, seen, plan.window.step_um)
+        parts["stop"] = ripples * dimmer
+    return parts
 
 
-def _dimmer(field: PsfField, grid: Grid) -> float:
+def _plane_error(made: Imager) -> float:
+    """Root mean square error of evenly lit planes beside those of the nodes' PSFs, at
+    the worst of the depth nodes and those half-way.
+    """
+    near, far = made.light.vergence
+    count = 2 * len(made.plan.depths_um) - 1
+    depths = 1 / torch.linspace(near, far, count, dtype=torch.float64)
+    field = made.field
+    deep = spline_matrix(torch.linspace(0, 1, count), len(made.plan.depths_um))
+    light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
+    even = PsfField(light, torch.ones_like(light[..., 0, 0]), depths)
+    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
+    wanted = crop_image(plane_images(even, maps), made.grid)
+    one = torch.ones(1, *made.grid.frame).to(field.psf)
+    found = [
+        crop_image(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
+        for depth in depths.tolist()
+    ]
+    wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
+    level = wanted.square().mean((1, 2)).max().clamp_min(1e-30)
+    return float(torch.sqrt(wrong / level))
+
+
+def image_dimming(made: Imager) -> float:
     """By how much an image of even light is dimmer than the whole frame's, 1 at least:
     margins may be in the light where an image lies in the shadow of a stop.
+
+    Args:
+        made: imager with its nodes.
     """
-    maps = frame_maps(grid.frame, psf_nodes(field), field.psf)
-    middle = slice(field.psf.shape[2] // 2, field.psf.shape[2] // 2 + 1)
-    some = PsfField(
-        field.psf[:, :, middle].detach(),
-        field.illumination[:, :, middle].detach(),
-        field.depths_um[middle],
-    )
-    plane = plane_images(some, maps)[0]
+    field, middle = made.field, len(made.plan.depths_um) // 2
+    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
+    light = field.light[:, :, middle : middle + 1]
+    even = PsfField(light, torch.ones_like(light[..., 0, 0]), field.depths_um)
+    plane = plane_images(even, maps)[0]
     whole, image = (
-        float(part.square().mean().sqrt()) for part in (plane, crop_image(plane, grid))
+        float(part.square().mean().sqrt())
+        for part in (plane, crop_image(plane, made.grid))
     )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
 
-def _ripples(
+def _shadow_error(
     optics: Optics,
     wavelength_um: float,
-    seen: tuple[Tensor, Tensor],
-    light: Sequence[Tensor],
+    places: tuple[Tensor, Tensor],
+    seen: tuple[Tensor, ...],
     step_um: float,
 ) -> float:
-    """Error of the stop's shadow, the worst of some places and depths; light: their
-    PSFs, the share of their light that
-    these hold, and their light over that of the brightest place."""
-    places, depths_um = seen
-    held = light[1].cpu().numpy().clip(1e-6, 1)
-    blurs_um = blur_um(light[0].cpu().numpy(), step_um, held)
+    """Error of the stop's shadow, the worst of some places and depths.
+
+    Args:
+        places: field points and depths. seen: their PSFs, the share of the light on the
+            aperture that these hold, and that of the brightest place of each depth.
+    """
+    at, depths_um = places
+    psfs, held, brightest = (part.cpu().numpy() for part in seen)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    found = []
-    for place, row, parts, lit in zip(
-        (places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=True
-    ):
-        rads = row / math.hypot(1, *place)
-        for z, rad, part, bright in zip(
-            depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True
-        ):
-            error = optics.layers.shadow_error(
-                (place[0], place[1]), z, wavelength_um, rad, part
-            )
-            found.append(float(error * bright))
-    return max(found)
+    share = held.clip(1e-6, 1)
+    unit = psfs / held.clip(1e-6)[..., None, None]
+    rads = blur_um(unit, step_um, share) / reduced
+    errors = []
+    for i, (x, y) in enumerate((at / reduced).tolist()):
+        for k, depth in enumerate(depths_um.tolist()):
+            rad = float(rads[i, k]) / math.hypot(1, x, y)
+            about = (x, y), depth, wavelength_um, rad, float(share[i, k])
+            error = optics.layers.shadow_error(*about)
+            errors.append(error * held[i, k] / brightest[k])
+    return float(max(errors))
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
@@ -444,26 +356,6 @@ def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
         weights = optics.light.interpolate(deep, where)
         out.append(torch.einsum("rn,rhw->nhw", weights, optics.light.kernels))
     return torch.stack(out, 1)
-
-
-def psfs_between(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) light that the splines through the nodes' PSFs give there.
-
-    Args:
-        optics: lens, light and distances at the nodes.
-        pixels: places of the samples.
-        depths_um: source depths from the lens, um.
-    """
-    field = optics.field
-    maps = frame_maps(optics.grid.frame, psf_nodes(field), field.psf)
-    rows, columns = (
-        m[p.to(m.device)] for m, p in zip(maps, pixels.unbind(1), strict=True)
-    )
-    near, far = optics.light.vergence
-    unit = (near - 1 / depths_um) / max(near - far, 1e-30)
-    deep = spline_matrix(unit.clamp(0, 1), field.psf.shape[2]).to(field.psf)
-    light = torch.einsum("cz,abzhw->abchw", deep, field.light)
-    return torch.einsum("na,nb,abchw->nchw", rows, columns, light)
 
 
 def crop_image(whole: Tensor, grid: Grid) -> Tensor:

@@ -28,7 +28,6 @@ FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near o
 # Kernels of coverage, of those of light and at least: it matters at the borders of
 # sheets alone.
 COVER_SHARE, COVER_FEWEST = 0.3, 12
-LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,14 +41,12 @@ class Imager:
     basis: kernels of the PSFs.
     light: what sources give, for every sample of the frame. cover: what coverage does,
         of PSFs of sum 1.
-    parts: share of the error by cause: kernels (low rank), nodes (interpolation between
-        field points and depths), planes (evenly lit, at the depth nodes), spectrum,
-        transform, folded (light from beyond the windows that the transform shows in
-        them), polarisation (components of the field that are left out), edge (of light
-        that the rim bends beyond the window), pillars (taken together a few micrometres
-        at a time; 0 of a smooth phase), stop (of its shadow). In addition shares of
-        light: ``outside``, of what goes through the lens, what windows leave out; and,
-        of pillars, ``unknown``: of the spectrum, what lies beyond their library.
+    parts: share of the error by cause: psfs (low rank, and interpolation between field
+        points and depths), planes (evenly lit), spectrum, transform, folded (light from
+        beyond the windows that the transform shows in them), polarisation (components
+        of the field that are left out), edge (of light that the rim bends beyond the
+        window), pillars (taken together a few micrometres at a time; 0 of a smooth
+        phase), stop (of its shadow). Of a uniform imager kernels (low rank) alone.
     stray: light of other diffraction orders, None where the lens has no pillars.
     asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are
         wanted; None for all.
@@ -71,9 +68,7 @@ class Imager:
         """Relative L2 error to expect of the image of a scene of mean 1 with a 1/f
         texture of standard deviation 0.3.
         """
-        return math.hypot(
-            *(value for name, value in self.parts.items() if name not in LIGHT)
-        )
+        return math.hypot(*self.parts.values())
 
     @property
     def field(self) -> PsfField:
@@ -86,11 +81,10 @@ class Imager:
         """
         if self.error <= tolerance:
             return ""
-        errors = {k: v for k, v in self.parts.items() if k not in LIGHT}
-        cause = max(errors, key=lambda name: errors[name])
+        cause = max(self.parts, key=lambda name: self.parts[name])
         return (
             f"the image's error {self.error:.2g} is above the {tolerance:g} asked for "
-            f"({cause}: {errors[cause]:.2g})"
+            f"({cause}: {self.parts[cause]:.2g})"
         )
 
     def __call__(self, frames: Frames) -> Tensor:

@@ -212,13 +212,6 @@ class PillarWave:
             )[0]
         )
 
-    def transmittance(self, wavelength_um: float, angle_rad: float) -> float:
-        """Mean |t|² of the pillars."""
-        return float(
-            (self.answer(wavelength_um, angle_rad).abs() ** 2).sum()
-            / (self.diameter_um > 0).sum()
-        )
-
     def _among(self, t: Tensor) -> Tensor:
         """With the factor of unlike neighbours where the lens holds their rows."""
         if self.lens.neighbours is None:
