@@ -49,42 +49,13 @@ def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
         out[:, y, :start] = 0
         out[:, y, stop:] = 0
         for d in range(depths):
-            if few == 5:  # of many depths: one pass
-                m0, m1, m2, m3, m4 = (
-                    mix[d, 0],
-                    mix[d, 1],
-                    mix[d, 2],
-                    mix[d, 3],
-                    mix[d, 4],
-                )
+            line[start:stop] = turns[y, start:stop]
+            for v in range(few):
                 for x in range(start, stop):
-                    part = (
-                        m0 * paths[0, y, x] + m1 * paths[1, y, x] + m2 * paths[2, y, x]
-                    )
-                    line[x] = (
-                        turns[y, x] + part + m3 * paths[3, y, x] + m4 * paths[4, y, x]
-                    )
-            else:
-                line[start:stop] = turns[y, start:stop]
-                for v in range(few):
-                    for x in range(start, stop):
-                        line[x] += mix[d, v] * paths[v, y, x]
+                    line[x] += mix[d, v] * paths[v, y, x]
             for x in range(start, stop):
                 c, s = sincos_turns32(line[x] - np.rint(line[x]))
                 out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s
-
-
-def power(field: Array) -> Array:
-    """|U|² of complex64."""
-    out = np.empty(field.shape, np.float32)
-    _power(np.ascontiguousarray(field).reshape(-1), out.reshape(-1))
-    return out
-
-
-@numba.njit(cache=True, fastmath=True, nogil=True)
-def _power(field, out):  # type: ignore[no-untyped-def]
-    for i in range(len(out)):
-        out[i] = field[i].real * field[i].real + field[i].imag * field[i].imag
 
 
 def cells(

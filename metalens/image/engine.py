@@ -12,7 +12,7 @@ from torch import Tensor
 from metalens.core.errors import SceneError
 from metalens.image import left_out
 from metalens.image.forming import Imager, build_imager
-from metalens.image.low_rank import PsfField, frame_maps, plane_images, psf_nodes
+from metalens.image.low_rank import frame_maps, plane_images
 from metalens.image.plan import Grid, Plan, plan_nodes, sum_over_spectrum
 from metalens.image.points import Optics, sampling
 from metalens.image.scene import Frames
@@ -141,10 +141,9 @@ def node_psfs(
     if plan.folds:
         light = _folded(optics, plan, device)
     else:
-        y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
-        at = torch.stack([x.flatten(), y.flatten()], -1).to(device)
+        at = plan.places_um.to(device)
         light = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
-        light = light.reshape(*x.shape, *light.shape[1:])
+        light = light.unflatten(0, (len(plan.y_um), len(plan.x_um)))
     return normalise_psfs(light, optics, plan)
 
 
@@ -157,9 +156,10 @@ def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, T
         plan: field nodes, depths and wavelengths.
     """
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
-    y, x = torch.meshgrid(plan.y_um.to(plan.x_um), plan.x_um, indexing="ij")
-    cosine4 = _cosine4(optics, torch.stack([x, y], -1), plan.depths_um, wave)
-    return light / total[..., None, None], total * cosine4.to(total)
+    cosine4 = _cosine4(optics, plan.places_um, plan.depths_um, wave)
+    return light / total[..., None, None], total * cosine4.reshape(total.shape).to(
+        total
+    )
 
 
 def _cosine4(
@@ -279,9 +279,8 @@ def _plane_error(made: Imager) -> float:
     field = made.field
     deep = spline_matrix(torch.linspace(0, 1, count), len(made.plan.depths_um))
     light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
-    even = PsfField(light, torch.ones_like(light[..., 0, 0]), depths)
-    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
-    wanted = crop_image(plane_images(even, maps), made.grid)
+    maps = frame_maps(made.grid.frame, light.shape[:2], light)
+    wanted = crop_image(plane_images(light, maps), made.grid)
     one = torch.ones(1, *made.grid.frame).to(field.psf)
     found = [
         crop_image(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
@@ -299,11 +298,10 @@ def image_dimming(made: Imager) -> float:
     Args:
         made: imager with its nodes.
     """
-    field, middle = made.field, len(made.plan.depths_um) // 2
-    maps = frame_maps(made.grid.frame, psf_nodes(field), field.psf)
-    light = field.light[:, :, middle : middle + 1]
-    even = PsfField(light, torch.ones_like(light[..., 0, 0]), field.depths_um)
-    plane = plane_images(even, maps)[0]
+    middle = len(made.plan.depths_um) // 2
+    light = made.field.light[:, :, middle : middle + 1]
+    maps = frame_maps(made.grid.frame, light.shape[:2], light)
+    plane = plane_images(light, maps)[0]
     whole, image = (
         float(part.square().mean().sqrt())
         for part in (plane, crop_image(plane, made.grid))

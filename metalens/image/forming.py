@@ -18,7 +18,7 @@ from metalens.image.low_rank import (
     low_rank_psfs,
     principal_kernels,
 )
-from metalens.image.plan import SHARES, Grid, Plan
+from metalens.image.plan import KERNELS, Grid, Plan
 from metalens.image.points import Window
 from metalens.image.scene import Frames
 from metalens.image.slopes import by_nodes
@@ -195,7 +195,7 @@ def build_imager(
         tolerance: of the whole image; kernels take their share of it.
     """
     found = PsfField(stack, energy, plan.depths_um)
-    most = tolerance * SHARES["kernels"]
+    most = tolerance * KERNELS
     basis = principal_kernels(found, grid.frame, tolerance=most)
     return _assembled(grid, plan, found, basis, {})
 

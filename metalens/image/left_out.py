@@ -17,10 +17,8 @@ from torch import Tensor
 from metalens import propagate
 from metalens.image.points import Optics, Window, psfs, sampling
 from metalens.image.texture import texture_error, weigh_by_light
-from metalens.image.waves import Pillars
+from metalens.image.waves import PillarWave
 from metalens.psf import Polarisation, SpectralNodes, psf_stack
-
-MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +162,7 @@ def gathering_error(
         wavelength_um: vacuum wavelength, um.
     """
     wave = optics.wave
-    if not isinstance(wave, Pillars):
+    if not isinstance(wave, PillarWave):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
     # points of a sample, half of Nyquist's step apart: triangles of a sample are then
@@ -172,8 +170,9 @@ def gathering_error(
     # Nyquist's step it is 5e-3 too much; what scatters to the rim of a window is more,
     # so that no window is cut for it.
     finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
-    finer *= 2 if (window.samples + 2) * 2 * finer <= MOST else 1
-    count = min(window.samples, max(MOST // finer - 2, 3) | 1)
+    most = 256  # along an axis; of a wider window the middle is looked at
+    finer *= 2 if (window.samples + 2) * 2 * finer <= most else 1
+    count = min(window.samples, max(most // finer - 2, 3) | 1)
     share, edge = _triangles(count, finer), (window.samples - count) // 2
     few = slice(edge, edge + count)
     errors, lights = [], []
@@ -215,7 +214,7 @@ def _triangles(count: int, finer: int) -> Tensor:
 
 def _of_pillars(
     optics: Optics,
-    wave: Pillars,
+    wave: PillarWave,
     wavelength_um: float,
     at: tuple[Tensor, Tensor],
     sampled: tuple[float, int, int],

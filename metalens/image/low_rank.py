@@ -14,12 +14,8 @@ from metalens.image.texture import scene_spectrum, texture_spectrum
 
 CODES = 4096  # depths of a shift-invariant table, at equal steps of 1/z
 SAMPLED = 1024  # node PSFs, drawn at random, from which the kernels are made
-MOST_KERNELS = 320
 FEWEST = 24  # kernels: single points hold more fine detail than a textured scene
-ROUNDS = 2  # of the correction of planes: each squares what the last left of it
 FAINT = 0.01  # of the brightest sample: darker ones of a plane are not corrected
-EVEN = 0.01  # rms error of an evenly lit plane that kernels may leave to correct
-SLOPE = 0.02  # relative error of an image's derivative by shift-invariant PSFs
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,17 +80,17 @@ def principal_kernels(
         field: sampled field or PSFs.
         frame: (y, x) samples over which the nodes reach.
         tolerance: relative L2 error of the image of the scene, at the worst depth; a
-            plane errs by no more, and by :data:`EVEN` at most.
+            plane errs by no more, and by 0.01 at most.
     """
     psf = field.psf.detach().flatten(0, 2)
     light = field.illumination.detach().flatten().double()
     # an error that differs from node to node has frequencies up to half their number
-    band = max((k - 1) / (2 * n) for k, n in zip(psf_nodes(field), frame, strict=True))
+    band = max((k - 1) / (2 * n) for k, n in zip(field.psf.shape, frame, strict=False))
 
     def transform(some: Tensor) -> Tensor:
         if field.uniform:
             return texture_spectrum(some.double())
-        return scene_spectrum(some.double(), max(tolerance / EVEN, 1.0), band)
+        return scene_spectrum(some.double(), max(tolerance / 0.01, 1.0), band)
 
     draw = torch.Generator().manual_seed(3)
     order = torch.randperm(len(psf), generator=draw)[:SAMPLED].sort().values
@@ -104,7 +100,7 @@ def principal_kernels(
     power, vectors = power.flip(0), vectors.flip(1)
     # below this is the rounding of single precision, in which the PSFs are given
     rank = max(int((power > 1e-13 * power[0]).sum()), 1)
-    rank = min(rank, MOST_KERNELS)
+    rank = min(rank, 320)
     scaled = vectors[:, :rank] / power[:rank].clamp_min(1e-300).sqrt()
     axes = scaled.mT @ features
     weights, whole = [], []
@@ -121,7 +117,7 @@ def principal_kernels(
     fewest = FEWEST
     if field.uniform:
         lost = _derivative_error(features, vectors[:, :rank])
-        fewest = int((lost > SLOPE).sum()) if field.psf.requires_grad else 1
+        fewest = int((lost > 0.02).sum()) if field.psf.requires_grad else 1
     rank = min(max(int((missing > tolerance).sum()) + 1, fewest), rank)
     mixture = scaled.mT[:rank] * light[sampled]
     error = float(missing[rank - 1])
@@ -143,15 +139,6 @@ def _derivative_error(features: Tensor, axes: Tensor) -> Tensor:
     power = (axes.mT @ change).square().sum(1)
     total = change.square().sum().clamp_min(1e-300)
     return torch.sqrt((1 - (power.cumsum(0) - power) / total).clamp_min(0))
-
-
-def psf_nodes(field: PsfField) -> tuple[int, int]:
-    """(rows, columns) of nodes.
-
-    Args:
-        field: sampled field or PSFs.
-    """
-    return field.psf.shape[0], field.psf.shape[1]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -245,14 +232,12 @@ class LowRankPsfs:
         """(frames, *sheets, y, x) blurred content, few frames at a time."""
         if content.device.type != "cpu":
             return self.convolve(self.weigh(content, depth_um))
-        count = max(1, CACHED // (len(self.kernels) * content[0].numel()))
+        # what of weighted sources a core's cache holds: 2 MB
+        count = max(1, 2**19 // (len(self.kernels) * content[0].numel()))
         parts = zip(
             torch.split(content, count), torch.split(depth_um, count), strict=True
         )
         return torch.cat([self.convolve(self.weigh(*part)) for part in parts])
-
-
-CACHED = 2**19  # samples, 2 MB: what of a core's cache the weighted sources may take
 
 
 def low_rank_psfs(
@@ -289,7 +274,7 @@ def low_rank_psfs(
     weights = weights.to(psf).reshape(*psf.shape[:3], rank)
     if lit:
         weights = weights * field.illumination[..., None]
-    maps = frame_maps(frame, psf_nodes(field), psf)
+    maps = frame_maps(frame, psf.shape[:2], psf)
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
     if lit:
         factor = correct_planes(field, maps, kernels, values.detach())
@@ -346,12 +331,12 @@ def correct_planes(
     h, w = kernels.shape[-2:]
     shape = fast_shape((size[0] + h - 1, size[1] + w - 1))
     transfer = transfer_functions(kernels, shape)
-    for z, plane in enumerate(plane_images(field, maps)):
+    for z, plane in enumerate(plane_images(field.light.detach(), maps)):
         faint = FAINT * plane.abs().max()
         mean = weights[:, :, z].mean((0, 1)).to(transfer.dtype)
         back = torch.einsum("r,ryx->yx", mean, transfer).conj()
         back = back / back[0, 0].abs().clamp_min(1e-30)
-        for _ in range(ROUNDS):
+        for _ in range(2):  # each squares what the last left of it
             sources = (weights[:, :, z] * factor[:, :, z, None]).movedim(-1, 0)
             spectrum = (torch.fft.rfft2(sources, s=shape) * transfer).sum(0)
             found = torch.fft.irfft2(spectrum, s=shape)[: size[0], : size[1]]
@@ -361,16 +346,16 @@ def correct_planes(
     return factor
 
 
-def plane_images(field: PsfField, maps: list[Tensor]) -> Tensor:
+def plane_images(light: Tensor, maps: list[Tensor]) -> Tensor:
     """(depths, y, x) images of uniformly illuminated planes at the depth nodes.
 
-    I(X) = Σ_ab Σ_x down(y, a) across(x, b) E_ab P_ab(X - x): both sums over x are
+    I(X) = Σ_ab Σ_x down(y, a) across(x, b) light_ab(X - x): both sums over x are
     products of matrices.
 
     Args:
-        field: sampled field or PSFs.
+        light: (rows, columns, depths, h, w) PSFs times their illumination.
+        maps: :func:`frame_maps`.
     """
-    light = field.light.detach()
     spread = []
     for matrix, size in zip(maps, light.shape[-2:], strict=True):
         padded = pad(matrix.mT, (size // 2, size // 2))

@@ -3,7 +3,7 @@ the field, cheapest first.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,37 +26,25 @@ from metalens.image.waves import PillarWave
 from metalens.psf import Polarisation, Source, SpectralNodes
 from metalens.psf import spectrum as spectra
 
-DEPTH_NODES = (5, 7, 9, 13, 17, 25)  # numbers that are tried
-MOST = 57  # nodes along an axis of the field
+MOST = 57  # nodes along an axis of the field or of 1/z
 # Largest errors of interpolation, and of light folded back, whatever the tolerance:
 # evenly lit planes are then even to half a percent between the nodes.
 NODES_MOST, FOLDED_MOST = 0.005, 0.001
-LONGEST = 4.0  # period of the nodes, in windows, from which on none is longer
-LONGER = 2**0.25  # by which one is than the next; nodes grow with its square
-OFF_AXIS = (
-    (0.75, 0.45),
-    (-0.3, 0.8),
-)  # places (x, y) in half fields, well off the middle
-# two in each quarter, a fifth of either axis apart at most, out to the rims, where a
-# blur is widest and the more light
-# is folded back
-STREWN = tuple(
-    zip(
-        (-0.95, -0.7, -0.45, -0.2, 0.2, 0.45, 0.7, 0.95),
-        (-0.3, 0.6, -0.85, 0.1, -0.55, 0.95, 0.35, -0.75),
-        strict=True,
-    )
+# Places (x, y) in half fields, out to the rims, where a blur is widest and the more
+# light is folded back.
+PLACES = (
+    (-0.95, -0.3),
+    (-0.7, 0.6),
+    (-0.45, -0.85),
+    (-0.2, 0.1),
+    (0.2, -0.55),
+    (0.45, 0.95),
+    (0.7, 0.35),
+    (0.95, -0.75),
 )
-ORDER = 2.5  # of the error in the distance of nodes; more needs PSFs without edges
-SHARES = {  # of the tolerance; in quadrature all of it
-    "kernels": 0.8,
-    "field": 0.3,
-    "depth": 0.2,
-    "spectrum": 0.3,
-    "transform": 0.25,
-    "polarisation": 0.15,
-    "folded": 0.2,
-}
+# of the tolerance: kernels, whose number is what an image costs, and each of six other
+# causes; in quadrature all of it
+KERNELS, OTHERS = 0.8, 0.6 / math.sqrt(6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +119,12 @@ class Plan:
     window: Window
     folds: bool
 
+    @property
+    def places_um(self) -> Tensor:
+        """(nodes, [x, y]) field points of all nodes, row by row."""
+        y, x = torch.meshgrid(self.y_um.to(self.x_um), self.x_um, indexing="ij")
+        return torch.stack([x.flatten(), y.flatten()], -1)
+
 
 def plan_nodes(
     optics: Optics,
@@ -164,17 +158,16 @@ def plan_nodes(
     if not 0 < tolerance < 1:
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
     window, half = Window(grid.window, grid.step_um), grid.half_um
-    waves = waves_of(
-        optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"]
-    )
+    share = tolerance * OTHERS
+    waves = waves_of(optics, grid, source, middle_um, half, share)
     coarse = waves if isinstance(source, SpectralNodes) else _coarse(optics, source, 2)
     ends = depth_nodes(grid, 3)
     window = _unfolded(
         optics,
         coarse,
         window,
-        (_places(STREWN, middle_um, half), ends),
-        min(tolerance * SHARES["folded"], FOLDED_MOST),
+        (_places(PLACES, middle_um, half), ends),
+        min(share, FOLDED_MOST),
     )
 
     def across(unit: Tensor) -> Tensor:
@@ -189,23 +182,16 @@ def plan_nodes(
         depths = 1 / (near + (far - near) * unit)
         return sum_over_spectrum(optics, at, depths, coarse, window).transpose(0, 1)
 
-    count = _field_nodes(
-        across, grid.frame[1], min(tolerance * SHARES["field"], NODES_MOST)
-    )
+    within = min(share, NODES_MOST)
+    count = _node_count(across, within, "field")
     one = grid.depths_um[0] == grid.depths_um[1]
-    most = min(tolerance * SHARES["depth"], NODES_MOST)
-    depths = 1 if one else _depth_count(deep, most)
-    aside = _places(OFF_AXIS, middle_um, half), ends
-    if (
-        transform_error(JudgedPsfs(optics, coarse, window, aside))
-        > tolerance * SHARES["transform"]
-    ):
+    depths = 1 if one else _node_count(deep, within, "range of depths")
+    aside = _places(PLACES[1::4], middle_um, half), ends
+    if transform_error(JudgedPsfs(optics, coarse, window, aside)) > share:
         window = replace(window, curved=True)
-    some = _places((*OFF_AXIS, (0.0, 0.0)), middle_um, half), ends
-    most = tolerance * SHARES["polarisation"]
-    window = choose_polarisation(
-        JudgedPsfs(optics, coarse, window, some), polarisation, within=(tolerance, most)
-    )
+    some = _places((*PLACES[1::4], (0.0, 0.0)), middle_um, half), ends
+    judged = JudgedPsfs(optics, coarse, window, some)
+    window = choose_polarisation(judged, polarisation, within=(tolerance, share))
     y, x = (
         m + h * torch.linspace(-1, 1, _along(count, h / half[1]), dtype=torch.float64)
         for m, h in zip(middle_um[::-1], half, strict=True)
@@ -280,16 +266,15 @@ def _unfolded(
     """The window with nodes of the least period that folds no more light back than is
     tolerated, or of the longest.
     """
-    while (
-        window.period < LONGEST
-        and folding_error(JudgedPsfs(optics, waves, window, at)) > tolerance
-    ):
-        window = replace(window, period=LONGER * window.period)
+    while folding_error(JudgedPsfs(optics, waves, window, at)) > tolerance:
+        if window.period >= 4:
+            break
+        window = replace(window, period=2**0.25 * window.period)
     return window
 
 
 def _places(
-    units: tuple[tuple[float, float], ...],
+    units: Sequence[tuple[float, float]],
     middle_um: tuple[float, float],
     half_um: list[float],
 ) -> Tensor:
@@ -355,9 +340,7 @@ def _coarse(
 
 
 def _along(count: int, length: float) -> int:
-    """Nodes of an axis so many times as long as one of ``count`` nodes; one of none."""
-    if count == 1 or length == 0:
-        return 1
+    """Nodes of an axis so many times as long as one of ``count`` nodes."""
     return max(TAPS, math.ceil((count - 1) * length) + 1)
 
 
@@ -367,65 +350,30 @@ DARK = (
 )
 
 
-class _Known:
-    """Light of PSFs at places 0 … 1 of a line, each computed once."""
-
-    def __init__(self, at: Callable[[Tensor], Tensor]) -> None:
-        self.at, self.kept = at, dict[float, Tensor]()
-
-    def between(self, count: int) -> tuple[Tensor, Tensor]:
-        """(count - 1, depths, h, w) light half-way between so many nodes, interpolated
-        and true.
-        """
-        nodes = torch.linspace(0, 1, count, dtype=torch.float64)
-        middle = (nodes[1:] + nodes[:-1]) / 2
-        true, given = self.light(middle), self.light(nodes)
-        matrix = spline_matrix(middle, count).to(given)
-        return torch.tensordot(matrix, given, 1), true
-
-    def light(self, unit: Tensor) -> Tensor:
-        """(places, depths, h, w)."""
-        keys = [round(place, 9) for place in unit.tolist()]
-        missing = [key for key in keys if key not in self.kept]
-        if missing:
-            found = self.at(torch.tensor(missing, dtype=torch.float64))
-            if not bool((found.sum((-1, -2)) > 0).all()):
-                raise SceneError(DARK)
-            self.kept.update(zip(missing, found, strict=True))
-        return torch.stack([self.kept[key] for key in keys])
-
-
-def _field_nodes(at: Callable[[Tensor], Tensor], samples: int, tolerance: float) -> int:
-    """Number of nodes that a line of PSFs needs, at equal steps.
+def _node_count(at: Callable[[Tensor], Tensor], tolerance: float, cure: str) -> int:
+    """Number of nodes at equal steps that a line of PSFs needs.
 
     Half-way between them a textured scene is to err by no more than the tolerance.
 
     Args:
-        at: gives light at places 0 … 1 of the line. samples: along it.
+        at: gives light (places, depths, h, w) at places 0 … 1 of the line.
+        tolerance: relative L2 error. cure: what lowers the number.
     """
-    if samples == 1:
-        return 1
-    known, count = _Known(at), 5
+    count = 5
     while count <= MOST:
-        error = scene_error(*known.between(count))
+        places = torch.linspace(0, 1, 2 * count - 1, dtype=torch.float64)
+        light = at(places)
+        if not bool((light.sum((-1, -2)) > 0).all()):
+            raise SceneError(DARK)
+        matrix = spline_matrix(places[1::2], count).to(light)
+        between = torch.tensordot(matrix, light[::2], 1)
+        error = scene_error(between, light[1::2])
         if error <= tolerance:
             return count
-        most = (count - 1) * (error / tolerance) ** (1 / ORDER)
-        count = max(count + 2, 1 + 2 * math.ceil(0.45 * min(most, 2 * (count - 1))))
+        # errors fall as the distance of nodes to the power of 2.5 and more
+        most = min((error / tolerance) ** 0.4, 2.0) * (count - 1)
+        count = max(count + 2, 1 + 2 * math.ceil(0.45 * most))
     raise SceneError(
-        f"{count - 2} field points along an axis leave {error:.2g} of the image, above {tolerance:.2g}: "
-        "raise the tolerance or the sample, or narrow the field"
-    )
-
-
-def _depth_count(at: Callable[[Tensor], Tensor], tolerance: float) -> int:
-    """Number of depth nodes that a scene needs; ``at`` gives light at 0 … 1 of 1/z."""
-    known = _Known(at)
-    for count in DEPTH_NODES:
-        error = scene_error(*known.between(count))
-        if error <= tolerance:
-            return count
-    raise SceneError(
-        f"{count} depths leave {error:.2g} of the image, above {tolerance:.2g}: "
-        "raise the tolerance or the sample, or narrow the range of depths"
+        f"{count - 2} nodes leave {error:.2g} of the image, above {tolerance:.2g}: "
+        f"raise the tolerance or the sample, or narrow the {cure}"
     )

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from metalens.core.errors import PropagationError
 from metalens.image import compiled, polarised
-from metalens.image.compiled import is_compilable
 from metalens.image.rays import (
     Paths,
     Rays,
@@ -28,9 +27,6 @@ from metalens.optics import Layers, media
 from metalens.psf import VectorPupil, dominant_components
 
 SPARE = 1.06  # period of the nodes per width of the window
-# of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
-CLEAR = 0.7
-DARK = 1e-6  # of samples that no light reaches: a PSF of next to nothing keeps a shape
 LARGEST_P = 0.9  # of a ray, in units of the rarest index
 
 
@@ -130,9 +126,7 @@ class Sampling:
     harmonics: int
     beyond: float
     dimmed: float
-    curved: bool
-    components: int
-    flux: bool
+    window: Window
 
 
 def sampling(
@@ -172,14 +166,13 @@ def sampling(
         4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5
     )
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto
-    # the last of them
-    size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
+    # the last three tenths of them, below 3e-4 of the sharpest image
+    size = max(nodes + math.ceil(0.7 * harmonics) + 1, 2 * harmonics + 2)
     quick = 16 * scipy.fft.next_fast_len(
         -(-size // 16)
     )  # a third quicker than sizes that just factorise
     dimmed = beyond * math.pi**2 / (12 * SPARE * window.period)
-    how = window.curved, window.components, window.flux
-    return Sampling(period, nodes, step, quick, harmonics, beyond, dimmed, *how)
+    return Sampling(period, nodes, step, quick, harmonics, beyond, dimmed, window)
 
 
 def psfs(
@@ -235,7 +228,7 @@ def psfs(
                 place,
                 depths_um,
                 wavelength_um,
-                _view(grid, window, view, shift_um, at_um.device),
+                _view(grid, view, shift_um, at_um.device),
             )
             for place, view in zip(at_um, views, strict=True)
         ]
@@ -277,14 +270,12 @@ class _View(NamedTuple):
 
 def _view(
     grid: Sampling,
-    window: Window,
     view: tuple[float, float],
     shift_um: tuple[float, float],
     device: torch.device,
 ) -> _View:
     ends = tuple(
-        _to_samples(grid, window, v, s, device)
-        for v, s in zip(view, shift_um, strict=True)
+        _to_samples(grid, v, s, device) for v, s in zip(view, shift_um, strict=True)
     )
     return _View((view[0] + shift_um[0], view[1] + shift_um[1]), ends)
 
@@ -314,19 +305,22 @@ def _one(
         )
         light, total = light * shade, total * taken
     mixed = None
-    if grid.components:
+    if grid.window.components:
         fields = polarised.polarisation_factors(
-            found, tangents, after.order, flux=grid.flux
+            found, tangents, after.order, flux=grid.window.flux
         )
-        mixed = dominant_components(fields, pupil.weight, grid.components)
+        mixed = dominant_components(fields, pupil.weight, grid.window.components)
     few = (
         1 if light.device.type == "cpu" else len(light)
     )  # one depth at a time stays in a processor's cache
     moves = [
         _move(slope, ends)
-        for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))
+        for slope in (
+            found.slope,
+            *(found.curvature.unbind(1) if grid.window.curved else ()),
+        )
     ]
-    aside = (found.aside, found.aside[:, None]) if grid.curved else ()
+    aside = (found.aside, found.aside[:, None]) if grid.window.curved else ()
     parts = torch.split(light, few)
     return (
         torch.cat(
@@ -396,12 +390,7 @@ def _fluxes(
     for sign, pupil in pupils:
         part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
-        if is_compilable(spectrum):
-            found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
-        else:
-            found = [
-                torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
-            ]
+        found = [torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)]
         for along in aside:
             other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
             found.append(
@@ -503,26 +492,22 @@ def node_fields(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 
 @functools.lru_cache(maxsize=64)
 def _to_samples(
-    grid: Sampling,
-    window: Window,
-    view_um: float,
-    shift_um: float,
-    device: torch.device,
+    grid: Sampling, view_um: float, shift_um: float, device: torch.device
 ) -> Samples:
     """From the points of the padded transform to the samples along an axis: sinc² up to
     its second zero.
 
     Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics
     to harmonics, by a transform.
-    Samples more than half a period from where the light lands are dark (``DARK``): the
-    transform has other light there.
+    Samples more than half a period from where the light lands are dark, since the
+    transform has other light there; 1e-6 keeps the shape of a PSF of next to nothing.
     """
-    harmonic = np.arange(grid.harmonics + 1)
+    window, harmonic = grid.window, np.arange(grid.harmonics + 1)
     box = np.sinc(harmonic / grid.period_um * window.step_um) ** 2
     place = (
         np.arange(window.samples) - (window.samples - 1) / 2
     ) * window.step_um - view_um
-    seen_as = np.where(np.abs(place) <= grid.period_um / 2, 1.0, DARK)
+    seen_as = np.where(np.abs(place) <= grid.period_um / 2, 1.0, 1e-6)
     place = place - shift_um
     wave = (
         seen_as[:, None]

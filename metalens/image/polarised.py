@@ -7,9 +7,6 @@ from metalens.image.rays import Rays
 from metalens.psf import VectorPupil, beyond_faces, of_flux, transmitted_polarization
 
 OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
-STEEPEST = (
-    1e-3  # cos² in the rarest medium of nodes beyond the rim, which have no light
-)
 
 
 def polarisation_factors(
@@ -29,7 +26,8 @@ def polarisation_factors(
     q, p = torch.meshgrid(
         seen.aside + seen.middle[1], seen.aside + seen.middle[0], indexing="ij"
     )
-    room = (1 - STEEPEST) * min(order) ** 2 / (p * p + q * q).clamp_min(STEEPEST)
+    # nodes beyond the rim, which have no light, keep cos² = 1e-3 in the rarest medium
+    room = (1 - 1e-3) * min(order) ** 2 / (p * p + q * q).clamp_min(1e-3)
     p, q = (side * torch.sqrt(room.clamp_max(1)) for side in (p, q))
     first, b = (_directions(p / n, q / n) for n in (order[0], order[-1]))
     slope = torch.cat([tangents, tangents.new_ones(1)])

@@ -15,8 +15,6 @@ from torch import Tensor
 from metalens.optics import Layers, Media, interpolant, media
 
 VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
-FEW = 24  # rays along an axis that tell where the light behind a stop lands
-KEPT = 4  # field points whose rays are kept: a few MB each
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,7 +57,7 @@ class Paths:
         return (self.mix @ self.few_um.flatten(1)).reshape(-1, *self.few_um.shape[1:])
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=4)  # a few MB each
 def rays(
     after: Media,
     radius: float,
@@ -108,7 +106,7 @@ def rays(
     )
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=4)  # a few MB each
 def through_stop(
     layers: Layers,
     tangents: tuple[float, float],
@@ -163,12 +161,9 @@ def landing_offset(
     if layers.stop is None:
         return 0.0, 0.0
     place, after = seen_from
-    step = (
-        2
-        * float(media.ray_direction(after, torch.tensor(radius, dtype=torch.float64)))
-        / FEW
-    )
-    found = rays(after, radius, place, (FEW, step), torch.device("cpu"))
+    rim, count = torch.tensor(radius, dtype=torch.float64), 24
+    step = 2 * float(media.ray_direction(after, rim)) / count
+    found = rays(after, radius, place, (count, step), torch.device("cpu"))
     tangents = place[0] / after.reduced_um, place[1] / after.reduced_um
     own = (
         carrier_rad(found.x_um, found.y_um) * (wavelength_um / (2 * math.pi))
@@ -257,7 +252,7 @@ def source_paths(
     )
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=4)  # a few MB each
 def _source_paths(
     layers: Layers,
     tangents: tuple[float, float],

@@ -58,7 +58,7 @@ class _ByNodes(torch.autograd.Function):
         level = illumination[..., None, None] if lit else torch.ones(1)
         deep = spline_coefficients(depths).to(content)
         frame = content.shape[-2:]
-        maps = frame_maps((frame[0], frame[1]), (rows, columns), content)
+        maps = frame_maps((frame[0], frame[1]), psf.shape[:2], content)
         shape = fast_shape((frame[0] + h - 1, frame[1] + w - 1))
         # image samples half a window beyond the frame are not part of it
         seen = torch.nn.functional.pad(gradient, (w // 2, w // 2, h // 2, h // 2))
@@ -115,11 +115,9 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
     """
     with torch.no_grad():
         light = sum_over_spectrum(
-            optics, _places(plan), plan.depths_um, plan.waves, plan.window
+            optics, plan.places_um, plan.depths_um, plan.waves, plan.window
         )
-    return light.reshape(
-        len(plan.y_um), len(plan.x_um), *light.shape[1:]
-    ).requires_grad_()
+    return light.unflatten(0, (len(plan.y_um), len(plan.x_um))).requires_grad_()
 
 
 def surrogate_loss(
@@ -174,7 +172,7 @@ def gradient_term(
         optics: lens, light and distances at the nodes.
         plan: field nodes, depths and wavelengths.
     """
-    places = _places(plan)
+    places = plan.places_um
     light = psfs(
         optics,
         places[point : point + 1].to(gradient.device),
@@ -184,8 +182,3 @@ def gradient_term(
         finest_um=float(plan.waves.wavelengths_um.min()),
     )[0]
     return len(places) * (gradient.flatten(0, 1)[point] * light).sum()
-
-
-def _places(plan: Plan) -> Tensor:
-    y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
-    return torch.stack([x.flatten(), y.flatten()], -1)

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -22,10 +22,6 @@ from metalens.psf import among
 
 # over which pillars are averaged at most: below a zone of the lens, far above the pitch
 CELL_UM = 2.5
-# in λ z / window: mean and interpolation leave light at a window's rim sinc³(1/6) =
-# 0.87 of its amplitude
-CELLS = 3
-LOBES = 2.0  # of the mean of cells over the nodes that read them, in widths of a node
 
 
 class Wave(Protocol):
@@ -42,22 +38,6 @@ class Wave(Protocol):
         self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
     ) -> Tensor | None:
         """Complex transmission less the carrier, differentiable; None where it is 1."""
-
-
-@runtime_checkable
-class Pillars(Protocol):
-    """A lens plane whose factor is gathered from pillars, which can be asked one by
-    one.
-    """
-
-    @property
-    def pitch_um(self) -> float:
-        """Of their square lattice."""
-
-    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none, as the factor takes
-        them.
-        """
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -312,12 +292,13 @@ def _over(cells: Tensor, width: float) -> Tensor:
     """
     if width <= 1:
         return cells
-    reach = math.ceil(LOBES * width) - 1
+    lobes = 2.0  # in widths of a node
+    reach = math.ceil(lobes * width) - 1
     away = (
         torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64)
         / width
     )
-    row = (torch.sinc(away) * torch.sinc(away / LOBES) / width).to(cells)
+    row = (torch.sinc(away) * torch.sinc(away / lobes) / width).to(cells)
     there = (cells.detach() != 0).any(0, keepdim=True).to(cells)
     both = torch.cat([cells, there])[:, None]
     for shape, pad in (((1, 1, -1, 1), (reach, 0)), ((1, 1, 1, -1), (0, reach))):
@@ -370,7 +351,9 @@ def cell_um(
     node_um = (
         wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
     )
-    return min(CELL_UM, node_um / CELLS)
+    # mean and interpolation leave light at a window's rim sinc³(1/6) = 0.87 of its
+    # amplitude
+    return min(CELL_UM, node_um / 3)
 
 
 def wave_of(
