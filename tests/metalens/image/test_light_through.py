@@ -87,7 +87,9 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         torch.tensor([4.0, 400 * slope], dtype=torch.float64),
         torch.tensor([depth_um], dtype=torch.float64),
     )
-    window = Window(31, 2.0)
+    at = torch.stack([x_um, torch.zeros(2, dtype=torch.float64)], -1)
+    window = Window(81, 4.0)
+    light = psfs(optics, at, depths_um=depths, wavelength_um=0.85, window=window)
     plan = Plan(
         torch.zeros(1),
         x_um,
@@ -96,8 +98,7 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
         window,
         folds=False,
     )
-    light = torch.ones(1, 2, 1, 1, 1)  # all that falls on the stop
-    found = normalise_psfs(light, optics, plan)[1][0, :, 0]
+    found = normalise_psfs(light[None], optics, plan)[1][0, :, 0]
     want = [_relative(t, depth_um, thick_um, n) for t in (0.01, slope)]
     assert float(found[1] / found[0]) == pytest.approx(
         want[1] / want[0], rel=6e-3

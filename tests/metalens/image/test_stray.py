@@ -81,21 +81,6 @@ def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(
         )
 
 
-def test_a_lens_without_a_stop_is_lit_by_the_fourth_power_of_the_cosine_at_every_pixel():
-    """Of the angle from the middle of the lens to a pixel's, whose field point is the
-    middle of the frame.
-    """
-    found = stray._all(RADIUS, GRID, 1700.0, (310.0, -240.0))
-    assert (found.radius_um, found.aside_um) == (RADIUS, None)
-    assert found.illumination.shape == (90, 120)
-    for row, column in ((0, 0), (40, 66), (89, 3), (12, 119)):
-        x, y = (column - 59.5) * 7 + 310, (row - 44.5) * 7 - 240
-        cosine = math.cos(math.atan(math.hypot(x, y) / 1700))
-        assert float(found.illumination[row, column]) == pytest.approx(
-            cosine**4, rel=1e-6
-        )  # float32
-
-
 def test_a_smooth_phase_has_one_order_alone():
     assert (
         stray.stray_of(
@@ -166,44 +151,3 @@ def test_behind_a_stop_a_disc_is_what_rays_through_the_hole_light(
         assert found == pytest.approx(
             [(x - field_um[0]).mean(), (y - field_um[1]).mean()], abs=0.7
         )
-
-
-def _lit(middle_um, stop):
-    optics = SimpleNamespace(wave=Wave(), distance_um=D, layers=Layers(stop=stop))
-    return stray._behind_stop(optics, GRID, DEPTH, middle_um)
-
-
-def test_a_hole_that_the_whole_lens_sees_lights_its_own_size():
-    """As large as the hole by the source's distances; of 64 places across the lens the
-    rim's leave 8e-4 (2.6e-3 of
-    half as many)."""
-    found = _lit((310.0, -240.0), Stop(HOLE, THICK, MIDDLE))
-    assert found.radius_um == pytest.approx(HOLE * DEPTH / (DEPTH - THICK), rel=1.3e-3)
-
-
-def test_light_through_a_hole_on_the_axis_has_the_mirrors_of_the_field():
-    """Partly beside the lens; to the last bits, so the middle direction is among those
-    that are traced.
-    """
-    there, back = (_lit((side * 1450.0, 250.0), Stop(HOLE, THICK)) for side in (1, -1))
-    assert there.aside_um[0] == pytest.approx(back.aside_um[0], abs=1e-9)
-    assert there.aside_um[1] == pytest.approx(-back.aside_um[1][::-1], abs=1e-9)
-    assert np.ptp(there.aside_um[1]) > 1
-    assert there.illumination.numpy() == pytest.approx(
-        back.illumination.numpy()[:, ::-1], abs=1e-6
-    )
-
-
-def test_a_lens_that_is_lit_all_over_is_as_large_as_its_64_places_across():
-    """Middles of squares that lie on the lens: pairs of odd numbers whose squares add
-    up to 64² or less.
-    """
-    found = _lit((310.0, -240.0), Stop(300.0, THICK, MIDDLE))
-    odd = np.arange(-63, 64, 2)
-    count = np.count_nonzero(odd**2 + odd[:, None] ** 2 <= 64**2)
-    assert found.radius_um == pytest.approx(
-        2 * RADIUS / 64 * math.sqrt(count / math.pi), rel=1e-9
-    )
-    assert found.radius_um == pytest.approx(
-        RADIUS, rel=2e-3
-    )  # (1 / 64)^(4/3) or so, by the circle's lattice points
