@@ -18,7 +18,7 @@ from metalens import propagate
 from metalens.image.points import Optics, Window, psfs, sampling
 from metalens.image.texture import texture_error, weigh_by_light
 from metalens.image.waves import PillarWave
-from metalens.psf import Polarisation, SpectralNodes, psf_stack
+from metalens.psf import Polarisation, SpectralNodes, blur_um, psf_stack
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +64,12 @@ def transform_error(judged: JudgedPsfs) -> float:
     Args:
         judged: PSFs by which the error is judged.
     """
-    light = judged.shown.sum((-1, -2))
-    wide = psf_width(judged.shown / light[..., None, None]) * judged.window.step_um
-    return weigh_by_light(
-        texture_error(
-            judged.compute_psfs(shift_um=(wide * 0.6, wide * 0.8)), judged.shown
-        ),
-        light,
-    )
+    shown, step_um = judged.shown, judged.window.step_um
+    light = shown.sum((-1, -2))
+    # root mean square distance of the light of a disc of this blur
+    wide = float(blur_um(shown.cpu().numpy(), step_um).mean()) / math.sqrt(2)
+    moved = judged.compute_psfs(shift_um=(wide * 0.6, wide * 0.8))
+    return weigh_by_light(texture_error(moved, shown), light)
 
 
 def folding_error(judged: JudgedPsfs) -> float:
@@ -132,21 +130,6 @@ def polarisation_error(judged: JudgedPsfs, whole: Tensor | None = None) -> float
         ),
         light,
     )
-
-
-def psf_width(psfs: Tensor) -> float:
-    """Root mean square distance of the light from its centroid, samples, mean over the
-    PSFs.
-    """
-    n = psfs.shape[-1]
-    place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
-    total = psfs.sum((-1, -2))
-    x, y = (
-        (psfs.sum(-2) * place).sum(-1) / total,
-        (psfs.sum(-1) * place).sum(-1) / total,
-    )
-    square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
-    return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
 
 
 def gathering_error(

@@ -5,7 +5,6 @@ the window's centre sees it.
 import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -203,7 +202,8 @@ def psfs(
             the chief ray.
         depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in
             vacuum.
-        shift_um: the window's rays are seen from a place (x, y) beside :func:`view_um`;
+        shift_um: the window's rays are seen from a place (x, y) beside
+            :func:`metalens.image.rays.landing_offset`;
             the samples stay. A check of
             what the transform neglects.
         finest_um: shortest wavelength of a spectrum, whose nodes are then those of all
@@ -216,81 +216,37 @@ def psfs(
         PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
     grid = sampling(optics, window, wavelength_um, finest_um)
-    views = [
-        view_um(optics, place, depths_um, min(wavelength_um, finest_um))
-        for place in at_um
-    ]
-    return torch.stack(
-        [
-            _one(
-                optics,
-                grid,
-                place,
-                depths_um,
-                wavelength_um,
-                _view(grid, view, shift_um, at_um.device),
-            )
-            for place, view in zip(at_um, views, strict=True)
-        ]
-    )
-
-
-def view_um(
-    optics: Optics, place: Tensor, depths_um: Tensor, wavelength_um: float
-) -> tuple[float, float]:
-    """(x, y) beside a field point from where its rays are seen: where the light lands
-    that a stop lets through.
-
-    Args:
-        optics: lens, light and distances at the nodes.
-        depths_um: source depths from the lens, um.
-        wavelength_um: vacuum wavelength, um.
-    """
-    after = optics.layers.after(optics.distance_um, wavelength_um)
-    x, y = place.tolist()
-    wave = optics.wave
-    return landing_offset(
-        optics.layers,
-        wave.carrier_rad,
-        wave.radius_um,
-        ((x, y), after),
-        depths_um,
-        wavelength_um,
-    )
-
-
-class _View(NamedTuple):
-    """From where the rays of a field point are seen, (x, y) beside it, and the samples
-    along x and y from there.
-    """
-
-    beside_um: tuple[float, float]
-    ends: tuple[Samples, ...]
-
-
-def _view(
-    grid: Sampling,
-    view: tuple[float, float],
-    shift_um: tuple[float, float],
-    device: torch.device,
-) -> _View:
-    ends = tuple(
-        _to_samples(grid, v, s, device) for v, s in zip(view, shift_um, strict=True)
-    )
-    return _View((view[0] + shift_um[0], view[1] + shift_um[1]), ends)
+    own = (grid, depths_um, wavelength_um, min(wavelength_um, finest_um), shift_um)
+    return torch.stack([_one(optics, place, *own) for place in at_um])
 
 
 def _one(
     optics: Optics,
-    grid: Sampling,
     place: Tensor,
+    grid: Sampling,
     depths_um: Tensor,
     wavelength_um: float,
-    view: _View,
+    finest_um: float,
+    shift_um: tuple[float, float],
 ) -> Tensor:
-    """(depths, h, w) PSFs of one field point."""
-    ends = view.ends
-    found, pupil = node_rays(optics, place, grid, wavelength_um, view.beside_um)
+    """(depths, h, w) PSFs of one field point, seen from where its light lands."""
+    landing = landing_offset(
+        optics.layers,
+        optics.wave.carrier_rad,
+        optics.wave.radius_um,
+        (
+            (float(place[0]), float(place[1])),
+            optics.layers.after(optics.distance_um, finest_um),
+        ),
+        depths_um,
+        finest_um,
+    )
+    ends = tuple(
+        _to_samples(grid, offset, shift, place.device)
+        for offset, shift in zip(landing, shift_um, strict=True)
+    )
+    seen_from = landing[0] + shift_um[0], landing[1] + shift_um[1]
+    found, pupil = node_rays(optics, place, grid, wavelength_um, seen_from)
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place / after.reduced_um
     paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
