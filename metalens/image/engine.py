@@ -102,17 +102,19 @@ def imager(
         with torch.no_grad():
             return build_imager(scene_grid, plan, stack, energy, tolerance=within)
 
-    made = build(tolerance)
-    if layers.stop is not None and (dimmer := image_dimming(made)) > 1:
+    prepared = build(tolerance)
+    if layers.stop is not None and (dimmer := image_dimming(prepared)) > 1:
         # an image in the shadow of the stop is prepared to its own light, where enough
         # nodes for that are allowed
         with contextlib.suppress(SceneError):
-            made = build(tolerance / min(dimmer, 8))
+            prepared = build(tolerance / min(dimmer, 8))
     with torch.no_grad():
-        parts = _error_parts(optics, made)
-    depth = float(1 / (1 / made.plan.depths_um).mean())
+        parts = _error_parts(optics, prepared)
+    depth = float(1 / (1 / prepared.plan.depths_um).mean())
     stray = stray_of(optics, scene_grid, depth, middle)
-    return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
+    return replace(
+        prepared, parts=parts, stray=None if stray is None else stray.to(device)
+    )
 
 
 def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
@@ -226,17 +228,17 @@ def textured_frames(grid: Grid) -> Frames:
     return Frames((cover * texture)[None], cover[None], depth[None])
 
 
-def _error_parts(optics: Optics, made: Imager) -> dict[str, float]:
+def _error_parts(optics: Optics, prepared: Imager) -> dict[str, float]:
     """Errors by cause, at places, depths and wavelengths that no node holds.
 
     Those that count by the light of a place are over the whole frame's light: more of
     an image that is dimmer than it.
     """
-    plan, draw = made.plan, np.random.default_rng(7)
-    pixels = np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame).astype(int)
+    plan, draw = prepared.plan, np.random.default_rng(7)
+    pixels = np.floor(draw.random((HELD_OUT, 2)) * prepared.grid.frame).astype(int)
     rows, columns = (
         np.linspace(float(nodes[0]), float(nodes[-1]), n)
-        for n, nodes in zip(made.grid.frame, (plan.y_um, plan.x_um), strict=True)
+        for n, nodes in zip(prepared.grid.frame, (plan.y_um, plan.x_um), strict=True)
     )
     at = torch.from_numpy(np.stack([columns[pixels[:, 1]], rows[pixels[:, 0]]], -1))
     near, far = 1 / plan.depths_um[[0, -1]]
@@ -244,8 +246,8 @@ def _error_parts(optics: Optics, made: Imager) -> dict[str, float]:
     true = sum_over_spectrum(optics, at, depths, plan.waves, plan.window).detach()
     middle_wave = float(plan.waves.wavelengths_um.mean())
     level = _cosine4(optics, at, depths, middle_wave)[..., None, None]
-    used = psfs_used(made, torch.from_numpy(pixels), depths).cpu()
-    dimmer, light = image_dimming(made), true.sum((-1, -2))
+    used = psfs_used(prepared, torch.from_numpy(pixels), depths).cpu()
+    dimmer, light = image_dimming(prepared), true.sum((-1, -2))
     few = at[:FEW], depths[1:-1]
     # of the brightest of few places in the image
     share = float(light[:FEW].max() / (light**2).mean().sqrt()) * dimmer
@@ -254,7 +256,7 @@ def _error_parts(optics: Optics, made: Imager) -> dict[str, float]:
     pillars = optics, wave, plan.window, (at[:2], depths[1:-1])
     parts = {
         "psfs": scene_error(used, (true * level).to(used)) * dimmer,
-        "planes": _plane_error(made),
+        "planes": _plane_error(prepared),
         "spectrum": max(plan.waves.error, 0.0),
         "transform": left_out.transform_error(judged) * share,
         "folded": left_out.folding_error(judged) * share,
@@ -269,21 +271,24 @@ def _error_parts(optics: Optics, made: Imager) -> dict[str, float]:
     return parts
 
 
-def _plane_error(made: Imager) -> float:
-    """Root mean square error of evenly lit planes beside those of the nodes' PSFs, at
-    the worst of the depth nodes and those half-way.
+def _plane_error(prepared: Imager) -> float:
+    """Root mean square error of uniformly illuminated planes, at the worst depth.
+
+    Compared with images by the PSFs of the nodes, at the depth nodes and half-way.
     """
-    near, far = made.light.vergence
-    count = 2 * len(made.plan.depths_um) - 1
+    near, far = prepared.light.vergence
+    count = 2 * len(prepared.plan.depths_um) - 1
     depths = 1 / torch.linspace(near, far, count, dtype=torch.float64)
-    field = made.field
-    deep = spline_matrix(torch.linspace(0, 1, count), len(made.plan.depths_um))
+    field = prepared.field
+    deep = spline_matrix(torch.linspace(0, 1, count), len(prepared.plan.depths_um))
     light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
-    maps = frame_maps(made.grid.frame, light.shape[:2], light)
-    wanted = crop_image(plane_images(light, maps), made.grid)
-    one = torch.ones(1, *made.grid.frame).to(field.psf)
+    maps = frame_maps(prepared.grid.frame, light.shape[:2], light)
+    wanted = crop_image(plane_images(light, maps), prepared.grid)
+    one = torch.ones(1, *prepared.grid.frame).to(field.psf)
     found = [
-        crop_image(made.light.blur(one, torch.full_like(one, depth))[0], made.grid)
+        crop_image(
+            prepared.light.blur(one, torch.full_like(one, depth))[0], prepared.grid
+        )
         for depth in depths.tolist()
     ]
     wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
@@ -291,20 +296,20 @@ def _plane_error(made: Imager) -> float:
     return float(torch.sqrt(wrong / level))
 
 
-def image_dimming(made: Imager) -> float:
+def image_dimming(prepared: Imager) -> float:
     """By how much an image of even light is dimmer than the whole frame's, 1 at least:
     margins may be in the light where an image lies in the shadow of a stop.
 
     Args:
-        made: imager with its nodes.
+        prepared: imager with its nodes.
     """
-    middle = len(made.plan.depths_um) // 2
-    light = made.field.light[:, :, middle : middle + 1]
-    maps = frame_maps(made.grid.frame, light.shape[:2], light)
+    middle = len(prepared.plan.depths_um) // 2
+    light = prepared.field.light[:, :, middle : middle + 1]
+    maps = frame_maps(prepared.grid.frame, light.shape[:2], light)
     plane = plane_images(light, maps)[0]
     whole, image = (
         float(part.square().mean().sqrt())
-        for part in (plane, crop_image(plane, made.grid))
+        for part in (plane, crop_image(plane, prepared.grid))
     )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
@@ -323,10 +328,10 @@ def _shadow_error(
             aperture that these hold, and that of the brightest place of each depth.
     """
     at, depths_um = places
-    psfs, held, brightest = (part.cpu().numpy() for part in seen)
+    psfs, contained, brightest = (part.cpu().numpy() for part in seen)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    share = held.clip(1e-6, 1)
-    unit = psfs / held.clip(1e-6)[..., None, None]
+    share = contained.clip(1e-6, 1)
+    unit = psfs / contained.clip(1e-6)[..., None, None]
     rads = blur_um(unit, step_um, share) / reduced
     errors = []
     for i, (x, y) in enumerate((at / reduced).tolist()):
@@ -334,7 +339,7 @@ def _shadow_error(
             rad = float(rads[i, k]) / math.hypot(1, x, y)
             about = (x, y), depth, wavelength_um, rad, float(share[i, k])
             error = optics.layers.shadow_error(*about)
-            errors.append(error * held[i, k] / brightest[k])
+            errors.append(error * contained[i, k] / brightest[k])
     return float(max(errors))
 
 

@@ -42,8 +42,8 @@ class Imager:
     light: what sources give, for every sample of the frame. cover: what coverage does,
         of PSFs of sum 1.
     parts: share of the error by cause: psfs (low rank, and interpolation between field
-        points and depths), planes (evenly lit), spectrum, transform, folded (light from
-        beyond the windows that the transform shows in them), polarisation (components
+        points and depths), planes (uniformly illuminated), spectrum, transform,
+        folded (light from beyond the windows that the transform shows in them), polarisation (components
         of the field that are left out), edge (of light that the rim bends beyond the
         window), pillars (taken together a few micrometres at a time; 0 of a smooth
         phase), stop (of its shadow). Of a uniform imager kernels (low rank) alone.
@@ -99,8 +99,8 @@ class Imager:
         if _far_alone(frames):
             return self.surface(frames.radiance[:, 1], frames.depth_um[:, 1])
         light, cover, depth_um = self._continued(*parts)
-        both = self._blurred(light, depth_um, lit=True)
-        covered = self._blurred(cover, depth_um, lit=False)
+        both = self._blurred(light, depth_um, illuminated=True)
+        covered = self._blurred(cover, depth_um, illuminated=False)
         return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
@@ -126,7 +126,7 @@ class Imager:
             SceneError: as above.
         """
         light, depth_um = self._continued(light, depth_um)
-        return self._returned(self._blurred(light, depth_um, lit=True), light)
+        return self._returned(self._blurred(light, depth_um, illuminated=True), light)
 
     def _continued(self, *parts: Tensor) -> list[Tensor]:
         """Frames with the border samples repeated outward, so that no PSF ends there."""
@@ -146,16 +146,18 @@ class Imager:
             out.append(wide if part.ndim == 4 else wide[:, 0])
         return out
 
-    def _blurred(self, content: Tensor, depth_um: Tensor, *, lit: bool) -> Tensor:
+    def _blurred(
+        self, content: Tensor, depth_um: Tensor, *, illuminated: bool
+    ) -> Tensor:
         """Light or coverage (frames, *sheets, y, x) through the PSFs."""
-        used = self.light if lit else self.cover
+        used = self.light if illuminated else self.cover
         total = used.blur(content, depth_um.detach())
         if self.light.uniform:
             return total
         moves = self.stack.requires_grad or depth_um.requires_grad
         if moves and torch.is_grad_enabled():
             about = self.field, content.detach(), depth_um
-            total = total + by_nodes(*about, lit=lit, asked=self.asked)
+            total = total + by_nodes(*about, illuminated=illuminated, asked=self.asked)
         return total
 
     def _returned(self, whole: Tensor, light: Tensor) -> Tensor:
@@ -262,7 +264,7 @@ def _assembled(
     few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)
     light = cover = low_rank_psfs(found, basis, grid.frame)
     if not found.uniform:
-        cover = low_rank_psfs(found, basis, grid.frame, rank=few, lit=False)
+        cover = low_rank_psfs(found, basis, grid.frame, rank=few, illuminated=False)
     given = found.psf, found.illumination, basis, light, cover, parts
     return Imager(grid, plan, *given)
 

@@ -50,8 +50,8 @@ class OpticsLoss:
     """Eq. 6 and its parts.
 
     value: sensitivity + orthogonality + compactness, each with its weight.
-    floored: parameters whose information is below the floor: their logarithm is held
-    and has a bounded gradient.
+    floored: parameters whose information is below the floor: their logarithm follows
+    its tangent there and has a bounded gradient.
     """
 
     value: Tensor
@@ -85,16 +85,16 @@ def optics_loss(
             with the brightness: it can be made small by dimming the image.
     """
     diagonal = torch.diagonal(fisher)
-    held = diagonal < floor
-    safe = torch.where(held, floor, diagonal)
-    logs = torch.log(safe) + torch.where(held, (diagonal - floor) / floor, 0.0)
+    below = diagonal < floor
+    safe = torch.where(below, floor, diagonal)
+    logs = torch.log(safe) + torch.where(below, (diagonal - floor) / floor, 0.0)
     scale = torch.outer(safe, safe) if relative else torch.ones_like(fisher)
     off = (fisher**2 / scale).sum() - (torch.diagonal(fisher**2 / scale)).sum()
     parts = -logs.sum(), orthogonality * off, compactness * (1 - encircled).mean()
     return OpticsLoss(
         sum(parts, fisher.new_zeros(())),
         *parts,
-        tuple(torch.nonzero(held)[:, 0].tolist()),
+        tuple(torch.nonzero(below)[:, 0].tolist()),
     )
 
 
@@ -267,11 +267,11 @@ def cramer_rao(fisher: Tensor) -> Tensor:
     diagonal = torch.diagonal(fisher)
     scale = torch.sqrt(diagonal.clamp_min(torch.finfo(fisher.dtype).tiny))
     values, vectors = torch.linalg.eigh(fisher / torch.outer(scale, scale))
-    seen = values > 1e-12 * len(fisher)
+    known = values > 1e-12 * len(fisher)
     spread = (
-        vectors**2 * torch.where(seen, 1 / torch.where(seen, values, 1.0), 0.0)
+        vectors**2 * torch.where(known, 1 / torch.where(known, values, 1.0), 0.0)
     ).sum(1)
-    blind = ((vectors**2)[:, ~seen].sum(1) > 1e-9) | (diagonal <= 0)
+    blind = ((vectors**2)[:, ~known].sum(1) > 1e-9) | (diagonal <= 0)
     return torch.where(blind, math.inf, torch.sqrt(spread) / scale)
 
 

@@ -73,8 +73,8 @@ def principal_kernels(
     """Fewest principal components of PSFs that image a textured scene and planes.
 
     The metric is the image of a scene of mean 1 with a 1/f texture, and that of an
-    evenly lit plane. Kernels are mixed of at most :data:`SAMPLED` of the nodes' PSFs,
-    since PSFs between nodes are mixtures of theirs.
+    uniformly illuminated plane. Kernels are mixed of at most :data:`SAMPLED` of the
+    nodes' PSFs, since PSFs between nodes are mixtures of theirs.
 
     Args:
         field: sampled field or PSFs.
@@ -246,12 +246,12 @@ def low_rank_psfs(
     frame: tuple[int, int],
     *,
     rank: int | None = None,
-    lit: bool = True,
+    illuminated: bool = True,
 ) -> LowRankPsfs:
     """PSFs of the samples of a frame, from those of a field's nodes.
 
     Of a field, sum and centroid of every node's PSF are exact, before what kernels lack
-    of evenly lit planes is spread over the relative illumination
+    of uniformly illuminated planes is spread over the relative illumination
     (:func:`correct_planes`).
 
     Args:
@@ -259,7 +259,7 @@ def low_rank_psfs(
         basis: of this field, or of a similar one on the same nodes.
         frame: (y, x) samples.
         rank: kernels that are used, by default all.
-        lit: whether the sources carry light; else the PSFs are of sum 1.
+        illuminated: whether the sources carry light; else the PSFs are of sum 1.
     """
     psf = field.psf if field.uniform else field.psf.detach()
     rank = len(basis.mixture) if rank is None else min(rank, len(basis.mixture))
@@ -272,11 +272,11 @@ def low_rank_psfs(
         return LowRankPsfs(kernels, transfer, shape, table.to(psf), vergence)
     weights = match_moments(weights, kernels, psf.flatten(0, 2))
     weights = weights.to(psf).reshape(*psf.shape[:3], rank)
-    if lit:
+    if illuminated:
         weights = weights * field.illumination[..., None]
     maps = frame_maps(frame, psf.shape[:2], psf)
     values = torch.einsum("ya,abzr,xb->yxzr", maps[0], weights, maps[1])
-    if lit:
+    if illuminated:
         factor = correct_planes(field, maps, kernels, values.detach())
         values = values * factor[..., None]
     deep = spline_coefficients(values.shape[2]).to(values)
@@ -382,8 +382,8 @@ def moments(psf: Tensor) -> Tensor:
 def match_moments(weights: Tensor, kernels: Tensor, psf: Tensor) -> Tensor:
     """Least change of weights (n, rank) that gives PSFs (n, h, w) sum and centroid.
 
-    An evenly lit plane images as 1 - ∇·centroid + ½ ∇∇:(second moments) - …: its first
-    two terms are then exact.
+    A uniformly illuminated plane images as 1 - ∇·centroid + ½ ∇∇:(second moments) - …:
+    its first two terms are then exact.
 
     Args:
         kernels: (rank, h, w) low-rank kernels.

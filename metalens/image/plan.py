@@ -186,8 +186,8 @@ def plan_nodes(
     count = _node_count(across, within, "field")
     one = grid.depths_um[0] == grid.depths_um[1]
     depths = 1 if one else _node_count(deep, within, "range of depths")
-    aside = _places(PLACES[1::4], middle_um, half), ends
-    if transform_error(JudgedPsfs(optics, coarse, window, aside)) > share:
+    off_axis = _places(PLACES[1::4], middle_um, half), ends
+    if transform_error(JudgedPsfs(optics, coarse, window, off_axis)) > share:
         window = replace(window, curved=True)
     some = _places((*PLACES[1::4], (0.0, 0.0)), middle_um, half), ends
     judged = JudgedPsfs(optics, coarse, window, some)
@@ -311,8 +311,8 @@ def waves_of(
     last = sum_over_spectrum(optics, at, ends, _coarse(optics, source, 1), window)
     beside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):
-        made = _coarse(optics, source, count)
-        found = sum_over_spectrum(optics, at, ends, made, window)
+        rule = _coarse(optics, source, count)
+        found = sum_over_spectrum(optics, at, ends, rule, window)
         light = found.sum((-1, -2))
         error = float(
             (texture_error(last, found) * light / light.amax(0)).max()
@@ -329,13 +329,13 @@ def _coarse(
     optics: Optics, source: Source | spectra.MeasuredSpectrum, count: int
 ) -> SpectralNodes:
     """So many wavelengths of a spectrum, which the lens's pillars are known for."""
-    made = SpectralNodes(
+    rule = SpectralNodes(
         *spectra.gauss_rule(*spectra.spectrum_points(source), count), np.nan
     )
     if not isinstance(optics.wave, PillarWave):
-        return made
+        return rule
     return spectra.nodes_inside_library(
-        made, source, optics.wave.lens.proxy.wavelengths_um
+        rule, source, optics.wave.lens.proxy.wavelengths_um
     )
 
 

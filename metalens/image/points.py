@@ -156,13 +156,16 @@ def sampling(
     harmonics = math.floor(2 * period / window.step_um)
     half = window.samples * window.step_um / 2 * window.period / SPARE
     stop = optics.layers.stop
-    lit = (
+    open_edge = (
         edge
         if stop is None
         else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
     )
     beyond = min(
-        4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5
+        4
+        * math.sqrt(2)
+        / (math.pi**2 * 2 * math.pi / wavelength_um * open_edge * half),
+        0.5,
     )
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto
     # the last three tenths of them, below 3e-4 of the sharpest image
@@ -276,12 +279,14 @@ def _one(
             *(found.curvature.unbind(1) if grid.window.curved else ()),
         )
     ]
-    aside = (found.aside, found.aside[:, None]) if grid.window.curved else ()
+    second_order = (
+        (found.offset_p, found.offset_p[:, None]) if grid.window.curved else ()
+    )
     parts = torch.split(light, few)
     return (
         torch.cat(
             [
-                _shown(_fluxes(part, mixed, aside, grid.size), ends, moves)
+                _shown(_fluxes(part, mixed, second_order, grid.size), ends, moves)
                 for part in parts
             ]
         )
@@ -330,10 +335,13 @@ def _shown(
 
 
 def _fluxes(
-    light: Tensor, mixed: VectorPupil | None, aside: tuple[Tensor, ...], size: int
+    light: Tensor,
+    mixed: VectorPupil | None,
+    second_order: tuple[Tensor, ...],
+    size: int,
 ) -> list[Tensor]:
     """(depths, size, size) |U|² of the transforms of the light on the nodes, and with
-    ``aside`` the flux along x and y.
+    ``second_order`` the flux along x and y.
 
     mixed: whose light adds up; None for the scalar.
     """
@@ -347,7 +355,7 @@ def _fluxes(
         part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
         found = [torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)]
-        for along in aside:
+        for along in second_order:
             other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
             found.append(
                 torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)

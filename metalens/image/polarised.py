@@ -10,7 +10,7 @@ OF_FLUX, OF_ENERGY = 4, 6  # components that leave nothing out
 
 
 def polarisation_factors(
-    seen: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool
+    bundle: Rays, tangents: Tensor, order: tuple[float, ...], *, flux: bool
 ) -> VectorPupil:
     """Both polarisations on the nodes, float64: of the flux through the sensor's plane
     (8), or of |E|² (6 as
@@ -19,12 +19,14 @@ def polarisation_factors(
     θ.
 
     Args:
-        seen: rays of the nodes.
+        bundle: rays of the nodes.
         tangents: slopes (x, y) of the chief ray in air. order: indices of the media
             from the pillars to the sensor.
     """
     q, p = torch.meshgrid(
-        seen.aside + seen.middle[1], seen.aside + seen.middle[0], indexing="ij"
+        bundle.offset_p + bundle.middle[1],
+        bundle.offset_p + bundle.middle[0],
+        indexing="ij",
     )
     # nodes beyond the rim, which have no light, keep cos² = 1e-3 in the rarest medium
     room = (1 - 1e-3) * min(order) ** 2 / (p * p + q * q).clamp_min(1e-3)

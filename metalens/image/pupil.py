@@ -67,7 +67,7 @@ class Field:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PupilView:
-    """The pupil as seen from the window's centre, on (nodes, nodes) direction cosines;
+    """The pupil as viewed from the window's centre, on (nodes, nodes) direction cosines;
     float64.
 
     x_um, y_um: where the rays leave the lens. weight: share of each cell inside the
@@ -206,13 +206,13 @@ def psf(
     for depth, field in zip(
         depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True
     ):
-        seen = view_pupil(pupil, field, float(focus_um))
-        path = source_path(seen.x_um, seen.y_um, field.tangents, 1 / depth)
-        known = wrap_phase(seen.lens_rad + k * path).float()
+        view = view_pupil(pupil, field, float(focus_um))
+        path = source_path(view.x_um, view.y_um, field.tangents, 1 / depth)
+        known = wrap_phase(view.lens_rad + k * path).float()
         angles.append(
-            known + (added if seen.node is None else added.reshape(-1)[seen.node])
+            known + (added if view.node is None else added.reshape(-1)[view.node])
         )
-        weights.append(seen.weight.float())
+        weights.append(view.weight.float())
     image = to_window @ (
         torch.polar(torch.stack(weights), torch.stack(angles)) @ to_window.mT
     )

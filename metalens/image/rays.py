@@ -24,7 +24,7 @@ class Rays:
 
     width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed:
     root of the power that faces let
-    through; away_um: path to the window's centre less that along the normal. aside:
+    through; away_um: path to the window's centre less that along the normal. offset_p:
     (nodes,) p - p0 along x and along
     y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`path_derivatives`
     there.
@@ -36,7 +36,7 @@ class Rays:
     whole: Tensor
     passed: Tensor
     away_um: Tensor
-    aside: Tensor
+    offset_p: Tensor
     middle: Tensor
     slope: Tensor
     curvature: Tensor
@@ -110,7 +110,7 @@ def rays(
 def through_stop(
     layers: Layers,
     tangents: tuple[float, float],
-    seen: Rays,
+    bundle: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float,
 ) -> Tensor:
@@ -121,18 +121,19 @@ def through_stop(
     Args:
         layers: films and stop of the lens.
         tangents: tangents of the field angles along x and y.
-        seen: rays of the nodes.
+        bundle: rays of the nodes.
         depths_um: source depths from the lens, um.
         wavelength_um: vacuum wavelength, um.
     """
-    lit = seen.whole.cpu().numpy() > 0
+    inside_rim = bundle.whole.cpu().numpy() > 0
     x, y, width = (
-        part.cpu().numpy()[lit] for part in (seen.x_um, seen.y_um, seen.width_um)
+        part.cpu().numpy()[inside_rim]
+        for part in (bundle.x_um, bundle.y_um, bundle.width_um)
     )
-    out = np.zeros((len(depths_um), *lit.shape), np.complex64)
+    out = np.zeros((len(depths_um), *inside_rim.shape), np.complex64)
     for one, depth in zip(out, depths_um, strict=True):
-        one[lit] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
-    return torch.from_numpy(out).to(seen.x_um.device)
+        one[inside_rim] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
+    return torch.from_numpy(out).to(bundle.x_um.device)
 
 
 def landing_offset(
@@ -226,7 +227,7 @@ def _turning(after: Media, p: Tensor) -> Tensor:
 def source_paths(
     layers: Layers,
     tangents: Tensor,
-    seen: Rays,
+    bundle: Rays,
     depths_um: Tensor,
     wavelength_um: float,
 ) -> Paths:
@@ -240,7 +241,7 @@ def source_paths(
     Args:
         layers: films and stop of the lens.
         tangents: tangents of the field angles along x and y.
-        seen: rays of the nodes.
+        bundle: rays of the nodes.
         depths_um: source depths from the lens, um.
         wavelength_um: vacuum wavelength, um.
     """
@@ -248,7 +249,7 @@ def source_paths(
         wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None
     )
     return _source_paths(
-        layers, tuple(tangents.tolist()), seen, tuple(depths_um.tolist()), wave
+        layers, tuple(tangents.tolist()), bundle, tuple(depths_um.tolist()), wave
     )
 
 
@@ -256,12 +257,12 @@ def source_paths(
 def _source_paths(
     layers: Layers,
     tangents: tuple[float, float],
-    seen: Rays,
+    bundle: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
 ) -> Paths:
     """As :func:`source_paths`; without films in front no wavelength is needed."""
-    given = layers, tangents, seen
+    given = layers, tangents, bundle
     if len(depths_um) <= VERGENCES:
         few = _each(*given, depths_um, wavelength_um)
         return Paths(few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device))
@@ -281,14 +282,14 @@ def _source_paths(
 def _each(
     layers: Layers,
     tangents: tuple[float, float],
-    seen: Rays,
+    bundle: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
 ) -> Tensor:
     """(depths, *shape) paths in um, one depth after the other; beyond the rim, behind
     films, those of places at it.
     """
-    x, y = seen.x_um, seen.y_um
+    x, y = bundle.x_um, bundle.y_um
     slope = math.hypot(*tangents)
     p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
     out = []
@@ -318,7 +319,7 @@ def _each(
         else:
             chief = float(media.path_of_reach(before, np.float64(math.hypot(sx, sy))))
             away2 = (x - sx) ** 2 + (y - sy) ** 2
-            away2 = away2.clamp(max=float((away2 * (seen.whole > 0)).max()))
+            away2 = away2.clamp(max=float((away2 * (bundle.whole > 0)).max()))
             out.append(
                 interpolant.chebyshev_interpolant(
                     functools.partial(_chord, before), away2

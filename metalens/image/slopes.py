@@ -18,7 +18,7 @@ def by_nodes(
     content: Tensor,
     depth_um: Tensor,
     *,
-    lit: bool = True,
+    illuminated: bool = True,
     asked: Set[int] | None = None,
 ) -> Tensor:
     """Zeros (frames, *sheets, y, x) whose derivatives by PSFs and depths are those of
@@ -27,12 +27,12 @@ def by_nodes(
     Args:
         field: sampled field or PSFs.
         content, depth_um: (frames, *sheets, y, x) light or coverage, and depth.
-        lit: whether the content is light, which the illumination weighs.
+        illuminated: whether the content is light, which the illumination weighs.
         asked: numbers of the nodes whose derivatives are wanted, the others' being 0;
             None for all.
     """
     shares = depth_shares(depth_um, field.depths_um)
-    about = field.illumination.detach(), lit, asked
+    about = field.illumination.detach(), illuminated, asked
     zeros: Tensor = _ByNodes.apply(field.psf, shares, content, about)  # type: ignore[no-untyped-call]
     return zeros
 
@@ -52,10 +52,10 @@ class _ByNodes(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         psf, shares, content = tuple[Tensor, ...](ctx.saved_tensors)
-        illumination, lit, asked = ctx.about
+        illumination, illuminated, asked = ctx.about
         of_psf, of_depth, *_ = ctx.needs_input_grad
         rows, columns, depths, h, w = psf.shape
-        level = illumination[..., None, None] if lit else torch.ones(1)
+        level = illumination[..., None, None] if illuminated else torch.ones(1)
         deep = spline_coefficients(depths).to(content)
         frame = content.shape[-2:]
         maps = frame_maps((frame[0], frame[1]), psf.shape[:2], content)
@@ -76,12 +76,14 @@ class _ByNodes(torch.autograd.Function):
                     found.append(whole[:h, :w])
                 out[a, b] = torch.einsum("cz,cyx->zyx", deep, torch.stack(found))
             if of_depth:
-                light = (psf[a, b] * level[a, b] if lit else psf[a, b]).to(content)
+                light = (psf[a, b] * level[a, b] if illuminated else psf[a, b]).to(
+                    content
+                )
                 for k, psf_k in enumerate(torch.einsum("cz,zyx->cyx", deep, light)):
                     part = torch.fft.rfft2(psf_k, s=shape).conj() * spectrum
                     whole = torch.fft.irfft2(part, s=shape)
                     back[k] += near * whole[..., : frame[0], : frame[1]]
-        if lit:
+        if illuminated:
             out *= level.to(out)
         return out if of_psf else None, back if of_depth else None, None, None
 
