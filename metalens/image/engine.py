@@ -283,12 +283,10 @@ def _plane_error(prepared: Imager) -> float:
     deep = spline_matrix(torch.linspace(0, 1, count), len(prepared.plan.depths_um))
     light = torch.einsum("cz,abzhw->abchw", deep.to(field.psf), field.light)
     maps = frame_maps(prepared.grid.frame, light.shape[:2], light)
-    wanted = crop_image(plane_images(light, maps), prepared.grid)
+    wanted = prepared.grid.crop(plane_images(light, maps))
     one = torch.ones(1, *prepared.grid.frame).to(field.psf)
     found = [
-        crop_image(
-            prepared.light.blur(one, torch.full_like(one, depth))[0], prepared.grid
-        )
+        prepared.grid.crop(prepared.light.blur(one, torch.full_like(one, depth))[0])
         for depth in depths.tolist()
     ]
     wrong = (torch.stack(found) - wanted).square().mean((1, 2)).max()
@@ -309,7 +307,7 @@ def image_dimming(prepared: Imager) -> float:
     plane = plane_images(light, maps)[0]
     whole, image = (
         float(part.square().mean().sqrt())
-        for part in (plane, crop_image(plane, prepared.grid))
+        for part in (plane, prepared.grid.crop(plane))
     )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
@@ -359,14 +357,3 @@ def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
         weights = optics.light.interpolate(deep, where)
         out.append(torch.einsum("rn,rhw->nhw", weights, optics.light.kernels))
     return torch.stack(out, 1)
-
-
-def crop_image(whole: Tensor, grid: Grid) -> Tensor:
-    """(…, y, x) samples of an image of the whole frame, without margin and spare.
-
-    Args:
-        grid: samples, step, depths and margin of the image.
-    """
-    edge = grid.margin + grid.spare
-    y, x = (slice(edge, edge + n) for n in grid.samples)
-    return whole[..., y, x]

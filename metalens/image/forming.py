@@ -139,12 +139,7 @@ class Imager:
         if not spare:
             return list(parts)
         pad = torch.nn.functional.pad
-        out = []
-        for part in parts:
-            sheets = part if part.ndim == 4 else part[:, None]
-            wide = pad(sheets, (spare, spare, spare, spare), mode="replicate")
-            out.append(wide if part.ndim == 4 else wide[:, 0])
-        return out
+        return [pad(part, (spare,) * 4, mode="replicate") for part in parts]
 
     def _blurred(
         self, content: Tensor, depth_um: Tensor, *, illuminated: bool
@@ -162,11 +157,10 @@ class Imager:
 
     def _returned(self, whole: Tensor, light: Tensor) -> Tensor:
         """The samples that are asked for, with stray light."""
-        edge = self.grid.margin + self.grid.spare
-        y, x = (slice(edge, edge + n) for n in self.grid.samples)
+        image = self.grid.crop(whole)
         if self.stray is None:
-            return whole[..., y, x]
-        return add_stray(whole[..., y, x], light, self.stray, self.grid)
+            return image
+        return add_stray(image, light, self.stray, self.grid)
 
     def scaled(self, factor: float) -> "Imager":
         """The same with so many times the light; stray light stays."""

@@ -92,6 +92,12 @@ class Grid:
             self.margin + self.spare
         )
 
+    def crop(self, whole: Tensor) -> Tensor:
+        """(…, y, x) samples of an image of the whole frame, without margin and spare."""
+        edge = self.margin + self.spare
+        y, x = (slice(edge, edge + n) for n in self.samples)
+        return whole[..., y, x]
+
     @property
     def half_um(self) -> list[float]:
         """[y, x] from the middle of the frame to its last sample: how far the field

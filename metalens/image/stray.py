@@ -199,7 +199,4 @@ def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
         torch.fft.rfft2(part, s=stray.shape) * transfer
         for part, transfer in zip(moved, stray.transfers, strict=True)
     )
-    edge = grid.margin + grid.spare
-    rows, columns = (slice(edge, edge + n) for n in grid.samples)
-    haze: Tensor = torch.fft.irfft2(spectrum, s=stray.shape)[..., rows, columns]
-    return image + haze
+    return image + grid.crop(torch.fft.irfft2(spectrum, s=stray.shape))
