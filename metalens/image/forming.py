@@ -37,16 +37,18 @@ class Imager:
     grid, plan: where the scene is sampled, and where the PSFs are known (one node on the
         axis, and no wavelengths, where they were given for all of the field).
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1.
-    energy: (rows, columns, depths) relative illumination E of each.
+    energy: (rows, columns, depths) relative illumination E of each; of a uniform imager
+        the same at all depths.
     basis: kernels of the PSFs.
     light: what sources give, for every sample of the frame. cover: what coverage does,
         of PSFs of sum 1.
     parts: share of the error by cause: psfs (low rank, and interpolation between field
         points and depths), planes (uniformly illuminated), spectrum, transform,
-        folded (light from beyond the windows that the transform shows in them), polarisation (components
-        of the field that are left out), edge (of light that the rim bends beyond the
-        window), pillars (taken together a few micrometres at a time; 0 of a smooth
-        phase), stop (of its shadow). Of a uniform imager kernels (low rank) alone.
+        folded (light from beyond the windows that the transform shows in them),
+        polarisation (components of the field that are left out), edge (of light that
+        the rim diffracts beyond the window), pillars (taken together a few micrometres
+        at a time; 0 of a smooth phase), stop (of its shadow). Of a uniform imager
+        kernels (low rank) alone.
     stray: light of other diffraction orders, None where the lens has no pillars.
     asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are
         wanted; None for all.
@@ -104,7 +106,7 @@ class Imager:
         return self._returned(occlude(both, covered) * covered.sum(1), light.sum(1))
 
     def _uniform_sheets(self, light: Tensor, cover: Tensor, depth_um: Tensor) -> Tensor:
-        """Light over coverage, blurred alike: constant radiance stays constant.
+        """Light over coverage through the same PSFs: constant radiance stays constant.
 
         The mean is not transformed, so that rounding grows with the contrast alone.
         """
@@ -114,7 +116,8 @@ class Imager:
         mean = whole / covered.clamp_min(1e-30)
         pair = torch.stack([light - mean * cover, cover], 1)
         blurred = self._returned(self.light.blur(pair, depth_um[:, None]), light)
-        return occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
+        image = occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
+        return image * self.energy.mean()
 
     def surface(self, light: Tensor, depth_um: Tensor) -> Tensor:
         """(frames, y, x) irradiance of one opaque surface in place of two sheets.

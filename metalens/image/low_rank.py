@@ -268,6 +268,7 @@ def low_rank_psfs(
     vergence = 1 / float(field.depths_um[0]), 1 / float(field.depths_um[-1])
     transfer = transfer_functions(kernels, shape)
     if field.uniform:
+        weights = weights * field.illumination.flatten()[:, None].to(weights)
         table = depth_table(field.depths_um).to(weights) @ weights
         return LowRankPsfs(kernels, transfer, shape, table.to(psf), vergence)
     weights = match_moments(weights, kernels, psf.flatten(0, 2))

@@ -218,3 +218,11 @@ def test_mismatched_depths_and_shapes_are_refused():
         _imager(STACK[:4])
     with pytest.raises(SceneError, match="shapes"):
         Frames(torch.zeros(2, 3, 4), torch.zeros(2, 3, 4), torch.zeros(2, 3, 4))
+
+
+def test_so_many_times_the_light_is_so_many_times_the_image():
+    frames, made = _eye(), _imager()
+    light, depth = frames.radiance.sum(1), frames.depth_um[:, 1]
+    dim = made.scaled(0.37)
+    assert torch.allclose(dim(frames), 0.37 * made(frames))
+    assert torch.allclose(dim.surface(light, depth), 0.37 * made.surface(light, depth))
