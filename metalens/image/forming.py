@@ -115,7 +115,7 @@ class Imager:
         )
         mean = whole / covered.clamp_min(1e-30)
         pair = torch.stack([light - mean * cover, cover], 1)
-        blurred = self._returned(self.light.blur(pair, depth_um[:, None]), light)
+        blurred = self._returned(self.cover.blur(pair, depth_um[:, None]), light)
         image = occlude(blurred[:, 0], blurred[:, 1]) + mean[:, 0]
         return image * self.energy.mean()
 
@@ -259,8 +259,10 @@ def _assembled(
     parts: Mapping[str, float],
 ) -> Imager:
     few = max(round(COVER_SHARE * len(basis.mixture)), COVER_FEWEST)
-    light = cover = low_rank_psfs(found, basis, grid.frame)
-    if not found.uniform:
+    light = low_rank_psfs(found, basis, grid.frame)
+    if found.uniform:
+        cover = replace(light, table=light.table / found.illumination.mean())
+    else:
         cover = low_rank_psfs(found, basis, grid.frame, rank=few, illuminated=False)
     given = found.psf, found.illumination, basis, light, cover, parts
     return Imager(grid, plan, *given)
