@@ -44,7 +44,7 @@ PLACES = (
 )
 # of the tolerance: kernels, whose number is what an image costs, and each of six other
 # causes; in quadrature all of it
-KERNELS, OTHERS = 0.8, 0.6 / math.sqrt(6)
+KERNELS, OTHERS = 0.75, 0.27
 
 
 @dataclass(frozen=True, slots=True)
