@@ -96,8 +96,9 @@ def imager(
     given = optics, scene_grid, source, middle
 
     def build(within: float) -> Imager:
-        about = {"folds": round_, "polarisation": polarisation}
-        plan = plan_nodes(*given, tolerance=within, **about)
+        plan = plan_nodes(
+            *given, tolerance=within, folds=round_, polarisation=polarisation
+        )
         stack, energy = node_psfs(optics, plan, device)
         with torch.no_grad():
             return build_imager(scene_grid, plan, stack, energy, tolerance=within)
@@ -145,7 +146,8 @@ def node_psfs(
     else:
         at = plan.places_um.to(device)
         light = sum_over_spectrum(optics, at, plan.depths_um, plan.waves, plan.window)
-        light = light.unflatten(0, (len(plan.y_um), len(plan.x_um)))
+        size = len(plan.y_um), len(plan.x_um)
+        light = light.reshape(*size, *light.shape[1:])
     return normalise_psfs(light, optics, plan)
 
 

@@ -269,8 +269,13 @@ def _assembled(
 
 
 def occlude(light: Tensor, cover: Tensor) -> Tensor:
-    """Near sheet over far sheet: (frames, 2, y, x) blurred light and coverage to the
-    (frames, y, x) light of what is visible, over its coverage.
+    """(frames, y, x) radiance of a near sheet over a far one that goes on behind it.
+
+    (L_near + b L_far) / (C_near + b C_far) with b = (1 - C_near) / C_far, which fades
+    where the far sheet covers less than :data:`FAINT`.
+
+    Args:
+        light, cover: (frames, 2, y, x) blurred light L and coverage C, near first.
     """
     free = (1 - cover[:, 0]).clamp(0, 1)
     share = (cover[:, 1] / FAINT).clamp(0, 1)

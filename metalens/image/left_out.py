@@ -210,7 +210,9 @@ def _of_pillars(
         place.cpu() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     )
     angle = torch.atan(tangents).tolist()
-    t = wave.answer(wavelength_um, math.atan(math.hypot(*tangents.tolist()))).cpu()
+    t = wave.pillar_transmission(
+        wavelength_um, math.atan(math.hypot(*tangents.tolist()))
+    ).cpu()
     about: dict[str, Any] = {
         "pitch_um": wave.pitch_um,
         "wavelength_um": wavelength_um,

@@ -144,19 +144,20 @@ def plan_nodes(
 ) -> Plan:
     """The fewest nodes that interpolate the PSFs within their shares of the tolerance.
 
-    Tried on a line across the field (at 0.6 of its half height), whose points in
-    between judge every candidate, for
-    the nearest, the middle and the farthest depth. A whole spectrum is used from the
-    start, coarse for the line. Of the
-    field one scalar is taken where its error (:func:`unpolarised`) is below the
-    tolerance, else as many components of
-    both polarisations as their share asks for, as ``polarisation`` says.
+    Field nodes are tried on a line at 0.6 of the half height, depth nodes at two field
+    points; PSFs half-way between the nodes judge each number. The spectrum of these
+    trials is coarse. The window follows from what the transform folds back and neglects
+    (:mod:`metalens.image.left_out`), its components from
+    :func:`metalens.image.left_out.choose_polarisation`.
 
     Args:
         optics: lens, light and distances at the nodes.
         grid: samples, step, depths and margin of the image.
         source: spectrum of the source.
         middle_um: (x, y) field point in the middle, um on the sensor.
+        tolerance: relative L2 error of the image; each cause takes its share.
+        folds: whether the lens is round and the grid on its axis.
+        polarisation: see :func:`metalens.image.imager`.
 
     Raises:
         SceneError: tolerance not above 0, or not met with ``MOST`` nodes along an axis.

@@ -119,7 +119,8 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
         light = sum_over_spectrum(
             optics, plan.places_um, plan.depths_um, plan.waves, plan.window
         )
-    return light.unflatten(0, (len(plan.y_um), len(plan.x_um))).requires_grad_()
+    size = len(plan.y_um), len(plan.x_um)
+    return light.reshape(*size, *light.shape[1:]).requires_grad_()
 
 
 def surrogate_loss(

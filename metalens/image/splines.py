@@ -46,7 +46,7 @@ def spline_matrix(unit: Tensor, nodes: int) -> Tensor:
     """(positions, nodes) interpolation at positions 0 … 1 of an axis, float64.
 
     Args:
-        unit: places between the nodes, in steps.
+        unit: (positions,) from the first node, 0, to the last, 1.
     """
     first, taps = spline_taps(unit.double(), nodes)
     coefficients = spline_coefficients(nodes)

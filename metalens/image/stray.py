@@ -176,7 +176,8 @@ def _middle(light: Array, place_um: Array, count: int) -> Array:
     if not len(bright):
         return np.zeros(count)
     found = light[bright] @ place_um.ravel() / given[bright]
-    return np.interp(np.linspace(0, len(light) - 1, count), bright, found)
+    every = np.linspace(0, len(light) - 1, count)
+    return np.asarray(np.interp(every, bright, found))
 
 
 def _reduced(optics: Optics, depth_um: float) -> float:

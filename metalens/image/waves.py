@@ -182,17 +182,21 @@ class PillarWave:
         y, x = (n + (-n) % self._block for n in self.diameter_um.shape)
         return y, x
 
-    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none, with the factor of
-        its neighbours; as
-        :meth:`factor` asks for them."""
-        return self._among(
+    def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex transmission of every pillar, 0 where there is none, with the
+        factor of its neighbours.
+
+        Args:
+            wavelength_um: vacuum wavelength, um. angle_rad: of incidence, used where
+                the library has angles.
+        """
+        return self._with_neighbours(
             self._pillars(
                 wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
             )[0]
         )
 
-    def _among(self, t: Tensor) -> Tensor:
+    def _with_neighbours(self, t: Tensor) -> Tensor:
         """With the factor of unlike neighbours where the lens holds their rows."""
         if self.lens.neighbours is None:
             return t
@@ -272,7 +276,7 @@ class PillarWave:
         """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
         rest = torch.view_as_real(
-            self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)
+            self._with_neighbours(t) * torch.polar(torch.ones_like(ideal), -ideal)
         ).permute(2, 0, 1)
         layers = torch.cat([rest, open_[None]])
         pad = (

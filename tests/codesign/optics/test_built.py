@@ -72,7 +72,7 @@ def test_every_pillar_can_be_asked_as_it_was_made():
     got = (
         built.MadeLens(m.small(), m.OPTICS)
         .stack(X)
-        .plane.wave.answer(0.85, 0.0)
+        .plane.wave.pillar_transmission(0.85, 0.0)
         .numpy()
     )
     assert (
