@@ -113,9 +113,15 @@ def solvers_at_common_discretization(
             )
             for light in lights
         ]
-    make = _modal_levels if engine == "modal" else _rcwa_levels
     of_lights = [
-        [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
+        [
+            functools.cache(level)
+            for level in (
+                _modal_levels(cell, light, tolerance)
+                if engine == "modal"
+                else _rcwa_levels(cell, light, span_um[1], tolerance)
+            )
+        ]
         for light in lights
     ]
     levels = list(zip(*of_lights, strict=True))
@@ -178,33 +184,15 @@ def _first_converged(
 
 
 def _modal_levels(
-    cell: Cell, light: Incidence, largest_um: float, tolerance: float
+    cell: Cell, light: Incidence, tolerance: float
 ) -> list[Callable[[float], Response]]:
-    """One mesh a level: the one that the ladder takes for the largest diameter."""
-    from metalens.modal import RUNGS, MeshLevel, case_of, first_rung, solve_on_mesh
+    """One level of the modal method each."""
+    from metalens.modal import LEVELS, case_of, solve_level
 
-    def level(rung: MeshLevel) -> Callable[[float], Response]:
-        mesh = rung.choice(largest_um / cell.pitch_um)
+    def respond(level: int, diameter_um: float) -> Response:
+        return solve_level(case_of(cell, diameter_um, light), level, tolerance)
 
-        def at(diameter_um: float) -> Response:
-            case = case_of(cell, diameter_um, light)
-            made = solve_on_mesh(case, mesh.plan, weak=rung.weak)
-            error = rung.error(made, case.rho, mesh=mesh)
-            t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
-            return Response(
-                t,
-                r,
-                error,
-                made.unknowns,
-                made.energy,
-                "modal",
-                error <= tolerance,
-                f"mesh {rung.name}",
-            )
-
-        return at
-
-    return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
+    return [functools.partial(respond, level) for level in range(1, len(LEVELS))]
 
 
 def _rcwa_levels(

@@ -1,6 +1,5 @@
 from .case import case_of as case_of
-from .engine import solve as solve
 from .engine import solve_on_mesh as solve_on_mesh
-from .ladder import RUNGS as RUNGS
-from .ladder import MeshLevel as MeshLevel
-from .ladder import first_rung as first_rung
+from .solver import LEVELS as LEVELS
+from .solver import solve as solve
+from .solver import solve_level as solve_level

@@ -1,28 +1,15 @@
-"""From a cell, a size and a plane wave to the numbers of one modal case, and those of
-its solution; refuses what the
-elements cannot follow."""
+"""From a cell, a size and a plane wave to the numbers of one modal case; refuses what
+the elements cannot follow.
+"""
 
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from metalens.cell import Cell, Film, Incidence, index
 from metalens.core.errors import CellError
 
-LEAST_CONTRAST = (
-    2.0  # of permittivities, of a pillar that is told from its surroundings
-)
-LOW, TALL = 0.5, 16.0  # heights in half pitches
-DENSE, ORDERS = 2.0, 1.05  # waves in a pitch, in the layer and in the half-spaces
-STEEP_RAD = 1.0  # half Bloch phase
-GUIDING = 1.2  # permittivity between pillars over that of the denser half-space
-RARER = 3.0
-NORMAL_RAD = (
-    1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
-)
-
-
+# of Bloch phase: below, t differs from normal incidence by less than 1e-12
+NORMAL_RAD = 1e-6
 Films = tuple[tuple[complex, float], ...]  # permittivity, thickness
 
 
@@ -30,10 +17,11 @@ Films = tuple[tuple[complex, float], ...]  # permittivity, thickness
 class ModalCase:
     """One problem in half pitches: what the linear algebra needs.
 
-    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above:
-    permittivities of the
-    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the
-    electric field.
+    rho: diameter over pitch. k0, height: vacuum wavenumber and height.
+    below, above: permittivities of the half-spaces. disc, around: of the layer.
+    bloch: kx. p: whether the plane of incidence holds the electric field of oblique
+        light.
+    under, over: films, nearest to the layer first.
     """
 
     rho: float
@@ -47,73 +35,6 @@ class ModalCase:
     p: bool
     under: Films = ()
     over: Films = ()
-
-    @property
-    def size(self) -> float:
-        """Waves in a pitch, in the denser medium of the layer."""
-        return self.k0 * math.sqrt(max(abs(self.disc), abs(self.around))) / math.pi
-
-    @property
-    def regime_factor(self) -> float:
-        """0 in the regime that the error factors are calibrated for, else 1; ``RARER``
-        for a disc of the rarer medium.
-
-        The regime: a pillar of the denser medium, a quarter to eight pitches high, at
-        most two waves in a pitch, no order but zero at normal incidence, moderate
-        angles, between media hardly denser than either half-space. Outside it the forms
-        on a coarse mesh err more alike. If the layer between the pillars guides light,
-        resonances are narrow and the bound may be too small by 2 times.
-        """
-        disc, around = abs(self.disc), abs(self.around)
-        outside = self.k0 * math.sqrt(max(self.below, self.above)) / math.pi
-        if disc < around:
-            return RARER
-        usual = (
-            (disc >= LEAST_CONTRAST * around or self.disc.imag > disc / 2)
-            and LOW <= self.height <= TALL
-            and self.size <= DENSE
-            and outside <= ORDERS
-            and self.bloch <= STEEP_RAD
-            and around <= GUIDING * max(self.below, self.above)
-        )
-        return 0.0 if usual else 1.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class MeshSolution:
-    """Solution on one mesh.
-
-    matrix: (2, 2) zero-order scattering matrix, mean of both forms.
-    waves, rim: half the difference of the forms, by the wavenumbers of the layer modes
-        and beyond.
-    drift: change of the matrix per relative error of the transverse wavenumbers squared
-        of the layer modes, which both forms share.
-    energy: mean of both forms. unknowns: of both forms.
-    grazing: change of the matrix for what the mesh misplaces cutoffs.
-    cutoff: how near an order is to its cutoff, see
-        :func:`metalens.modal.match.cutoff_proximity`.
-    bloch: half the Bloch phase. size: wavelengths in a pitch, in the densest medium.
-    regime_factor: as in :class:`ModalCase`; where it is not 0, damping of round trips
-        in the layer.
-    """
-
-    matrix: np.ndarray
-    waves: float
-    rim: float
-    drift: float
-    energy: float
-    unknowns: int
-    grazing: float = 0.0
-    cutoff: float = 0.0
-    bloch: float = 0.0
-    size: float = 0.0
-    regime_factor: float = 0.0
-    damping: float = 1.0
-
-    @property
-    def spread(self) -> float:
-        """Half of how far the forms are apart, waves and rim together."""
-        return self.waves + self.rim
 
 
 def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
@@ -138,6 +59,8 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
         abs(math.sin(light.angle_rad)),
     )
     bloch = k0 * sine * half
+    if bloch <= NORMAL_RAD:
+        bloch = 0.0
 
     def films(stack: tuple[Film, ...]) -> Films:
         return tuple(
@@ -153,8 +76,8 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
         above=above.real**2,
         disc=disc**2,
         around=around**2,
-        bloch=bloch if bloch > NORMAL_RAD else 0.0,
-        p=light.polarization in ("p", along),
+        bloch=bloch,
+        p=bloch > 0 and light.polarization in ("p", along),
         under=films(cell.under),
         over=films(cell.over[::-1]),
     )

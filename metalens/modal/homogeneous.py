@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
 
 from metalens.modal.dense import congruence_product, eigen_pairs, gram_matrix
 from metalens.modal.spaces import SymmetryClass
@@ -59,73 +58,8 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
     return out
 
 
-def gradient_modes(
-    space: SymmetryClass, lower: np.ndarray, *, careful: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transverse wavenumbers squared and scalar fields of the gradients (TM), and a full
-    orthogonal basis, gradients first.
-
-    The basis is in coordinates ``lower.T @ field``, in which the mass matrix is the
-    identity.
-
-    Args:
-        space: the symmetry class. lower: Cholesky factor of its mass.
-        careful: take singular values instead of eigenvalues of the squared problem: nearly
-            uniform gradients keep all digits, at twice the cost.
-    """
-    g = space.gradient
-    if careful:
-        scalar_lower = np.linalg.cholesky(space.cell.scalar)
-        factor = sl.solve_triangular(
-            scalar_lower, (lower.T @ g).T, lower=True, check_finite=False
-        ).T
-        left, value, right = np.linalg.svd(factor, full_matrices=True)
-        order = np.argsort(value)
-        left[:, : len(value)] = left[:, order]
-        scalar = sl.solve_triangular(
-            scalar_lower, right[order].T, trans="T", lower=True, check_finite=False
-        )
-        return value[order] ** 2, scalar, left
-    tm, scalar = sl.eigh(
-        g.T @ space.cell.mass @ g, space.cell.scalar, check_finite=False
-    )
-    normal = lower.T @ ((g @ scalar) / np.sqrt(tm))
-    q = sl.qr(normal, check_finite=False)[0]
-    q[:, : len(tm)] = normal
-    return tm, scalar, q
-
-
-def homogeneous_modes(
-    space: SymmetryClass, *, careful: bool = False, quick: bool = False
-) -> HomogeneousBasis:
-    """Eigenmodes of the empty cell: TM modes from the gradients, TE modes from their
-    complement.
-
-    Args:
-        space: the symmetry class. careful: as in :func:`gradient_modes`.
-        quick: allow :func:`quick_modes`.
-    """
-    if quick and not careful:
-        return quick_modes(space)
-    lower = np.linalg.cholesky(space.cell.mass)
-    tm, scalar, orthogonal = gradient_modes(space, lower, careful=careful)
-    vector = sl.solve_triangular(
-        lower, orthogonal, trans="T", lower=True, check_finite=False
-    )
-    rest = vector[:, len(tm) :]
-    te, mix = np.linalg.eigh(rest.T @ space.cell.curl @ rest)
-    rest = rest @ mix
-    vector = np.concatenate([rest, vector[:, : len(tm)]], 1)
-    disc = (
-        congruence_product(space.disc.mass, vector),
-        congruence_product(space.disc.curl, rest),
-    )
-    return assemble_basis(space, te, tm, lambda: vector, scalar, disc)
-
-
-def quick_modes(space: SymmetryClass) -> HomogeneousBasis:
-    """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients, half the
-    time of :func:`homogeneous_modes`.
+def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
+    """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients.
 
     The curl knows the cotree unknowns alone: with G the gradients, K = G^T mass G, the TM
     modes solve K f = tm scalar f, and the TE modes are x on the cotree less its projection

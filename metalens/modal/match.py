@@ -8,16 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.modal.case import Films
-from metalens.modal.dense import cholesky_factor, solve_lower
-from metalens.modal.few_modes import FewModes
+from metalens.modal.few_modes import FewModes, LayerPencil
 from metalens.modal.homogeneous import HomogeneousBasis
 from metalens.modal.layer import LayerModes, axial_wavenumber
-from metalens.modal.pencil import LayerPencil
 
 # relative distance of k² from its cutoff within which an order takes its exact
 # wavenumber
 NEAR = 0.4
-AT = 0.1  # and within which it counts as at its cutoff
 KNOWN = 0.02  # relative error of k² up to which a mode of the mesh is that order
 # modes that decay below this over the height cannot change a result of double precision
 CARRY = 1e-13
@@ -138,18 +135,6 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     return out
 
 
-def cutoff_proximity(cutoff: float, bloch: float) -> float:
-    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over the
-    distance, to 0 at ``NEAR``.
-
-    Args:
-        cutoff: k0^2 times the permittivity. bloch: kx.
-    """
-    exact = lattice_wavenumbers(cutoff, bloch)
-    apart = float(np.abs(exact[exact > bloch**2 * (1 + 1e-9)] / cutoff - 1).min())
-    return min(1.0, max(0.0, (NEAR / max(apart, AT) - 1) / (NEAR / AT - 1)))
-
-
 def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
     """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
     reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
@@ -163,55 +148,67 @@ def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerInterface:
-    """One end of the layer, seen by its carrying modes and by the propagating orders
-    (power-normalised).
+    """Scattering at one end of the layer, between the modes that carry light over it and
+    the propagating orders (power-normalised).
 
-    reflect: (carry, carry) of layer modes; enter: (carry, ports); leave: (ports,
-    carry); back: (ports, ports).
-    inward: (n, carry + ports) amplitudes of all layer modes going in, per carrying mode
-    that arrives (its own
-    incoming amplitude left out) and per order that arrives.
+    reflect: (carry, carry) of layer modes. enter: (carry, ports). leave: (ports,
+        carry). back: (ports, ports).
     """
 
     reflect: np.ndarray
     enter: np.ndarray
     leave: np.ndarray
     back: np.ndarray
-    inward: np.ndarray
+
+
+def interface_blocks(
+    green: np.ndarray, norm: np.ndarray, rate: np.ndarray, half: HalfSpace
+) -> LayerInterface:
+    """Blocks of an interface from G = columns^T (Y_layer + Y_half)^-1 columns, with the
+    partners of the carrying modes and the ports as columns.
+
+    Args:
+        green: (carry + ports, carry + ports) G. norm: (carry, carry) partners with fields.
+        rate: (carry,) i q. half: the half-space.
+    """
+    c, through = len(rate), half.transfer
+    weight = 2 * np.concatenate([rate, through])
+    arrive = np.linalg.solve(norm, green[:c]) * weight
+    leaving = through[:, None] * green[c:] * weight
+    return LayerInterface(
+        reflect=arrive[:, :c] - np.eye(c),
+        enter=arrive[:, c:],
+        leave=leaving[:, :c],
+        back=leaving[:, c:] + np.diag(half.reflection),
+    )
 
 
 def layer_interface(
     layer: LayerModes, carry: np.ndarray, half: HalfSpace
 ) -> LayerInterface:
-    """Blocks of the scattering at a half-space, from all modes of the layer.
+    """Scattering at a half-space, from all modes of the layer.
 
     Args:
         layer: modes. carry: places of those that travel. half: the half-space.
     """
-    ports = half.ports
-    rate, c = 1j * layer.q, len(carry)
+    rate = 1j * layer.q
     columns = np.concatenate(
-        [layer.partner[:, carry], np.eye(len(half.admittance))[:, ports]], 1
+        [layer.partner[:, carry], np.eye(len(half.admittance))[:, half.ports]], 1
     )
-    real = np.isrealobj(layer.field) and half.lossless
-    near_rate = -np.abs(rate) if real else rate
-    near = half.real_admittance() if real else half.admittance
     inward = np.linalg.solve(
-        layer.partner * near_rate + near[:, None] * layer.field, columns
+        layer.partner * rate + half.admittance[:, None] * layer.field, columns
     )
-    return correct_stand_ins(
-        columns.T @ (layer.field @ inward),
-        inward,
-        columns[:, :c].T @ layer.field[:, carry],
-        InterfaceRates(rate[carry], near_rate[carry], near[ports], half),
-    )
+    green = columns.T @ (layer.field @ inward)
+    norm = columns[:, : len(carry)].T @ layer.field[:, carry]
+    return interface_blocks(green, norm, rate[carry], half)
 
 
 def few_interface(
     pencil: LayerPencil, modes: FewModes, half: HalfSpace
 ) -> LayerInterface:
-    """Blocks of the scattering at a half-space, from the modes that carry and the real
-    admittance of all others.
+    """Scattering at a half-space, from the modes that carry and the real admittance of
+    all others; what is real in place of the travelling waves is corrected after
+    (Woodbury).
 
     Args:
         pencil: of the layer. modes: those that carry. half: the half-space.
@@ -224,163 +221,33 @@ def few_interface(
     pencil.tm_turn.onto(operator[a:, a:], near[a:])
     fed = np.zeros((len(operator), len(ports)))
     te = ports < a
-    fed[:a, te], fed[a:, ~te] = (
-        pencil.te_turn.rows(ports[te]).T,
-        pencil.tm_turn.rows(ports[~te] - a).T,
-    )
-    partner = modes.partner
-    parts = [partner.real, partner.imag] if np.iscomplexobj(partner) else [partner]
-    columns = np.concatenate([*parts, fed], 1)
-    found = solve_symmetric(operator, a, columns, first=not pencil.dual)
-    green = columns.T @ found
-    if len(parts) == 2:
-        whole = np.zeros((2 * c + len(ports), c + len(ports)), complex)
-        whole[:c, :c], whole[c : 2 * c, :c], whole[2 * c :, c:] = (
-            np.eye(c),
-            1j * np.eye(c),
-            np.eye(len(ports)),
-        )
-        green, found = whole.T @ green @ whole, found @ whole
-    return correct_stand_ins(
-        green,
-        found,
-        partner.T @ modes.field,
-        InterfaceRates(1j * modes.q, np.full(c, modes.near_rate), near[ports], half),
-    )
+    fed[:a, te] = pencil.te_turn.rows(ports[te]).T
+    fed[a:, ~te] = pencil.tm_turn.rows(ports[~te] - a).T
+    columns = np.concatenate([modes.partner, fed], 1)
+    green = columns.T @ solve_real(operator, columns)
+    norm = modes.partner.T @ modes.field
+    rate = 1j * modes.q
+    correction = np.zeros((c + len(ports), c + len(ports)), complex)
+    correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rate - modes.near_rate)).T
+    correction[c:, c:] = np.diag(half.admittance[ports] - near[ports])
+    green = green @ np.linalg.inv(np.eye(c + len(ports)) + correction @ green)
+    return interface_blocks(green, norm, rate, half)
 
 
-def solve_symmetric(
-    operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool
-) -> np.ndarray:
-    """operator⁻¹ columns, symmetric: the definite block goes first, in three quarters
-    of the time of a plain solve.
-
-    The first ``a`` unknowns are negative definite (``first``), or the others positive
-    definite; if not, the plain way.
-    """
-    if not first:
-        swapped, fed = np.roll(-operator, (-a, -a), (0, 1)), np.roll(-columns, -a, 0)
-        return np.roll(
-            solve_symmetric(swapped, len(operator) - a, fed, first=True), a, 0
-        )
-    try:
-        lower = cholesky_factor(-operator[:a, :a])
-    except np.linalg.LinAlgError:
+def solve_real(operator: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """operator^-1 columns of a real operator, for columns that may be complex."""
+    if not np.iscomplexobj(columns):
         return np.linalg.solve(operator, columns)
-    across, fed = (
-        solve_lower(lower, operator[:a, a:]),
-        solve_lower(lower, columns[:a]),
-    )
-    rest = np.linalg.solve(
-        operator[a:, a:] + across.T @ across, columns[a:] + across.T @ fed
-    )
-    return np.concatenate(
-        [solve_lower(lower, across @ rest - fed, transposed=True), rest]
-    )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class InterfaceRates:
-    """i q of the carrying modes, true and as the operator holds them; admittances of
-    the ports as it holds them; the half-space.
-    """
-
-    mode: np.ndarray
-    near_mode: np.ndarray
-    near_port: np.ndarray
-    half: HalfSpace
-
-
-def correct_stand_ins(
-    green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: InterfaceRates
-) -> LayerInterface:
-    """Blocks from (Y_layer + Y_half)^-1 with its real stand-ins corrected (Woodbury).
-
-    Args:
-        green: of partners and ports with the solution; inward: the solution.
-        norm: partners with fields. rates: true values and stand-ins.
-    """
-    c, m = len(rates.mode), len(green)
-    port = rates.half.admittance[rates.half.ports]
-    if (rates.mode != rates.near_mode).any() or (port != rates.near_port).any():
-        correction = np.zeros((m, m), complex)
-        correction[:c, :c] = np.linalg.solve(
-            norm.T, np.diag(rates.mode - rates.near_mode)
-        ).T
-        correction[c:, c:] = np.diag(port - rates.near_port)
-        mend = np.linalg.inv(np.eye(m) + correction @ green)
-        green, inward = green @ mend, inward @ mend
-    through = rates.half.transfer
-    weight = 2 * np.concatenate([rates.mode, through])
-    arrive = np.linalg.solve(norm, green[:c]) * weight
-    return LayerInterface(
-        reflect=arrive[:, :c] - np.eye(c),
-        enter=arrive[:, c:],
-        leave=through[:, None] * green[c:, :c] * weight[:c],
-        back=through[:, None] * green[c:, c:] * weight[c:]
-        + np.diag(rates.half.reflection),
-        inward=inward * weight,
-    )
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ScatteringMatch:
-    """Scattering matrix over the ports of both sides, below first, and what it was made
-    from.
-
-    carry: the modes that travel; round_trip: (2 carry, 2 carry) system of their
-    amplitudes, waves up at the foot
-    first, then waves down at the top; amplitude: (2 carry, ports) its solution for unit
-    power into each port.
-    travel: (carry,) their factors exp(i q h).
-    """
-
-    matrix: np.ndarray
-    carry: np.ndarray
-    travel: np.ndarray
-    foot: LayerInterface
-    top: LayerInterface
-    round_trip: np.ndarray
-    amplitude: np.ndarray
-
-    @property
-    def damping(self) -> float:
-        """Least singular value of the round trip: what the waves least damped lose, or
-        come back out of step by.
-        """
-        return float(np.linalg.svd(self.round_trip, compute_uv=False).min(initial=1.0))
-
-    def rate(self, moved: np.ndarray) -> np.ndarray:
-        """Derivatives (..., ports, ports) of the scattering matrix, given those (...,
-        carry) of the factors exp(i q h)
-        of the carrying modes."""
-        c, x = len(self.carry), self.travel[:, None]
-        down, up = (
-            moved[..., None] * self.amplitude[c:],
-            moved[..., None] * self.amplitude[:c],
-        )
-        push = np.concatenate([self.foot.reflect @ down, self.top.reflect @ up], -2)
-        echo = np.linalg.solve(self.round_trip, push)
-        down, up = down + x * echo[..., c:, :], up + x * echo[..., :c, :]
-        out: np.ndarray = np.concatenate(
-            [self.foot.leave @ down, self.top.leave @ up], -2
-        )
-        return out
-
-
-def exchange_waves(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """[[0, foot x], [top x, 0]]: waves that crossed the layer meet the other end."""
-    c = len(x)
-    out = np.zeros((len(foot) + len(top), 2 * c), complex)
-    out[: len(foot), c:], out[len(foot) :, :c] = foot * x, top * x
-    return out
+    both = np.linalg.solve(operator, np.concatenate([columns.real, columns.imag], 1))
+    half = columns.shape[1]
+    return np.asarray(both[:, :half] + 1j * both[:, half:])
 
 
 def scattering_matrix(
     layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
-) -> ScatteringMatch:
-    """Scattering matrix of a layer between half-spaces, from all its modes: symmetric, and
-    unitary where lossless.
+) -> np.ndarray:
+    """Scattering matrix of a layer between half-spaces, from all its modes, over the ports
+    of both sides, below first: symmetric, and unitary where lossless.
 
     Args:
         layer: modes. height: of the layer. below, above: half-spaces.
@@ -390,7 +257,6 @@ def scattering_matrix(
     return join_interfaces(
         layer_interface(layer, carry, below),
         layer_interface(layer, carry, above),
-        carry,
         travel[carry],
     )
 
@@ -401,37 +267,40 @@ def few_scattering(
     height: float,
     below: HalfSpace,
     above: HalfSpace,
-) -> ScatteringMatch:
-    """As :func:`scattering_matrix`, from few modes; ``carry`` counts them, and ``inward``
-    is in the pencil's coordinates.
+) -> np.ndarray:
+    """As :func:`scattering_matrix`, from the few modes that carry.
 
     Args:
         pencil, modes: of the layer. height: of the layer. below, above: half-spaces.
     """
-    foot, top = few_interface(pencil, modes, below), few_interface(pencil, modes, above)
-    return join_interfaces(
-        foot, top, np.arange(len(modes.q)), np.exp(1j * modes.q * height)
-    )
+    foot, top = (few_interface(pencil, modes, half) for half in (below, above))
+    return join_interfaces(foot, top, np.exp(1j * modes.q * height))
 
 
 def join_interfaces(
-    foot: LayerInterface, top: LayerInterface, carry: np.ndarray, x: np.ndarray
-) -> ScatteringMatch:
+    foot: LayerInterface, top: LayerInterface, x: np.ndarray
+) -> np.ndarray:
     """Scattering matrix of a layer from both its interfaces, by the round trips of the
     carrying modes.
 
     Args:
-        foot, top: interfaces. carry: places of the modes. x: (c,) factors exp(iqh).
+        foot, top: interfaces. x: (c,) factors exp(iqh) of the modes.
     """
-    c, n = len(carry), len(foot.back)
-    round_trip = np.eye(2 * c) - exchange_waves(foot.reflect, top.reflect, x)
+    c, n = len(x), len(foot.back)
+
+    def cross(up: np.ndarray, down: np.ndarray) -> np.ndarray:
+        """[[0, up x], [down x, 0]]: waves that crossed the layer meet the other end."""
+        out = np.zeros((len(up) + len(down), 2 * c), complex)
+        out[: len(up), c:], out[len(up) :, :c] = up * x, down * x
+        return out
+
     source = np.zeros((2 * c, n + len(top.back)), complex)
     source[:c, :n], source[c:, n:] = foot.enter, top.enter
-    amplitude = np.linalg.solve(round_trip, source)
-    matrix = exchange_waves(foot.leave, top.leave, x) @ amplitude
+    round_trip = np.eye(2 * c) - cross(foot.reflect, top.reflect)
+    matrix = cross(foot.leave, top.leave) @ np.linalg.solve(round_trip, source)
     matrix[:n, :n] += foot.back
     matrix[n:, n:] += top.back
-    return ScatteringMatch(matrix, carry, x, foot, top, round_trip, amplitude)
+    return matrix
 
 
 def zero_order(

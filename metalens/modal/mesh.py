@@ -38,11 +38,11 @@ class MeshPlan:
     radial: int
     angular: int
     outside: int
-    exponents: tuple[float, ...] = (0.7,)
+    exponents: tuple[float, ...] = (0.7, 1.3)
     inner: tuple[float, ...] = (1.0,)
     outer: tuple[float, ...] = (1.0,)
     sectors: tuple[float, ...] = (1.0,)
-    core: float = 0.5
+    core: float = 0.6
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -14,16 +14,16 @@ from metalens.cell.record import Cell, Film, Index
 from metalens.core.errors import CellError
 from metalens.modal.assembly import assemble_disc
 from metalens.modal.case import case_of
-from metalens.modal.engine import geometric_mean, nearest_pairs, solve_on_mesh
+from metalens.modal.engine import geometric_mean, solve_on_mesh
 from metalens.modal.homogeneous import homogeneous_modes
-from metalens.modal.ladder import RUNGS
 from metalens.modal.mesh import X0, X1, MeshPlan, build_mesh
 from metalens.modal.shapes import polynomial_interval, rim_interval, square_basis
+from metalens.modal.solver import LEVELS
 from metalens.modal.spaces import build_symmetry_class
 
 WAVELENGTH = 0.85
 PLAN = MeshPlan(3, 3, 3, (0.7, 1.3))
-COARSE = RUNGS[0].choice(0.5).plan
+COARSE = LEVELS[0]
 
 
 def cell(height=0.7, n=3.6, k=0.0, pitch=0.4, substrate=1.4525, cover=1.0, between=1.0):
@@ -38,21 +38,6 @@ def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):
     t12 = 2 * np.sqrt(below * n) / (below + n) * 2 * np.sqrt(n * above) / (n + above)
     phase = np.exp(2j * np.pi * n * height / wavelength)
     return t12 * phase / (1 + r1 * r2 * phase**2)
-
-
-# --- both forms
-# -----------------------------------------------------------------------------------------------
-
-
-def test_modes_of_both_forms_are_paired_by_nearness_not_by_order():
-    """Two close modes that change places, and a third that only one form has."""
-    one, other = (
-        np.array([9.1, 4.02, 4.0 + 0.3j, 1.5]),
-        np.array([9.0, 4.01 + 0.29j, 4.05]),
-    )
-    pairs = nearest_pairs(one, other)
-    assert sorted(map(tuple, pairs.tolist())) == [(0, 0), (1, 2), (2, 1)]
-    assert nearest_pairs(one, other[:0]).shape == (0, 2)
 
 
 # --- elements

@@ -1,0 +1,133 @@
+"""The public solve: polynomial degrees raised until the error estimate meets the
+tolerance.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from metalens import rcwa
+from metalens.cell import Cell, Incidence, Polarization, Response, check_tolerance
+from metalens.modal.case import ModalCase, case_of
+from metalens.modal.engine import MeshSolution, solve_on_mesh
+from metalens.modal.mesh import MeshPlan
+from metalens.modal.tilted import solve_tilted
+
+
+def mesh_of_degree(degree: int) -> MeshPlan:
+    """Mesh of a polynomial ``degree``, one more along the rim, where the gap between
+    wide discs varies.
+
+    From degree 5 on rings narrow geometrically towards the rim: the field is singular
+    there, and degree alone gains little.
+    """
+    ends = tuple(
+        GRADING**k for k in range((degree - 3) // 2 if degree > 4 else 0, 0, -1)
+    )
+    inner = tuple(1 - end for end in reversed(ends))
+    return MeshPlan(degree, degree + 1, degree, inner=(*inner, 1.0), outer=(*ends, 1.0))
+
+
+GRADING = 0.15
+LEVELS = tuple(mesh_of_degree(degree) for degree in range(2, 8))
+SAFETY = 2.0
+ROUNDING = 1e-12
+
+
+def estimate_error(coarser: MeshSolution, finer: MeshSolution) -> float:
+    """Error estimate of the ``finer`` of two successive levels: ``SAFETY`` times the
+    geometric mean of its change from the ``coarser`` and half the difference of its two
+    forms, but at least that half.
+
+    Both forms bound the answer from opposite sides where waves are smooth; what they
+    have wrong alike shows in the change, which is the error of the coarser level.
+    """
+    change = float(np.abs(finer.matrix - coarser.matrix).max())
+    half = finer.half_difference
+    return max(half, SAFETY * math.sqrt(change * half)) + ROUNDING
+
+
+def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
+    """Response on one level, with the error estimate from the level before.
+
+    Args:
+        case: the problem. level: place in ``LEVELS``, 1 or more.
+        tolerance: that ``converged`` tells of.
+    """
+    coarser, finer = (solve_on_mesh(case, LEVELS[i]) for i in (level - 1, level))
+    error = estimate_error(coarser, finer)
+    met = error <= tolerance
+    degree = LEVELS[level].radial
+    reason = f"degree {degree}: estimate {'meets' if met else 'above'} the tolerance"
+    t, r = complex(finer.matrix[1, 0]), complex(finer.matrix[0, 0])
+    return Response(t, r, error, finer.unknowns, finer.energy, "modal", met, reason)
+
+
+def refine_case(case: ModalCase, tolerance: float) -> Response:
+    """Response of the lowest level that meets the ``tolerance``, else of the level with
+    the least estimate.
+    """
+    tried = []
+    for level in range(1, len(LEVELS)):
+        tried.append(solve_level(case, level, tolerance))
+        if tried[-1].converged:
+            break
+    return min(tried, key=lambda response: response.t_error)
+
+
+def solve(
+    cell: Cell,
+    diameter_um: float,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    polarization: Polarization = "x",
+    tolerance: float = 1e-3,
+) -> Response:
+    """Zero-order transmission and reflection of a round pillar by the modal method: exact
+    along z, curved finite elements across.
+
+    Pillars with tilted walls: see :mod:`metalens.modal.tilted`.
+
+    Args:
+        cell: round pillar on a square lattice, films allowed.
+        diameter_um: above 0 and below the pitch.
+        wavelength_um: in vacuum.
+        angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in every layer by
+            Snell's law.
+        azimuth_rad: of the plane of incidence, a multiple of pi/2.
+        polarization: "s" or "p", or "x" or "y" for the field along that axis of the plane
+            of incidence.
+        tolerance: of t and r; the mesh is refined until the estimate meets it.
+
+    Returns:
+        Co-polarised amplitudes; ``t_error`` holds for t and r, see
+        :func:`estimate_error`.
+
+    Raises:
+        CellError, MaterialError: see :func:`metalens.modal.case.case_of`.
+    """
+    check_tolerance(tolerance)
+    light = Incidence(
+        float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
+    )
+    direction: dict[str, Any] = {
+        "angle_rad": angle_rad,
+        "azimuth_rad": azimuth_rad,
+        "polarization": polarization,
+    }
+    if cell.round and cell.height_um == 0:
+        return rcwa.solve(cell, diameter_um, wavelength_um, **direction)
+    if cell.round and cell.sidewall_rad:
+        return solve_tilted(
+            cell,
+            float(diameter_um),
+            light,
+            lambda plain, d, tol: solve(
+                plain, d, wavelength_um, tolerance=tol, **direction
+            ),
+            tolerance=tolerance,
+        )
+    return refine_case(case_of(cell, diameter_um, light), tolerance)
