@@ -174,8 +174,8 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
     """Zero-order scattering matrix on one mesh: the mean of the electric and magnetic
     forms, whose errors have opposite tendency; remembered.
 
-    Layer modes that decay below 10^-(3 + degree) over the height are left out: far below
-    the error of a mesh of that degree.
+    Layer modes that decay over the height below 1e-7, or 10^-(3 + degree), end where
+    they start: far below the error of a mesh of that degree.
 
     Args:
         case: the problem. plan: of the mesh.
@@ -183,7 +183,7 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
     Raises:
         CellError: a disc so thin or so wide that the matrices of its elements are singular.
     """
-    loss = 10.0 ** -(3 + plan.radial)
+    loss = min(1e-7, 10.0 ** -(3 + plan.radial))
     try:
         # matrices of a few hundred rows: on two threads of BLAS a solve takes three to
         # six times as long; degenerate elements, which divide by 0, are refused below

@@ -5,8 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.dense import congruence_product, eigen_pairs, gram_matrix
+from metalens.modal.dense import (
+    cholesky_factor,
+    congruence_product,
+    eigen_pairs,
+    gram_matrix,
+    solve_lower,
+)
 from metalens.modal.spaces import SymmetryClass
+
+# half Bloch phases below it lose digits in the squared problem of the gradients
+SMALL_PHASE_RAD = 0.05
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,6 +67,18 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
     return out
 
 
+def gradient_modes(space: SymmetryClass) -> tuple[np.ndarray, np.ndarray]:
+    """Transverse wavenumbers squared and scalar fields of the TM modes from singular
+    values, which keep all digits of a nearly uniform field.
+
+    space: the symmetry class.
+    """
+    lower = cholesky_factor(space.cell.scalar)
+    field = cholesky_factor(space.cell.mass).T @ space.gradient
+    _, value, right = np.linalg.svd(solve_lower(lower, field.T).T, full_matrices=False)
+    return value[::-1] ** 2, solve_lower(lower, right[::-1].T, transposed=True)
+
+
 def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
     """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients.
 
@@ -70,7 +91,10 @@ def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
     c, down_to = space.cotree, space.transposed
     corner = c[:, None], c
     mass = (down_to @ space.cell.mass).T
-    tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
+    if 0 < (space.half_phase_rad or 0.0) < SMALL_PHASE_RAD:
+        tm, scalar = gradient_modes(space)
+    else:
+        tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
     unit = scalar / np.sqrt(tm)
     inner = unit.T @ mass[c].T
     te, x = eigen_pairs(
