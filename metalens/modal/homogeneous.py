@@ -1,6 +1,5 @@
 """Modes of a homogeneous layer in the element space: the basis of everything else."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,30 +21,19 @@ SMALL_PHASE_RAD = 0.05
 class HomogeneousBasis:
     """Mass-orthonormal modes of the empty cell, lengths in half pitches.
 
-    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise. te_exact,
-    tm_exact: the same with that of the
-    zero order exact.
-    vector: (unknowns, a + b) fields, TE first (made on demand). scalar: (scalars, b)
-    longitudinal fields of the TM
-    modes.
-    disc_mass: (a + b, a + b) mass inside the disc; disc_curl: (a, a); disc_scalar: (b,
-    b).
+    te: (a,) transverse wavenumbers squared, rising. tm: (b,) likewise.
+    te_exact, tm_exact: the same with that of the zero order exact.
+    disc_mass: (a + b, a + b) mass inside the disc, TE first. disc_curl: (a, a).
+    disc_scalar: (b, b) of the longitudinal fields of the TM modes.
     """
 
     te: np.ndarray
     tm: np.ndarray
     te_exact: np.ndarray
     tm_exact: np.ndarray
-    make_vector: Callable[[], np.ndarray]
-    scalar: np.ndarray
     disc_mass: np.ndarray
     disc_curl: np.ndarray
     disc_scalar: np.ndarray
-
-    @property
-    def vector(self) -> np.ndarray:
-        """The modes on the vector space, made when first asked for."""
-        return self.make_vector()
 
     @property
     def size(self) -> int:
@@ -100,63 +88,17 @@ def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
     te, x = eigen_pairs(
         space.cell.curl[corner], space.cell.mass[corner] - gram_matrix(inner)
     )
-    down = inner @ x
-    inside, few = np.flatnonzero(space.disc.mass.diagonal()[c]), unit[space.within]
-    disc = (space.within_transposed @ space.disc.mass).T
-    across = x[inside].T @ (disc[c[inside]] @ few)
-    low = few.T @ (space.within_transposed @ disc) @ few
-    drawn = (low @ down).T
-    mixed = (across - drawn / 2) @ down
-    high = congruence_product(space.disc.mass[corner], x) - mixed - mixed.T
-    across -= drawn
-    a, gradient = len(te), space.gradient
-    disc_mass = np.empty((a + len(tm), a + len(tm)))
-    disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = (
-        high,
-        across,
-        across.T,
-        low,
-    )
-
-    def vector() -> np.ndarray:
-        gradients = gradient @ unit
-        rest = -gradients @ down
-        rest[c] += x
-        return np.concatenate([rest, gradients], 1)
-
-    return assemble_basis(
-        space,
-        te,
-        tm,
-        vector,
-        scalar,
-        (disc_mass, congruence_product(space.disc.curl[corner], x)),
-    )
-
-
-def assemble_basis(
-    space: SymmetryClass,
-    te: np.ndarray,
-    tm: np.ndarray,
-    vector: Callable[[], np.ndarray],
-    scalar: np.ndarray,
-    disc: tuple[np.ndarray, np.ndarray],
-) -> HomogeneousBasis:
-    """The basis of homogeneous modes from its parts.
-
-    Args:
-        space: the symmetry class. te, tm: transverse wavenumbers squared.
-        vector: makes the fields. scalar: longitudinal fields of the TM modes.
-        disc: mass and curl of the disc in these modes.
-    """
+    gradients = down_to.T @ unit
+    rest = -gradients @ (inner @ x)
+    rest[c] += x
     return HomogeneousBasis(
         te=np.maximum(te, 0.0),
         tm=tm,
         te_exact=exact_zero_order(te, space.half_phase_rad),
         tm_exact=exact_zero_order(tm, space.half_phase_rad),
-        make_vector=vector,
-        scalar=scalar,
-        disc_mass=disc[0],
-        disc_curl=disc[1],
+        disc_mass=congruence_product(
+            space.disc.mass, np.concatenate([rest, gradients], 1)
+        ),
+        disc_curl=congruence_product(space.disc.curl[corner], x),
         disc_scalar=congruence_product(space.disc.scalar, scalar),
     )

@@ -119,9 +119,7 @@ class SymmetryClass:
 
     cotree: unknowns that with all gradients make a well-conditioned basis (those of the
     edges off a spanning tree).
-    transposed: of the gradient, sparse. within: scalars that reach into the disc; of no
-    others the gradient does.
-    within_transposed: their rows of ``transposed``.
+    transposed: of the gradient, sparse.
     """
 
     cell: CellMatrices
@@ -131,8 +129,6 @@ class SymmetryClass:
     half_phase_rad: float | None
     cotree: np.ndarray
     transposed: scipy.sparse.csr_array
-    within: np.ndarray
-    within_transposed: scipy.sparse.csr_array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -145,8 +141,6 @@ class ClassTopology:
     scalars: FunctionSelection
     gradient: np.ndarray
     transposed: scipy.sparse.csr_array
-    within: np.ndarray
-    within_transposed: scipy.sparse.csr_array
 
 
 @lru_cache(maxsize=32)
@@ -168,12 +162,7 @@ def class_topology(
         mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad
     )
     dense = restrict_matrix(gradient_matrix(plan), vectors, scalars)
-    reaches = np.zeros(len(mesh.scalar_wall), bool)
-    for patch in mesh.patches:
-        reaches[patch.scalar] |= patch.inside
-    within = np.flatnonzero(scalars.unknowns(reaches))
-    down_to = scipy.sparse.csr_array(dense.T)
-    return ClassTopology(vectors, scalars, dense, down_to, within, down_to[within])
+    return ClassTopology(vectors, scalars, dense, scipy.sparse.csr_array(dense.T))
 
 
 @lru_cache(maxsize=32)
@@ -232,6 +221,4 @@ def build_symmetry_class(
         half_phase_rad,
         cotree_functions(plan, electric, step),
         known.transposed,
-        known.within,
-        known.within_transposed,
     )
