@@ -38,13 +38,14 @@ class MeshSolution:
     matrix: (2, 2) zero-order scattering matrix, the mean of both forms, substrate first.
     half_difference: half of the largest difference of the forms.
     energy: power out per unit power in from the substrate, mean of both forms.
-    unknowns: of both forms.
+    unknowns: of both forms. loss: what the modes that are left out change at most.
     """
 
     matrix: np.ndarray
     half_difference: float
     energy: float
     unknowns: int
+    loss: float
 
 
 @lru_cache(maxsize=4)
@@ -202,4 +203,5 @@ def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
         float(np.abs(first - second).max()) / 2,
         (energy + other_energy) / 2,
         count + other_count,
+        loss,
     )

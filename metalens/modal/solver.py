@@ -32,7 +32,6 @@ def mesh_of_degree(degree: int) -> MeshPlan:
 GRADING = 0.15
 LEVELS = tuple(mesh_of_degree(degree) for degree in range(2, 8))
 SAFETY = 2.0
-ROUNDING = 1e-12
 LARGEST = 2.0  # error of a passive cell
 
 
@@ -41,12 +40,15 @@ def estimate_error(coarser: MeshSolution, finer: MeshSolution) -> float:
     geometric mean of its change from the ``coarser`` and half the difference of its two
     forms, but at least that half.
 
-    Both forms bound the answer from opposite sides where waves are smooth; what they
-    have wrong alike shows in the change, which is the error of the coarser level.
+    The forms bound smooth waves from opposite sides; what they have wrong alike shows in
+    the change, which is the error of the coarser level. Where the forms part from one
+    level to the next neither says anything yet: ``LARGEST``.
     """
     change = float(np.abs(finer.matrix - coarser.matrix).max())
     half = finer.half_difference
-    return max(half, SAFETY * math.sqrt(change * half)) + ROUNDING
+    if half > coarser.half_difference + coarser.loss:
+        return LARGEST
+    return max(half, SAFETY * math.sqrt(change * half)) + finer.loss
 
 
 def resolves_waves(case: ModalCase, plan: MeshPlan) -> bool:
