@@ -22,15 +22,12 @@ from benchmarks import Row
 from metalens import modal, rcwa
 from metalens.cell import Cell, Incidence, Index
 from metalens.core.errors import CellError
-from metalens.modal import RUNGS
-from metalens.modal.case import ModalCase, case_of
-from metalens.modal.engine import solve_on_mesh
+from metalens.modal import LEVELS, case_of, solve_level
+from metalens.modal.case import ModalCase
 
 COUNT = 1000
 SEED = 8023  # no factor of the estimate was chosen on its cells
-# first rung of the referee; where the answer is of this one, its estimate sends the
-# referee on
-FINER = 3
+FINER = 3  # first level of the referee
 SHARE = 0.2  # of the bar, that the referee may be uncertain by
 TOLERANCES = (1e-2, 1e-3)
 Drawn = tuple[
@@ -128,14 +125,11 @@ def referee(case: ModalCase, bar: float) -> tuple[tuple[complex, complex], float
     """t and r on the coarsest of the finer meshes whose own estimate, the second value,
     is far below the bar.
     """
-    found, doubt = (0j, 0j), math.inf
-    for rung in RUNGS[FINER:]:
-        solution = solve_on_mesh(case, rung.choice(case.rho).plan)
-        r, t = solution.matrix[:, 0].tolist()
-        found, doubt = (t, r), rung.error(solution, case.rho)
-        if doubt <= SHARE * bar:
+    for level in range(FINER, len(LEVELS)):
+        found = solve_level(case, level, SHARE * bar)
+        if found.converged:
             break
-    return found, doubt
+    return (found.t, found.r), found.t_error
 
 
 def judged(
