@@ -54,7 +54,7 @@ class CoordinateTurn:
     size: int
     beyond: float = 1.0
 
-    def down(self, matrix: np.ndarray) -> np.ndarray:
+    def apply_transposed(self, matrix: np.ndarray) -> np.ndarray:
         """turnᵀ matrix."""
         m = len(self.low)
         if m == self.size:
@@ -63,15 +63,15 @@ class CoordinateTurn:
         out[:m] = self.low.T @ matrix[:m]
         return out
 
-    def onto(self, block: np.ndarray, diagonal: np.ndarray) -> None:
-        """Add turnᵀ diag turn to a block, in place."""
+    def add_congruence(self, block: np.ndarray, diagonal: np.ndarray) -> None:
+        """Add turnᵀ diagonal turn to a ``block``, in place."""
         m = len(self.low)
         block[:m, :m] += self.low.T @ (diagonal[:m, None] * self.low)
         beyond = np.arange(m, self.size)
         block[beyond, beyond] += self.beyond**2 * diagonal[m:]
 
-    def rows(self, places: np.ndarray) -> np.ndarray:
-        """Some of its rows."""
+    def take_rows(self, places: np.ndarray) -> np.ndarray:
+        """Its rows at ``places``."""
         m = len(self.low)
         out = np.zeros((len(places), self.size))
         for row, place in zip(out, places.tolist(), strict=True):
@@ -150,7 +150,7 @@ def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
     rise = solve_lower(scalar, np.diag(np.sqrt(basis.tm / k2)))
     tm, tm_turn = whitened_levels(second, add_diagonal(gram_matrix(rise), -1.0))
     turn = CoordinateTurn(te_low, a)
-    coupling = turn.down(-k2 * step * basis.disc_mass[:a, a:] @ tm_turn)
+    coupling = turn.apply_transposed(-k2 * step * basis.disc_mass[:a, a:] @ tm_turn)
     return LayerPencil(
         te,
         tm,
@@ -180,7 +180,7 @@ def magnetic_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
     second = add_diagonal(-k2 * weighted[a:, a:], basis.tm)
     tm, tm_low, rest = low_levels(second, basis.tm, k2 * abs(1 / disc - 1 / around))
     turn = CoordinateTurn(tm_low * medium.k0, b, medium.k0)
-    coupling = turn.down(weighted[a:, :a] @ te_turn).T
+    coupling = turn.apply_transposed(weighted[a:, :a] @ te_turn).T
     return LayerPencil(
         te,
         tm,

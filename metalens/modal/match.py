@@ -217,12 +217,12 @@ def few_interface(
     near, ports = half.real_admittance(dual=pencil.dual), half.ports
     a, c = len(pencil.te), len(modes.q)
     operator = modes.near.copy()
-    pencil.te_turn.onto(operator[:a, :a], near[:a])
-    pencil.tm_turn.onto(operator[a:, a:], near[a:])
+    pencil.te_turn.add_congruence(operator[:a, :a], near[:a])
+    pencil.tm_turn.add_congruence(operator[a:, a:], near[a:])
     fed = np.zeros((len(operator), len(ports)))
     te = ports < a
-    fed[:a, te] = pencil.te_turn.rows(ports[te]).T
-    fed[a:, ~te] = pencil.tm_turn.rows(ports[~te] - a).T
+    fed[:a, te] = pencil.te_turn.take_rows(ports[te]).T
+    fed[a:, ~te] = pencil.tm_turn.take_rows(ports[~te] - a).T
     columns = np.concatenate([modes.partner, fed], 1)
     green = columns.T @ solve_real(operator, columns)
     norm = modes.partner.T @ modes.field

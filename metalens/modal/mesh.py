@@ -93,7 +93,7 @@ class FunctionNumbering:
         self.vector_wall: list[int] = []
         self.scalar_wall: list[int] = []
 
-    def wall(self, vertex: Vertex) -> int:
+    def wall_bits(self, vertex: Vertex) -> int:
         """Walls of the quarter cell that a vertex lies on, as bits."""
         kind, i, j = vertex
         if kind == "core":
@@ -104,7 +104,7 @@ class FunctionNumbering:
         start, end = (Y0, X1) if kind == "A" else (X0, Y1)
         return (start if j == 0 else 0) | (end if last else 0)
 
-    def vector(self, wall: int, *key: object) -> int:
+    def number_vector(self, wall: int, *key: object) -> int:
         """Number of the vector function ``key``; a key seen for the first time takes
         the next one.
         """
@@ -113,7 +113,7 @@ class FunctionNumbering:
             self.vector_wall.append(wall)
         return self.vectors[key]
 
-    def scalar(self, wall: int, *key: object) -> int:
+    def number_scalar(self, wall: int, *key: object) -> int:
         """Number of the scalar function ``key``; a key seen for the first time takes
         the next one.
         """
@@ -122,31 +122,31 @@ class FunctionNumbering:
             self.scalar_wall.append(wall)
         return self.scalars[key]
 
-    def element(
+    def number_element(
         self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
     ) -> tuple[list[int], list[int]]:
         """Numbers of the vector and scalar functions of the element with corners v00,
         v10, v01, v11.
         """
-        walls = [self.wall(vertex) for vertex in v]
+        walls = [self.wall_bits(vertex) for vertex in v]
         x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 
         def on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.vector(
+            return self.number_vector(
                 walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
             )
 
         def scalar_on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.scalar(
+            return self.number_scalar(
                 walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
             )
 
         vectors = [
-            on_edge(x_ends[j], i) if j < 2 else self.vector(0, "x", v, i, j)
+            on_edge(x_ends[j], i) if j < 2 else self.number_vector(0, "x", v, i, j)
             for i in range(px)
             for j in range(py + 1)
         ] + [
-            on_edge(y_ends[i], j) if i < 2 else self.vector(0, "y", v, i, j)
+            on_edge(y_ends[i], j) if i < 2 else self.number_vector(0, "y", v, i, j)
             for i in range(px + 1)
             for j in range(py)
         ]
@@ -154,13 +154,13 @@ class FunctionNumbering:
         for i in range(px + 1):
             for j in range(py + 1):
                 if i < 2 and j < 2:
-                    scalars.append(self.scalar(walls[i + 2 * j], v[i + 2 * j]))
+                    scalars.append(self.number_scalar(walls[i + 2 * j], v[i + 2 * j]))
                 elif j < 2:
                     scalars.append(scalar_on_edge(x_ends[j], i))
                 elif i < 2:
                     scalars.append(scalar_on_edge(y_ends[i], j))
                 else:
-                    scalars.append(self.scalar(0, "z", v, i, j))
+                    scalars.append(self.number_scalar(0, "z", v, i, j))
         return vectors, scalars
 
 
@@ -209,7 +209,7 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
             corners = tuple(
                 core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1)
             )
-            numbered = numbers.element(corners, plan.angular, plan.angular)  # type: ignore[arg-type]
+            numbered = numbers.number_element(corners, plan.angular, plan.angular)  # type: ignore[arg-type]
             vectors.append(numbered[0])
             scalars.append(numbered[1])
     xi, eta = np.array(along_u), np.array(along_v)
@@ -300,7 +300,7 @@ def ring_patch(
                     for m in (0, 1)
                     for k in (0, 1)
                 )
-                numbered = numbers.element(corners, radial.degree, plan.angular)  # type: ignore[arg-type]
+                numbered = numbers.number_element(corners, radial.degree, plan.angular)  # type: ignore[arg-type]
                 vectors[copy].append(numbered[0])
                 scalars[copy].append(numbered[1])
     parts = [np.array(part) for part in zip(*jacobians, strict=True)]

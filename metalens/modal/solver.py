@@ -35,7 +35,7 @@ SAFETY = 2.0
 LARGEST = 2.0  # error of a passive cell
 
 
-def estimate_error(coarser: MeshSolution, finer: MeshSolution) -> float:
+def estimate_level_error(coarser: MeshSolution, finer: MeshSolution) -> float:
     """Error estimate of the ``finer`` of two successive levels: ``SAFETY`` times the
     geometric mean of its change from the ``coarser`` and half the difference of its two
     forms, but at least that half.
@@ -73,7 +73,7 @@ def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
     """
     coarser, finer = (solve_on_mesh(case, LEVELS[i]) for i in (level - 1, level))
     resolved = resolves_waves(case, LEVELS[level - 1])
-    error = estimate_error(coarser, finer) if resolved else LARGEST
+    error = estimate_level_error(coarser, finer) if resolved else LARGEST
     met = error <= tolerance
     degree = LEVELS[level].radial
     reason = f"degree {degree}: estimate {'meets' if met else 'above'} the tolerance"
@@ -82,8 +82,8 @@ def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
 
 
 def refine_case(case: ModalCase, tolerance: float) -> Response:
-    """Response of the lowest level that meets the ``tolerance``, else of the level with
-    the least estimate.
+    """Response to a ``case`` of the lowest level that meets the ``tolerance``, else of
+    the level with the least estimate.
     """
     tried = []
     for level in range(1, len(LEVELS)):
@@ -121,7 +121,7 @@ def solve(
 
     Returns:
         Co-polarised amplitudes; ``t_error`` holds for t and r, see
-        :func:`estimate_error`.
+        :func:`estimate_level_error`.
 
     Raises:
         CellError, MaterialError: see :func:`metalens.modal.case.case_of`.

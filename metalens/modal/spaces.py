@@ -44,19 +44,14 @@ class FunctionSelection:
     @property
     def size(self) -> int:
         """Count of the unknowns."""
-        return 2 * self.inside + self.start + self.end if self.periodic else self.inside
+        return (
+            2 * self.inside + self.start + self.end if self.is_periodic else self.inside
+        )
 
     @property
-    def periodic(self) -> bool:
+    def is_periodic(self) -> bool:
         """Whether a Bloch phase ties the ends of the cell together."""
         return len(self.order) > self.inside
-
-    def unknowns(self, functions: np.ndarray) -> np.ndarray:
-        """Values of the unknowns from those of the functions of the quarter cell."""
-        picked = functions[self.order]
-        second = picked[: self.inside] if self.periodic else picked[:0]
-        first = self.inside + self.start
-        return np.concatenate([picked[:first], second, picked[first:]])
 
 
 def select_functions(
@@ -96,7 +91,7 @@ def restrict_matrix(
             weights at x = pitch / 2.
     """
     picked = matrix.take(rows.order, 0).take(columns.order, 1)
-    if not rows.periodic:
+    if not rows.is_periodic:
         return picked
     out = np.zeros((rows.size, columns.size))
     r, c = rows.inside, columns.inside
