@@ -210,9 +210,11 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
                 if one.cause in unstated and one.frees and not one.stated
                 else 0.0
             )
-            about = {"taken": taken, "frees": one.frees, "stated": one.stated}
+            lean = fit.lean(one.cause, change)
             found.append(
-                dataclasses.replace(fit.lean(one.cause, change), odds=odds, **about)
+                dataclasses.replace(
+                    lean, taken=taken, frees=one.frees, odds=odds, stated=one.stated
+                )
             )
     found.append(_ghost(task, x, image, root, fit))
     if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(
