@@ -202,7 +202,7 @@ def _unstated(
     lens: Lens, protocol: BenchProtocol, response: Sensitivity, frames: Array
 ) -> UnmodelledShifts:
     """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as
-    asked for, will reckon with.
+    asked for, will allow for.
     """
     known = {k.name: k for k in protocol.known}
     sizes = unfitted_sizes(known, lens)
@@ -234,7 +234,7 @@ def _left(
     names: tuple[str, ...], untold: Array, wanted: Sequence[IntervalRequirement]
 ) -> list[IntervalRequirement]:
     """What the model's own errors may take of the wanted intervals; all where what
-    cannot be told takes more.
+    is unstated takes more.
     """
     left = []
     for one in wanted:
@@ -302,19 +302,19 @@ def _short(
             continue
         i = names.index(one.name)
         own, untold = REACH * float(sigma[i]), REACH * float(unstated.sigma[i])
-        told = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
+        expected = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
         if untold >= one.within:
             most = [
                 unstated.causes[k] for k in np.argsort(-unstated.by_cause[:, i])[:3]
             ]
             words.append(
-                f"{told}: within the model it is +- {own:.2g}, more frames do not help; state what else there is or is "
+                f"{expected}: within the model it is +- {own:.2g}, more frames do not help; state what else there is or is "
                 f"not, first of all {', '.join(most)} (capture.toml, [[known]])"
             )
         elif math.hypot(own, untold) > one.within * (1 + 1e-9):
             more = own**2 / (one.within**2 - untold**2)
             words.append(
-                f"{told}: {more:.1f} times the light "
+                f"{expected}: {more:.1f} times the light "
                 f"({math.ceil(count * more)} such frames), other depths or angles, or an independent measurement"
             )
     return words

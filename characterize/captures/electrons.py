@@ -398,15 +398,15 @@ def _dark_level(
         np.mean(capture.dark, axis=0),
         math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5),
     )
-    told, errors = level, np.full_like(level, error / math.sqrt(len(capture.dark)))
+    offset, errors = level, np.full_like(level, error / math.sqrt(len(capture.dark)))
     if gain.coarse:
         rounded = DarkStatistics.of(capture.dark)
-        told, errors = rounded.level, rounded.error
+        offset, errors = rounded.level, rounded.error
     notes.append(
-        f"offset {np.mean(told):.4g} counts on average, measured pixel by pixel in "
+        f"offset {np.mean(offset):.4g} counts on average, measured pixel by pixel in "
         f"{len(capture.dark)} dark frames, subtracted"
     )
-    return np.asarray(told), errors
+    return np.asarray(offset), errors
 
 
 def _flat_field(

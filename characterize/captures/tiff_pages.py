@@ -83,9 +83,9 @@ def count_images(file: Any) -> int:
     """How many images a file holds: its pages, or what ImageJ laid behind the head of
     one (stacks above 4 GB).
     """
-    told = (file.imagej_metadata or {}) if file.is_imagej else {}
+    about = (file.imagej_metadata or {}) if file.is_imagej else {}
     return (
-        max(int(str(told.get("images", 1))), 1)
+        max(int(str(about.get("images", 1))), 1)
         if len(file.pages) == 1
         else len(file.pages)
     )

@@ -33,8 +33,8 @@ _UNITS = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TiffTags:
-    """position_um: (n,) of the frames, empty where not told. pixel_um: nan where not
-    told; notes: in words.
+    """position_um: (n,) of the frames, empty where not stated. pixel_um: nan where not
+    stated; notes: in words.
     """
 
     position_um: Array = field(default_factory=lambda: np.empty(0))
@@ -112,7 +112,7 @@ def _imagej(
     path: Path, about: dict[str, object], per_pixel: float, pages: int
 ) -> TiffTags:
     """Steps without a unit are in um; of a unit that is no length (pixels) neither
-    steps nor a pixel are told.
+    steps nor a pixel are known.
 
     A stack that is seen several times steps through its slices each time; times alone
     tell no step.
@@ -133,7 +133,7 @@ def _imagej(
 
 
 def _resolution(page: object) -> float:
-    """Width of a pixel in the file's unit; nan where it is not told (1 / 1)."""
+    """Width of a pixel in the file's unit; nan where it is not stated (1 / 1)."""
     tag = getattr(page, "tags", {}).get("XResolution")
     if tag is None or 0 in tag.value or tag.value[0] == tag.value[1]:
         return math.nan

@@ -62,24 +62,24 @@ def _plan(options: Options, path: Path) -> int:
     values |= {
         "untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))
     }
-    told = [
+    lines = [
         f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
         for z, angle, time in rows
     ]
     whole = np.hypot(found.sigma, found.untold)
-    told.append(
-        "  half of a 95 % interval, with what cannot be told; within the model; so with frames evenly spread"
+    lines.append(
+        "  half of a 95 % interval, with what nobody states; within the model; so with frames evenly spread"
     )
     columns = (protocol.REACH * part for part in (whole, found.sigma, found.even_sigma))
     table = zip(found.names, *columns, strict=True)
-    told += [
+    lines += [
         f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}"
         for n, total, own, even in table
     ]
-    told += [f"  note: {words}" for words in found.warnings]
+    lines += [f"  note: {words}" for words in found.warnings]
     options.console.result(
         values,
-        "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]),
+        "\n".join([f"{target}: {len(rows)} frames, the most telling first", *lines]),
     )
     return 0
 

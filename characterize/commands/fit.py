@@ -64,13 +64,17 @@ def run(options: Options) -> int:
 
 def _run_lens(options: Options, design: Path, target: Path) -> int:
     lens, shots = lenses.load(design), captures.load(options.capture)
-    told = (
+    metrology = (
         config.load(options.metrology, MetrologySettings)
         if options.metrology
         else MetrologySettings()
     )
     choice = FitOptions(
-        told.free, told.known, told.window, told.scan_um, insist=options.insist
+        metrology.free,
+        metrology.known,
+        metrology.window,
+        metrology.scan_um,
+        insist=options.insist,
     )
     truth = config.load(options.truth, HiddenLens) if options.truth else None
     hidden = {k.name: k.value for k in truth.parameter} if truth else None

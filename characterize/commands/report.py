@@ -296,10 +296,10 @@ def _intervals(result: AsBuilt) -> bytes:
     names = [result.names[i] for i in shown]
     unit = np.array([typical_sigma(name) for name in names])
     value = result.value[shown] / unit
-    told = np.diag(invert_information(result.within_covariance) - result.information)[
-        shown
-    ]
-    prior = np.maximum(told, 1e-12) ** -0.5 / unit
+    information = np.diag(
+        invert_information(result.within_covariance) - result.information
+    )[shown]
+    prior = np.maximum(information, 1e-12) ** -0.5 / unit
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()
     rows = np.arange(len(names))[::-1]

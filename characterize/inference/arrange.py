@@ -58,7 +58,7 @@ class FrameArrangement:
     orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the
     stated one beyond doubt.
     alike: turns (1 to 7) under which the nominal images do not change: these cannot be
-    told from the chosen one.
+    distinguished from the chosen one.
     others: the same in other ways about as much alike: as a lens is made, any may be
     the one; fits tell.
     """
@@ -277,7 +277,7 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
         clearly=clearly,
         alike=tuple(k for k in apart if k and apart[k] < _TOLD),
     )
-    told = [
+    distinct = [
         way
         for way in alike
         if way[0] == reordered
@@ -294,7 +294,7 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> FrameArrangement:
             clearly=way[1] > 0,
             shift_px=shifts[way],
         )
-        for way in [*told, *twin]
+        for way in [*distinct, *twin]
         if alike[way] > alike[chosen] - _NEAR
     ]
     return replace(found, others=tuple(others))

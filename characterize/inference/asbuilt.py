@@ -47,7 +47,7 @@ class WithinModel:
 class AsBuilt:
     """Result of :func:`characterize.fit`.
 
-    ``covariance``, ``sigma``, ``interval``, ``draws`` and ``samples`` reckon with what
+    ``covariance``, ``sigma``, ``interval``, ``draws`` and ``samples`` allow for what
     the captures cannot tell and
     nobody stated (glass, source, side wall ...): they hold on a bench that is not
     known. ``within`` does not.

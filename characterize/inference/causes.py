@@ -49,7 +49,7 @@ WINDOWS = "a window off the chief ray at a field angle"
 _ROUND = (
     1e-4  # of the peak: round light does not turn, what is left is of the interpolation
 )
-_GRID = 41  # places across the lens where write fields are told apart
+_GRID = 41  # places across the lens at which write fields are sampled
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
@@ -60,9 +60,9 @@ _OF_MASK = {*names_of_kind(CDError), *names_of_kind(ResponseError)}
 class ImageChange:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
-    amount, told: of the first, in words with a place for the number; empty where no
+    amount, amount_text: of the first, in words with a place for the number; empty where no
     amount is said.
-    sigma: of every change, one for all or each its own, how much of it is reckoned with
+    sigma: of every change, one for all or each its own, how much of it is assumed
     where nobody states it: a
     standard deviation, 0 for none.
     frees: parameters that describe it. stated: whether one of these is stated without
@@ -75,7 +75,7 @@ class ImageChange:
     cause: str
     images: Array
     amount: float = 0.0
-    told: str = ""
+    amount_text: str = ""
     sigma: float | Array = 0.0
     frees: tuple[str, ...] = ()
     stated: bool = False
@@ -103,12 +103,18 @@ def systematic_changes(
     yield from _of_model(task, x, image)
     if "sidewall_deg" not in task.names or task.model.lens.cell.sidewall_rad == 0:
         leaning = task.model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image
-        told = "an angle whose square is {:.3g} deg²"
+        amount_text = "an angle whose square is {:.3g} deg²"
         sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
         words = "a side wall that leans about half height"
         # resonances are left out of it
         yield ImageChange(
-            words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True
+            words,
+            leaning[None],
+            _WALL_DEG**2,
+            amount_text,
+            sigma,
+            roughly=True,
+            of_mask=True,
         )
     light = image - background_planes(x, task.model.setting)
     yield ImageChange("vibration or blur along one direction", _along_one(light))
@@ -229,12 +235,12 @@ def _of_windows(task: SearchTask, slopes: dict[str, Array]) -> Iterator[ImageCha
         moved = np.zeros((len(aside), len(sideways), *sideways[0].shape))
         for k, index in enumerate(aside):
             moved[k, :, index] = np.stack(sideways, 1)[index]
-        told = "{:.3g} px at one of the angles"
+        amount_text = "{:.3g} px at one of the angles"
         yield ImageChange(
             WINDOWS,
             moved.reshape(-1, *sideways[0].shape),
             1.0,
-            told,
+            amount_text,
             _size(task, "window_px"),
         )
 
@@ -252,12 +258,12 @@ def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
             model,
             dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1]))),
         ).images(x)[0]
-        told, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
+        amount_text, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
         yield ImageChange(
             f"an aperture stop off along {'xy'[along]}",
             (moved - image)[None],
             _STOP_UM,
-            told,
+            amount_text,
             sigma,
         )
 
@@ -284,9 +290,12 @@ def _of_phase(
     for along, name in enumerate("xy"):
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
-        told = "{:.3g} nm of the right half"
+        amount_text = "{:.3g} nm of the right half"
         yield ImageChange(
-            f"a write field off along {name}", moved[None], _STITCH_UM * 1e3, told
+            f"a write field off along {name}",
+            moved[None],
+            _STITCH_UM * 1e3,
+            amount_text,
         )
     names = [f"residual_{k}" for k in range(MODES + 3)]
     bent = np.asarray(
@@ -320,7 +329,7 @@ def _exactly(task: SearchTask, name: str) -> bool:
 
 
 def _size(task: SearchTask, name: str) -> float:
-    """Standard deviation of a cause that is reckoned with: as it is stated, 0 where it
+    """Standard deviation of a cause: as it is stated, 0 where it
     is held as stated.
     """
     if name in task.unfitted:

@@ -350,7 +350,7 @@ def _result(
         verdict.left_out(task, solution),
     )
     covariance = _with_gain(names, found, gain)
-    unstated = looked.reckoned()
+    unstated = looked.shifts()
     within = _within(found, covariance, names)
     findings = [*_findings(task, solution, looked), *doubts]
     more, value = uncertainty.REACH * unstated.spread, solution.value
@@ -420,7 +420,7 @@ def _within(
 
 
 def _drawn(task: SearchTask, draws: Array, unstated: UnmodelledShifts) -> Array:
-    """Draws with what cannot be told; none where there are none."""
+    """Draws with the shifts by unstated effects; none where there are none."""
     if not len(draws):
         return draws
     moved = draws + gaussian_draws(
@@ -446,7 +446,7 @@ def _verdicts(
 ) -> tuple[str, str]:
     rows = usual_parameters(task.names, task.model.lens)
     known = verdict.process_verdict(
-        rows, found.low, found.high, _told(task, found), unstated
+        rows, found.low, found.high, _prior_share(task, found), unstated
     )
     errors = verdict.predicted_error(task, found), verdict.predicted_aside(task, found)
     return _psf_verdict(*errors, unseen, len(task.model.groups)), known
@@ -482,7 +482,7 @@ def _extrapolation(unseen: float) -> list[str]:
 def _open(
     task: SearchTask, found: FitPosterior, covariance: Array, looked: ScoreTests | None
 ) -> tuple[str, ...]:
-    """What cannot be told apart: bent and double posteriors, pairs, and causes that
+    """What cannot be distinguished: bent and double posteriors, pairs, and causes that
     nobody fitted.
     """
     pairs = knowable.correlated_pairs(task.names, covariance, task.prior.sigma)
@@ -497,7 +497,7 @@ def _named(names: tuple[str, ...]) -> Array:
     return np.array([not name.startswith(("log_gain", "background")) for name in names])
 
 
-def _told(task: SearchTask, found: FitPosterior) -> Array:
+def _prior_share(task: SearchTask, found: FitPosterior) -> Array:
     """(p,) width of the intervals over that of the prior."""
     return np.asarray(
         (found.high - found.low) / (2 * uncertainty.REACH) / task.prior.sigma

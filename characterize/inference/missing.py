@@ -76,8 +76,8 @@ class ScoreTest:
 @dataclass(frozen=True, eq=False, slots=True)
 class ScoreTests:
     """What was looked for beside the fit: leans, the most telling first, of every cause
-    that can be told apart or is
-    taken for something else; the fit, and the causes that are reckoned with as changes
+    that can be distinguished or is
+    taken for something else; the fit, and the causes that are assumed as changes
     (k, pixels) over the noise, of
     one standard deviation each. roughly: those whose change is known too roughly for
     the frames to bound them.
@@ -89,7 +89,7 @@ class ScoreTests:
     roughly: frozenset[str] = frozenset()
     of_mask: frozenset[str] = frozenset()
 
-    def reckoned(self) -> "UnmodelledShifts":
+    def shifts(self) -> "UnmodelledShifts":
         """What the causes may have done to the parameters; see
         :meth:`FitAtMode.amounts`.
         """
@@ -204,7 +204,11 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
             roughly |= {one.cause} if one.roughly else set()
             of_mask |= {one.cause} if one.of_mask else set()
         if one.sought:
-            taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
+            taken = (
+                fit.taken(change[0], one.amount, one.amount_text)
+                if one.amount_text
+                else ""
+            )
             odds = (
                 fit.odds(unstated[one.cause])
                 if one.cause in unstated and one.frees and not one.stated
@@ -221,15 +225,15 @@ def run_score_tests(task: SearchTask, mode: FitSolution) -> ScoreTests:
         2 / max(float((root > 0).sum()), 1.0)
     ):
         found.append(_patch(task, x, root, fit))
-    told = sorted(
+    named = sorted(
         (one for one in found if one.degrees or one.taken),
         key=lambda one: (one.chance, -one.chi2),
     )
-    return ScoreTests(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
+    return ScoreTests(named, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
 def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
-    """What a fit of frames to come will reckon with: at the task's start, of frames
+    """Shifts that a fit of frames to come will allow for: at the task's start, of frames
     that are as expected there.
     """
     image, slopes = task.model.images(task.start, task.names)
@@ -249,7 +253,7 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
         np.zeros(p),
         np.asarray(slopes),
     )
-    return run_score_tests(task, mode).reckoned()
+    return run_score_tests(task, mode).shifts()
 
 
 def to_fit(
@@ -267,11 +271,11 @@ def to_fit(
         most: causes that are fitted in turn to see which explains most.
     """
     some = [one for one in found if one.frees]
-    told = [one for one in some if one.chance < CHANCE]
+    clear = [one for one in some if one.chance < CHANCE]
     likely = sorted((one for one in some if one.odds > ODDS), key=lambda one: -one.odds)
     if stuck:
-        told = [one for one in some if not one.stated]
-    return (told or likely)[:most]
+        clear = [one for one in some if not one.stated]
+    return (clear or likely)[:most]
 
 
 def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
@@ -283,11 +287,11 @@ def score_test_text(found: list[ScoreTest]) -> list[ResidualFinding]:
     Args:
         found: score tests, the most telling first.
     """
-    told = [one for one in found if one.chance < CHANCE]
-    if not told:
+    clear = [one for one in found if one.chance < CHANCE]
+    if not clear:
         return []
-    first = told[0]
-    alike = [one.cause for one in told[1:4]]
+    first = clear[0]
+    alike = [one.cause for one in clear[1:4]]
     more = f"; {', '.join(alike)} would explain much of it too" if alike else ""
     cure = "state it, free it, or mend the bench"
     if first.cause == causes.LAMP:
@@ -394,8 +398,11 @@ class FitAtMode:
         With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to
         exp(tᵀC t / 2) (det C)^½.
         """
-        open_, told = self.amounts(changes)
-        size = float(told @ open_ @ told) / 2 + float(np.linalg.slogdet(open_)[1]) / 2
+        open_, weighted = self.amounts(changes)
+        size = (
+            float(weighted @ open_ @ weighted) / 2
+            + float(np.linalg.slogdet(open_)[1]) / 2
+        )
         return math.exp(min(size, 100.0))
 
     def amounts(self, changes: Array) -> tuple[Array, Array]:
@@ -423,13 +430,13 @@ class FitAtMode:
         counted = left * self.shared[0].ravel()
         return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
-    def taken(self, change: Array, amount: float, told: str) -> str:
+    def taken(self, change: Array, amount: float, amount_text: str) -> str:
         """What the parameters would do with a change of the images; empty where it does
         nothing.
 
         Of ``amount``, or as much of it as would not be seen: of what they leave
         ``_SEEN`` sigma or less. Nothing: no
-        parameter moves by one sigma. ``told``: the cause's amount in words, with a
+        parameter moves by one sigma. ``amount_text``: the cause's amount in words, with a
         place for the number.
         """
         moved = np.linalg.solve(self.known, self.slopes @ change)
@@ -444,7 +451,7 @@ class FitAtMode:
             for i in most
         )
         return (
-            f"{told.format(share * amount)} would be taken for {parts}; state it if there is any"
+            f"{amount_text.format(share * amount)} would be taken for {parts}; state it if there is any"
             if most
             else ""
         )

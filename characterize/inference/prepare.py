@@ -260,9 +260,9 @@ def lit_part(
         x: all parameters, of ``image`` (n, y, x).
     """
     light = np.maximum(image - background_planes(x, model.setting), 0.0)
-    told, out = (light**2 / data.variance(image) * data.usable).sum(0), []
+    information, out = (light**2 / data.variance(image) * data.usable).sum(0), []
     for axis in (1, 0):
-        share = np.cumsum(told.sum(axis)) / max(float(told.sum()), 1e-300)
+        share = np.cumsum(information.sum(axis)) / max(float(information.sum()), 1e-300)
         first, last = np.searchsorted(share, (_DARK / 4, 1 - _DARK / 4)).tolist()
         out.append(slice(first, min(last, len(share) - 1) + 1))
     return out[0], out[1]
@@ -371,7 +371,7 @@ def _number(capture: Capture, name: str) -> float:
 
 def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
     """What is known of the pillars to a tenth of it at best, or to a bias less than is
-    reckoned with, in words.
+    assumed, in words.
 
     Args:
         lens: the design.
@@ -382,7 +382,7 @@ def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
 
 
 def _beyond_table(lens: Lens) -> list[str]:
-    """Whether the bias to be reckoned with leads pillars of two sizes beyond the table
+    """Whether the bias to be expected leads pillars of two sizes beyond the table
     of their lens, in words.
     """
     if lens.pairs is None:

@@ -300,13 +300,13 @@ def process_verdict(
     rows: Sequence[FitParameter],
     low: Array,
     high: Array,
-    told: Array,
+    prior_share: Array,
     unstated: UnmodelledShifts,
 ) -> str:
     """Which causes the frames fix, and which come from prior knowledge or only with
     others.
 
-    ``rows``: (p,) of the fitted, for this lens. ``told``: (p,) interval over that of
+    ``rows``: (p,) of the fitted, for this lens. ``prior_share``: (p,) interval over that of
     the prior alone, 1 where the
     frames say nothing. Numbers are those with what ``unstated`` causes may have moved;
     where these are too large, a
@@ -327,7 +327,7 @@ def process_verdict(
     whole = np.hypot(own, unstated.sigma)
     good = [i for i in close if whole[i] <= rows[i].scale]
     known = ", ".join(f"{names[i]} +- {whole[i]:.2g}" for i in good) or "no cause alone"
-    prior = [names[i] for i in causes if told[i] > 0.7]
+    prior = [names[i] for i in causes if prior_share[i] > 0.7]
     more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""
     moved = [i for i in close if i not in good]
     if moved:
@@ -339,7 +339,7 @@ def process_verdict(
             unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst
         )
         more = f"; within the model only, that is without {without}: {parts}" + more
-    open_ = [i for i in causes if i not in close and told[i] <= 0.7]
+    open_ = [i for i in causes if i not in close and prior_share[i] <= 0.7]
     middle, reach = (low + high) / 2, 1.96 * whole
     wide = ", ".join(
         f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}"

@@ -20,7 +20,7 @@ from metalens.core.errors import DAMAGE, CaptureError
 _ROUND = (
     2 / 3
 )  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
-# sites of a lattice that is only tried, discs of which the blur of a picture is told
+# sites of a lattice that is only tried, discs that tell the blur of a picture
 _TRIED = 25
 # radius over blur from which on a disc tells its blur as well as all together do
 _TELLS = 3.0
@@ -328,12 +328,12 @@ def _sharper(
     """
     radius, sigma, smooth = radius.copy(), sigma.copy(), radial.ray_smoothing(pitch)
 
-    def told(k: int) -> float:
+    def own_blur(k: int) -> float:
         reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
         return radial.blur_variance(reach, rays, smooth)
 
     there = np.flatnonzero(np.isfinite(radius)).tolist()
-    own = {k: told(k) for k in there[:: max(len(there) // _TRIED, 1)]}
+    own = {k: own_blur(k) for k in there[:: max(len(there) // _TRIED, 1)]}
     blurs = np.array(list(own.values()))
     if np.isfinite(blurs).sum() <= MOST * len(blurs):
         return radius, sigma
@@ -341,7 +341,7 @@ def _sharper(
     for k in there:
         blur = usual
         if radial.is_wide_disc(radius[k], usual, smooth, times=_TELLS):
-            mine = own[k] if k in own else told(k)
+            mine = own[k] if k in own else own_blur(k)
             blur = mine if math.isfinite(mine) else usual
         found = _edges(flat, place[k, 0], place[k, 1], pitch, blur)
         if found is not None and math.isfinite(found[2]):

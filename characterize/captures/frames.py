@@ -1,4 +1,4 @@
-"""How much alike two frames are, wherever the light lies in them."""
+"""Frames as images: orientation, shifts and normalised cross-correlation."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,42 @@ import numpy as np
 from scipy import fft
 
 from metalens.core.arrays import Array
+
+TURNS = ("as they are", "turned by 90°", "turned by 180°", "turned by 270°")
+MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
+
+
+def orient_frames(frames: Array, orientation: int) -> Array:
+    """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation
+    mod 4) times.
+
+    Args:
+        frames: (n, y, x).
+        orientation: 0 to 7.
+    """
+    turned = frames[..., ::-1] if orientation >= 4 else frames
+    return np.rot90(turned, orientation % 4, axes=(-2, -1))
+
+
+def relative_orientation(first: int, second: int) -> int:
+    """The orientation that makes of frames turned by the first those turned by the
+    second.
+
+    Args:
+        first: orientation, 0 to 7, as :func:`orient_frames` takes it.
+        second: likewise.
+
+    >>> relative_orientation(3, 1), relative_orientation(4, 6)
+    (2, 2)
+    """
+    frame = np.arange(4).reshape(1, 2, 2)
+    return next(
+        k
+        for k in range(8)
+        if np.array_equal(
+            orient_frames(orient_frames(frame, first), k), orient_frames(frame, second)
+        )
+    )
 
 
 def above_rim(frames: Array) -> Array:
