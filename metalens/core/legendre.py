@@ -5,6 +5,7 @@ given function.
 import functools
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.special import roots_legendre
 
 from metalens.core.arrays import Array
@@ -21,17 +22,8 @@ def legendre_values(count: int, t: Array) -> Array:
     """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by
     the stable recurrence.
     """
-    t = np.asarray(t, float)
-    out = np.empty((count, *t.shape))
-    for m in range(count):
-        if m == 0:
-            out[0] = 1
-        elif m == 1:
-            out[1] = t
-        else:
-            out[m] = ((2 * m - 1) * t * out[m - 1] - (m - 1) * out[m - 2]) / m
     scale = np.sqrt(np.arange(count) + 0.5)
-    return np.asarray(np.ascontiguousarray(np.moveaxis(out, 0, -1)) * scale)
+    return np.ascontiguousarray(legvander(np.asarray(t, float), count - 1)) * scale
 
 
 def interpolation_matrix(count: int, t: Array) -> Array:

@@ -177,7 +177,7 @@ def longest_monotonic_branch(
     faults = _faults(library, d, t, bars, wanted.least_transmission)
     faults += [] if gaps else [_near_resonance(d, *one) for one in sharp]
     bad = np.any([mask for mask, _ in faults], axis=0)
-    runs = [run for run in _runs(~bad) if run.stop - run.start >= LEAST_ENTRIES]
+    runs = [run for run in find_runs(~bad) if run.stop - run.start >= LEAST_ENTRIES]
     if not runs:
         reasons = "; ".join(text for mask, text in faults if mask.any())
         raise DomainError(
@@ -258,8 +258,8 @@ def _near_resonance(
     return near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")
 
 
-def _runs(good: Array) -> list[slice]:
-    """Runs of True."""
+def find_runs(good: Array) -> list[slice]:
+    """Places of the runs of True."""
     edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -632,14 +632,9 @@ def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
     )
     if wanted.within_um is not None:
         good &= (d >= wanted.within_um[0]) & (d <= wanted.within_um[1])
-    low = (
-        middle - int(np.argmin(good[middle::-1]))
-        if not good[: middle + 1].all()
-        else -1
-    )
-    high = middle + int(np.argmin(good[middle:])) if not good[middle:].all() else len(d)
-    run = slice(low + 1, high)
-    if not good[middle] or run.stop - run.start < LEAST_ENTRIES:
+    around = (run for run in find_runs(good) if run.start <= middle < run.stop)
+    run = next(around, slice(0, 0))
+    if run.stop - run.start < LEAST_ENTRIES:
         raise DomainError(
             f"fewer than {LEAST_ENTRIES} sizes around {d[middle]:.4g} um, where most light is converted "
             f"({np.abs(t[:, middle]).min() ** 2:.0%}), are free of resonances: sweep with more samples, or another cell"

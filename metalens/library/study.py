@@ -15,7 +15,7 @@ from metalens.core.errors import CellError, ConfigError
 from metalens.core.report import Console
 from metalens.library import engines
 from metalens.library.curve import ResponseCurve
-from metalens.library.fit import REACH, UNKNOWN
+from metalens.library.fit import REACH, UNKNOWN, find_runs
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PLAIN, Sweep, check_light
 from metalens.library.workers import SweepJournal, Task, fit_curves
@@ -263,11 +263,15 @@ def judge_cell(
     for centre, width in curve.resonances(study.least_half_width_um):
         sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
     faults["a narrow resonance"] = sharp
-    start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
+    run = max(
+        find_runs(~np.any(list(faults.values()), axis=0)),
+        key=lambda one: phase[one.stop - 1] - phase[one.start],
+        default=slice(0, 0),
+    )
+    start, stop = run.start, run.stop
     why = [name for name, mask in faults.items() if stop < len(d) and mask[stop]] or [
         "the printable range"
     ]
-    run = slice(start, stop)
     return CellVerdict(
         cell.pitch_um,
         cell.height_um,
@@ -297,22 +301,6 @@ def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
     )
     sine = cell.lattice.least_order * wavelength_um / cell.pitch_um - n
     return math.degrees(math.asin(min(1.0, max(0.0, sine))))
-
-
-def _most_phase(phase: Array, good: Array) -> tuple[int, int]:
-    """(start, stop) of the run of good samples that covers most phase; (0, 0) where
-    there is none.
-    """
-    edges = (
-        np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-        .reshape(-1, 2)
-        .tolist()
-    )
-    return max(
-        ((a, b) for a, b in edges),
-        key=lambda run: phase[run[1] - 1] - phase[run[0]],
-        default=(0, 0),
-    )
 
 
 def _mean_over_phase(phase: Array, power: Array) -> float:

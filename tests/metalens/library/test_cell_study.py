@@ -73,13 +73,6 @@ def test_no_cell_is_said_plainly(verdicts):
     )
 
 
-def test_most_phase_of_runs():
-    phase = np.arange(10.0)
-    good = np.array([1, 1, 0, 1, 1, 1, 1, 0, 1, 1], bool)
-    assert cell_study._most_phase(phase, good) == (3, 7)
-    assert cell_study._most_phase(phase, ~good & False) == (0, 0)
-
-
 def test_pitch_without_room_is_refused():
     with pytest.raises(ConfigError, match="no pillar of"):
         CellStudy(pitches_um=(0.12,))

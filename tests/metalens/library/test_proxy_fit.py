@@ -378,54 +378,6 @@ def test_a_dip_that_no_candidate_follows_is_refused():
     )  # what the proxy says of its coefficients is no advice to a user
 
 
-class Stated:
-    """A proxy of typed errors; its phase turns back at one wavelength."""
-
-    wavelengths_um, max_angle_rad = (0.8, 0.9), 0.2
-
-    def __init__(self, phase, level, bad=None):
-        self.max_phase_error_rad, self.max_transmission_error, self.bad = (
-            phase,
-            level,
-            bad,
-        )
-
-    def monotone(self, wavelength, angle):
-        return (wavelength, angle) != self.bad
-
-
-def test_a_fit_costs_its_larger_error_in_units_of_the_tolerance():
-    wanted = ProxyTolerances(phase_tolerance_rad=4e-3, transmission_tolerance=0.05)
-    assert proxy_fit._cost(Stated(6e-3, 0.01), wanted) == pytest.approx(1.5)
-    assert proxy_fit._cost(Stated(6e-3, 0.1), wanted) == pytest.approx(2.0)
-    assert proxy_fit.tolerance_shortfall(Stated(4e-3, 0.05), wanted) == ""
-    assert "within 0.00401 rad" in proxy_fit.tolerance_shortfall(
-        Stated(4.01e-3, 0.01), wanted
-    )
-    assert (
-        "|T| within 0.051, where 0.004 and 0.05 are wanted"
-        in proxy_fit.tolerance_shortfall(Stated(1e-3, 0.051), wanted)
-    )
-    for bad in ((0.8, 0.0), (0.9, 0.2), (0.8 / 2 + 0.9 / 2, 0.2)):
-        assert proxy_fit._cost(Stated(1e-3, 0.01, bad), wanted) == math.inf
-
-
-@pytest.mark.parametrize(("pole", "degree"), [(1.2, 4), (1.5, 3)])
-def test_the_least_largest_deviation_is_chebyshevs(pole, degree):
-    """1 / (x - a) by polynomials of degree n errs by (a - √(a² - 1))ⁿ / (a² - 1); least
-    squares by 2.3 times as much.
-
-    Weights settle as 1 / rounds, 0.4 % after the 40 of a fit; those of a curve do not
-    know of another's.
-    """
-    x = np.linspace(-1, 1, 121)
-    basis = np.polynomial.chebyshev.chebvander(x, degree)
-    values = np.stack([1 / (x - pole), -2 / (x + pole)])
-    off = np.abs(proxy_fit._lawson(basis, values) @ basis.T - values).max(1)
-    least = (pole - math.sqrt(pole**2 - 1)) ** degree / (pole**2 - 1)
-    assert off == pytest.approx([least, 2 * least], rel=0.006)
-
-
 def test_errors_of_phase_and_transmission_stand_each_in_its_place():
     made = proxy.fit(
         synthetic(),

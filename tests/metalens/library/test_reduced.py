@@ -86,19 +86,6 @@ def test_cheaper_diameters_are_taken_where_they_serve_and_the_estimate_holds_as_
         assert error < 1e-3
 
 
-def test_the_widest_gap_is_halved_or_nearly_so_where_that_is_cheaper():
-    assert reduced._widest_gap([0.1, 0.18, 0.22, 0.29], np.empty(0)) == pytest.approx(
-        0.14, rel=1e-12
-    )
-    assert (
-        reduced._widest_gap([0.1, 0.18, 0.22, 0.29], np.array([0.125, 0.151, 0.25]))
-        == 0.151
-    )
-    assert reduced._widest_gap(
-        [0.1, 0.18, 0.22, 0.29], np.array([0.119, 0.25])
-    ) == pytest.approx(0.14, rel=1e-12)
-
-
 def test_resonances_are_the_poles():
     found = explored(1e-4).resonances()
     sharpest = found[np.argmin(found[:, 1])]
@@ -140,10 +127,3 @@ def test_the_solvers_error_enters_the_estimate():
     d = np.linspace(*SPAN, 400)
     estimate = curve(d)[1]
     assert estimate.min() > 0.01
-    x = np.sort(curve.nodes.diameter_um)
-    middle, steep = (x[1:] + x[:-1]) / 2, curve._steepness(x)
-    growth = curve._steepness(middle) / np.minimum(steep[1:], steep[:-1])
-    assert (
-        growth.max() > 3
-    )  # an error of the diameter costs more on a flank than at the nodes beside it
-    assert (curve(middle)[1] >= 0.02 * growth).all()
