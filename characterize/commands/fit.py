@@ -80,7 +80,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
     hidden = {k.name: k.value for k in truth.parameter} if truth else None
     about = _provenance(options, design)
     with options.claim(
-        target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+        target, companions=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
     ) as draft:
         result = dataclasses.replace(fit(shots, lens, choice), provenance=about)
         asbuilt.save(draft.path, result)
@@ -97,7 +97,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
     shots = captures.load(options.capture)
     about = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
     with options.claim(
-        target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+        target, companions=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
     ) as draft:
         found = fit_pupil(shots, spec, insist=options.insist)
         save(draft.path, found, about)

@@ -42,7 +42,7 @@ def run(options: Options) -> int:
         spectrum.spectrum_points(
             Source(made.wavelength_um * 1e3, given.fwhm_nm)
         )  # refused now, not after the work
-    with options.claim(target, beside=(".html", ".png")) as draft:
+    with options.claim(target, companions=(".html", ".png")) as draft:
         origin = _provenance(options, given)
         budget = ErrorBudget(made, given)
         links = options.console.track(budget.entries(), total=19, label="links")

@@ -46,7 +46,7 @@ class CommonOptions:
         self,
         target: Path,
         *,
-        beside: Sequence[str] = (),
+        companions: Sequence[str] = (),
         inputs: Sequence[Path] = (),
         room: int = transaction.ROOM,
     ) -> contextlib.AbstractContextManager[OutputDraft]:
@@ -54,15 +54,15 @@ class CommonOptions:
         end of the block, or not at all.
 
         Args:
-            beside: endings of the companions, as ``_xz.png``.
-            inputs: files that are read, beside those that the options name.
+            companions: endings of the companions, as ``_xz.png``.
+            inputs: files that are read, in addition to those that the options name.
             room: bytes that the output needs.
 
         Raises:
             OutputError: see :func:`metalens.core.transaction.claim_file`.
         """
         return transaction.claim_file(
-            target, beside=beside, terms=self._terms(inputs, room)
+            target, companions=companions, terms=self._terms(inputs, room)
         )
 
     def claim_folder(

@@ -248,7 +248,7 @@ def run(options: Options) -> int:
             "(lengths_um); give it"
         )
     ends = (".png",) if two_sizes else (".png", "_fisher.png")
-    with options.claim(target, beside=ends, inputs=read) as draft:
+    with options.claim(target, companions=ends, inputs=read) as draft:
         make = _design_two_sizes if two_sizes else _design_one_size
         made, wanted, values, notes, checks = make(wanted, options, draft.path)
         lens.save(draft.path, made)

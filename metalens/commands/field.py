@@ -171,7 +171,7 @@ def run(options: Options) -> int:
         options: of the command line.
     """
     wanted = near_field_request(options)
-    with options.claim(options.output, beside=(".png",)) as draft:
+    with options.claim(options.output, companions=(".png",)) as draft:
         found = near_fields(
             wanted.cell,
             wanted.diameter_um,

@@ -93,7 +93,7 @@ def run(options: Options) -> int:
         return _run_two_sizes(options, wanted)
     library.check_sweep(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
-    with options.claim(target, beside=(".png",)) as draft, options.shared():
+    with options.claim(target, companions=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
         made = library.sweep(
@@ -118,7 +118,7 @@ def _import_table(options: Options, cell_file: Path) -> int:
     inputs = _inputs(cell_file, wanted.cell) | {
         options.config.name: store.sha256(options.config)
     }
-    with options.claim(options.output, beside=(".png",)) as draft:
+    with options.claim(options.output, companions=(".png",)) as draft:
         return _finish(options, draft.path, made, wanted, inputs, 0.0)
 
 
@@ -397,7 +397,7 @@ def _run_two_sizes(options: Options, wanted: CellFile) -> int:
 
     target = options.output
     inputs = _inputs(options.config, wanted.cell)
-    with options.claim(target, beside=(".png",)) as draft, options.shared():
+    with options.claim(target, companions=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         made = axes.sweep_two_sizes(
             wanted.cell,

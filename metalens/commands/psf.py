@@ -152,7 +152,7 @@ def run(options: Options) -> int:
     )
     ends = (*(f"_{name}.png" for name in CAPTIONS), ".html")
     with options.claim(
-        target, beside=ends, room=transaction.ROOM + 4 * pixels
+        target, companions=ends, room=transaction.ROOM + 4 * pixels
     ) as draft:
         found = _compute(options.lens, settings, made, built)
         _write(draft.path, found, page=options.report)
@@ -184,7 +184,7 @@ def _far(options: Options) -> int:
     )
     with options.claim(
         target,
-        beside=("_far.png", ".html"),
+        companions=("_far.png", ".html"),
         room=transaction.ROOM + 4 * wanted.samples**2,
     ) as draft:
         found = far_field.compute_far_fields(made, wanted, options.console)

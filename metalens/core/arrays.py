@@ -1,4 +1,4 @@
-"""Names for arrays in signatures; the docstring beside them says the shape."""
+"""Names for arrays in signatures; their docstring says the shape."""
 
 from typing import Any
 

@@ -275,7 +275,7 @@ def _check_range(
     """Numbers finite, at most 1e9 in size; no empty list or name, but where these say
     something; see :func:`load`.
     """
-    told, empty = (
+    limits, empty = (
         field.metadata,
         field.metadata.get("may_be_empty")
         or field.default in ("", ())
@@ -287,9 +287,11 @@ def _check_range(
         raise ConfigError(
             f"{where}: {key} is empty, need {'entries' if value == () else 'a name'}"
         )
-    largest = _MOST if field.name == "seed" else told.get("most", _LARGE)
+    largest = _MOST if field.name == "seed" else limits.get("most", _LARGE)
     for number in _numbers(value):
-        if number == math.inf and (told.get("may_be_inf") or field.default == math.inf):
+        if number == math.inf and (
+            limits.get("may_be_inf") or field.default == math.inf
+        ):
             continue
         if math.isinf(number):
             raise ConfigError(f"{where}: {key} is {number}, need a finite number")
@@ -304,12 +306,12 @@ def _check_sign(
 ) -> None:
     """A number on the side of 0 that its field says."""
     if isinstance(value, int | float) and not isinstance(value, bool):
-        told = field.metadata
-        if value < 0 and not told.get("signed", field.name.endswith(_EITHER_SIGN)):
+        limits = field.metadata
+        if value < 0 and not limits.get("signed", field.name.endswith(_EITHER_SIGN)):
             raise ConfigError(f"{where}: {key} is {value}, need 0 or more")
-        if "above" in told and value <= told["above"]:
+        if "above" in limits and value <= limits["above"]:
             raise ConfigError(
-                f"{where}: {key} is {value}, need more than {told['above']}"
+                f"{where}: {key} is {value}, need more than {limits['above']}"
             )
 
 

@@ -23,7 +23,8 @@ def legendre_values(count: int, t: Array) -> Array:
     the stable recurrence.
     """
     scale = np.sqrt(np.arange(count) + 0.5)
-    return np.ascontiguousarray(legvander(np.asarray(t, float), count - 1)) * scale
+    values = np.ascontiguousarray(legvander(np.asarray(t, float), count - 1))
+    return np.asarray(values * scale)
 
 
 def interpolation_matrix(count: int, t: Array) -> Array:

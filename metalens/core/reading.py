@@ -43,10 +43,10 @@ def column_separator(line: str) -> tuple[str | None, bool]:
     if ";" in line:
         return ";", True
     words = line.split()
-    apart = len(words) > 1 and not any(
+    separated = len(words) > 1 and not any(
         word[0] == "," or word[-1] == "," for word in words
     )
-    if apart and all(_WITH_COMMA.fullmatch(word) for word in words[:2]):
+    if separated and all(_WITH_COMMA.fullmatch(word) for word in words[:2]):
         return None, True
     return ("," if "," in line else None), False
 

@@ -419,14 +419,14 @@ class Console:
     def judged(self, values: dict[str, Any], text: str, failures: Iterable[str]) -> int:
         """The outcome with the checks that it failed, in words (``failures`` of the
         values, a line each of the text);
-        the status that the command ends with: 1 where any is told, else 0. Empty words
+        the status that the command ends with: 1 with any failure, else 0. Empty words
         are no failure."""
-        told = [failure for failure in failures if failure]
+        found = [failure for failure in failures if failure]
         self.result(
-            values | {"failures": told},
-            "\n".join([text, *(f"  FAILED: {failure}" for failure in told)]),
+            values | {"failures": found},
+            "\n".join([text, *(f"  FAILED: {failure}" for failure in found)]),
         )
-        return 1 if told else 0
+        return 1 if found else 0
 
     def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
         """Pass ``items`` through, showing how far it is, the rate and the time left."""

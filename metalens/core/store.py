@@ -503,7 +503,7 @@ def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> No
 
 def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
     """Text goes in at its own length, inside the header; text of any length would lie
-    apart, without a checksum.
+    elsewhere, without a checksum.
     """
     if isinstance(value, str):
         encoded, name = (

@@ -20,7 +20,7 @@ from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_BESIDE = threading.local()  # stop: set for a thread that works beside others
+_CONCURRENT = threading.local()  # stop: set for a thread that works with others
 
 
 class WorkStopped(Exception):  # no error: nobody waits for what is stopped any more
@@ -47,11 +47,11 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
     stop = threading.Event()
 
     def alone(item: Item) -> Result:
-        _BESIDE.stop = stop
+        _CONCURRENT.stop = stop
         return work(item)
 
     with (
-        ThreadPoolExecutor(count, thread_name_prefix="metalens-beside") as pool,
+        ThreadPoolExecutor(count, thread_name_prefix="metalens-concurrent") as pool,
         one_blas_thread(),
     ):
         try:
@@ -67,7 +67,7 @@ def run_split(count: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads
     (see :func:`thread_count`).
     """
-    stop = getattr(_BESIDE, "stop", None)
+    stop = getattr(_CONCURRENT, "stop", None)
     if stop is not None and stop.is_set():
         raise WorkStopped
     _shared(count, min(thread_count(), count), work)
@@ -131,13 +131,13 @@ def thread_count() -> int:
     """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this
     process; one within `each`.
     """
-    if getattr(_BESIDE, "stop", None) is not None:
+    if getattr(_CONCURRENT, "stop", None) is not None:
         return 1
     torch = sys.modules.get("torch")
     if torch is not None:
         return int(torch.get_num_threads())
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, int(told)) if told.isdigit() else len(os.sched_getaffinity(0))
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(stated)) if stated.isdigit() else len(os.sched_getaffinity(0))
 
 
 @functools.lru_cache(maxsize=2)

@@ -42,7 +42,7 @@ _MARKS = (
 class OutputDraft:
     """A claimed output.
 
-    path: where to write it; companions of a file go beside this path under their own
+    path: where to write it; companions of a file go into the same folder under their own
     names.
     target: where all appears at the end; where a link leads. resumed: whether ``path``
     holds work of an earlier run.
@@ -71,24 +71,24 @@ class ClaimTerms:
 
 @contextlib.contextmanager
 def claim_file(
-    target: Path, *, beside: Sequence[str] = (), terms: ClaimTerms = ClaimTerms()
+    target: Path, *, companions: Sequence[str] = (), terms: ClaimTerms = ClaimTerms()
 ) -> Iterator[OutputDraft]:
     """Claim a file and its companions, give a scratch path, and put all in place if the
     block succeeds.
 
     Args:
         target: the file.
-        beside: endings of the companions: ``_xz.png`` is NAME_xz.png for NAME.h5.
+        companions: endings of the companions: ``_xz.png`` is NAME_xz.png for NAME.h5.
         terms: what the claim allows.
 
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
     target = _followed(target)
-    names = [target.stem + end for end in beside]
+    names = [target.stem + end for end in companions]
     if target.name.lower() in (name.lower() for name in names):
         raise OutputError(
-            f"{target}: a file of that name is written beside the result; give another ending, as .h5"
+            f"{target}: a file of that name is written with the result; give another ending, as .h5"
         )
     with _claim(target, terms, is_folder=False) as scratch:
         _refuse(target, names, terms, is_folder=False)
@@ -143,7 +143,7 @@ def claim_long_work(
 ) -> Iterator[OutputDraft]:
     """As :func:`claim_folder` for work of minutes to days: it is done in
     ``NAME.unfinished``
-    beside the target.
+    in the folder of the target.
 
     That folder survives an interruption if it holds a file that matches a pattern of
     ``keep``; with ``resume`` the next run goes on in it, or in a copy of the finished
@@ -274,7 +274,7 @@ def _scratch(target: Path) -> Iterator[Path]:
 
 
 def _refuse(
-    target: Path, beside: Iterable[str], terms: ClaimTerms, *, is_folder: bool
+    target: Path, companions: Iterable[str], terms: ClaimTerms, *, is_folder: bool
 ) -> None:
     """Refuse an output that is an input, exists without --force, is none of ours, or
     finds no room.
@@ -303,7 +303,7 @@ def _refuse(
     if target.exists() and target.is_dir() != is_folder:
         found, needed = ("folder", "file") if target.is_dir() else ("file", "folder")
         raise OutputError(f"{target} is a {found}; need the name of a {needed}")
-    for path in (target, *(target.with_name(name) for name in beside)):
+    for path in (target, *(target.with_name(name) for name in companions)):
         if not _is_taken(path):
             continue
         if not terms.force:
@@ -488,7 +488,7 @@ def sync_files(folder: Path) -> None:
 
 
 def iterate_files(folder: Path) -> Iterator[str]:
-    """Names of all files below a folder, the manifest aside; folders that hold nothing
+    """Names of all files below a folder, without the manifest; folders that hold nothing
     end in a slash.
     """
     for place, folders, names in os.walk(folder):

@@ -226,7 +226,7 @@ def unwrap_phase(lens: Lens) -> Array:
         lens: the lens.
 
     Raises:
-        LensError: gaps along the way, or neighbours half a turn apart whichever way
+        LensError: gaps along the way, or neighbours that differ by half a turn whichever way
             they are joined: a vortex, a spiral or zones with steps have no smooth
             phase.
     """

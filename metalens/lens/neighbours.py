@@ -1,4 +1,4 @@
-"""What unlike neighbours do to the light of a lens: a factor by the angle that it is
+"""Coupling of non-identical neighbours in a lens: a factor by the angle that it is
 turned by.
 """
 
@@ -54,11 +54,11 @@ class NeighbourRows:
             "scatter": (n,),
         }:
             raise LensError(
-                f"rows of unlike pillars: arrays of shapes {shapes}, need one entry a row"
+                f"rows of non-identical pillars: arrays of shapes {shapes}, need one entry a row"
             )
         if not (n and not np.all(self.diagonal) and np.all(np.asarray(self.sine) > 0)):
             raise LensError(
-                "rows of unlike pillars: need one along the lattice, and sines above 0"
+                "rows of non-identical pillars: need one along the lattice, and sines above 0"
             )
 
     @property
@@ -81,39 +81,39 @@ class NeighbourRows:
         """Largest sines that were solved, along the lattice and along its diagonal (0
         where none was).
         """
-        straight, aside = (
+        straight, diagonal = (
             float(self.sine[rows].max(initial=0.0))
             for rows in (~self.diagonal, self.diagonal)
         )
-        return straight, min(straight, aside)
+        return straight, min(straight, diagonal)
 
-    def of_field(self, field: int, sine: Any, aside: Any) -> Any:
+    def of_field(self, field: int, sine: Any, azimuth_weight: Any) -> Any:
         """(…) complex C of fields along the slope (0) or across it (1); NumPy or torch,
         differentiable.
 
         Args:
-            sine: (…) by which the slope turns light of the rows' wavelength. aside:
+            sine: (…) by which the slope turns light of the rows' wavelength. azimuth_weight:
                 sin² 2α of its azimuth α.
         """
-        return self._factor(self.coefficients[:, field], sine, aside)
+        return self._factor(self.coefficients[:, field], sine, azimuth_weight)
 
-    def of_both(self, sine: Any, aside: Any) -> Any:
+    def of_both(self, sine: Any, azimuth_weight: Any) -> Any:
         """(…) mean of :meth:`of_field` over both fields."""
-        return self._factor(self.coefficients.mean(1), sine, aside)
+        return self._factor(self.coefficients.mean(1), sine, azimuth_weight)
 
-    def _factor(self, coefficients: Array, sine: Any, aside: Any) -> Any:
+    def _factor(self, coefficients: Array, sine: Any, azimuth_weight: Any) -> Any:
         straight, diagonal = coefficients
         (a, b), (a2, b2) = straight.tolist(), (diagonal - straight).tolist()
         s, turned = (abs(sine).clip(max=most) for most in self.steepest)
-        return 1 + s * (a + b * s) + aside * (turned * (a2 + b2 * turned))
+        return 1 + s * (a + b * s) + azimuth_weight * (turned * (a2 + b2 * turned))
 
     def at(self, sine: Array, azimuth_rad: Array | float = 0.0) -> Array:
         """(2, …) complex C of fields along the slope and across it, of slopes in this
         azimuth of the lattice.
         """
-        aside = np.sin(2 * np.asarray(azimuth_rad)) ** 2
+        azimuth_weight = np.sin(2 * np.asarray(azimuth_rad)) ** 2
         return np.stack(
-            [self.of_field(field, np.asarray(sine), aside) for field in (0, 1)]
+            [self.of_field(field, np.asarray(sine), azimuth_weight) for field in (0, 1)]
         )
 
     def mean(self, sine: Array) -> Array:
@@ -159,6 +159,8 @@ class NeighbourRows:
         the next change.
         """
         mine = self.mean(sine)
-        apart = [float(np.abs(other.mean(sine) - mine).max()) for other in self.others]
+        changes = [
+            float(np.abs(other.mean(sine) - mine).max()) for other in self.others
+        ]
         less = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))
-        return [self.coarser, *(self.others[k] for k in np.argsort(apart)[-1:]), less]
+        return [self.coarser, *(self.others[k] for k in np.argsort(changes)[-1:]), less]

@@ -40,7 +40,7 @@ def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
         depth_um: distance of a source in front of the lens, um.
     """
     return (
-        _lit(lens, _aperture(lens).radius_um)
+        _illuminated_um(lens, _aperture(lens).radius_um)
         * sensor_reach_um(lens)
         * abs(defocus_per_um(lens, depth_um))
     )
@@ -157,16 +157,16 @@ def _aperture(lens: Lens | ApertureSummary) -> ApertureSummary:
 
 
 def _widest(lens: Lens | ApertureSummary) -> float:
-    """Radius, at least one pitch, of what is lit."""
+    """Radius, at least one pitch, of the illuminated part."""
     radius = (
         lens.radius_um
         if isinstance(lens, ApertureSummary)
         else max(lens.diameters.radius_um, lens.diameters.pitch_um)
     )
-    return _lit(lens, radius)
+    return _illuminated_um(lens, radius)
 
 
-def _lit(lens: Lens | ApertureSummary, radius_um: float) -> float:
+def _illuminated_um(lens: Lens | ApertureSummary, radius_um: float) -> float:
     return min(
         radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
     )

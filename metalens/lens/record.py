@@ -307,7 +307,7 @@ class Lens:
     pairs: table of pillars of two sizes in place of the proxy; None where they have
         one. light: polarisation, "x" or "y", that phase, transmission and distances are
         for where they have two (:meth:`seen`).
-    neighbours: rows of its own unlike pillars (:func:`metalens.design.neighbours`),
+    neighbours: rows of its own non-identical pillars (:func:`metalens.design.neighbours`),
         whose factor PSFs and images then hold; None where none was solved.
 
     Raises:

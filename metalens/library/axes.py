@@ -165,7 +165,7 @@ def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]
 
 
 def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
-    """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square
+    """Whether exchanging the sizes exchanges x and y: equal ranges, on a square
     lattice, not turned.
 
     Args:
@@ -230,13 +230,19 @@ def interpolate_table(
     (x, y), (at_x, at_y) = nodes, places
     first = _both(x, y, values, at_x, at_y, tolerance)
     second = _both(y, x, values.swapaxes(0, 1), at_y, at_x, tolerance).swapaxes(0, 1)
-    apart = np.abs(first - second).max(axis=-1)
+    difference = np.abs(first - second).max(axis=-1)
     row, column = _fewer(len(x)), _fewer(len(y))
     rival = _both(x[row], y[column], values[np.ix_(row, column)], at_x, at_y, tolerance)
-    apart = np.maximum(apart, np.abs(rival - (first + second) / 2).max(axis=-1))
+    difference = np.maximum(
+        difference, np.abs(rival - (first + second) / 2).max(axis=-1)
+    )
     reach = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
-    apart = maximum_filter(apart, size=[2 * n + 1 for n in reach], mode="nearest")
-    return InterpolatedTable((first + second) / 2, np.asarray(apart + 0.05 * tolerance))
+    difference = maximum_filter(
+        difference, size=[2 * n + 1 for n in reach], mode="nearest"
+    )
+    return InterpolatedTable(
+        (first + second) / 2, np.asarray(difference + 0.05 * tolerance)
+    )
 
 
 def _fewer(count: int) -> Array:
@@ -380,7 +386,7 @@ def sweep_two_sizes(
         ConfigError, CellError, MaterialError: see :func:`check_axes_sweep`.
     """
     check_axes_sweep(cell, settings)
-    settings = settings.settled(cell)
+    settings = settings.with_tolerance(cell)
     console = console or Console(quiet=True)
     journal = SweepJournal(checkpoint, cell, settings)
     places = size_entries(settings)
@@ -468,7 +474,7 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
         values, _ = nodes.grid(x, y, console, "pillars")
         doubt = interpolate_table((x, y), values, look, tolerance=sweep.bar).doubt
         above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
-        # a few pairs in a hundred may lie beside resonances
+        # a few pairs in a hundred may lie near resonances
         if above <= 0.03 or len(x) >= MOST:
             return x, y
         some = np.minimum(doubt, 10 * sweep.bar)  # a resonance is not chased for ever

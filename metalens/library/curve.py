@@ -152,8 +152,8 @@ class ResponseCurve:
         for rival in self.rivals:
             others = rival.poles()
             if len(poles) and len(others):
-                apart = np.abs(poles[:, None] - others).min(1)
-                poles = poles[apart < 0.2 * np.abs(poles.imag) + 1e-9]
+                distance = np.abs(poles[:, None] - others).min(1)
+                poles = poles[distance < 0.2 * np.abs(poles.imag) + 1e-9]
         poles = poles[np.argsort(poles.real)]
         return np.column_stack([poles.real, np.abs(poles.imag)])
 

@@ -20,7 +20,7 @@ PROBES = [
     7,
     FIRST - 1,
 ]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
-# that a curve takes: the one that serves most diameters, and what follows it beside a
+# that a curve takes: the one that serves most diameters, and what follows it near a
 # resonance
 MESHES = 3
 Engine = Literal["auto", "rcwa", "modal"]
@@ -92,10 +92,10 @@ def solvers_at_common_discretization(
     that all of them need.
 
     It is the least that meets the tolerance at three probes, which a curve over the
-    span solves anyhow: answers are remembered. Elsewhere the error of coupled waves may
+    span solves anyhow: responses are cached. Elsewhere the error of coupled waves may
     exceed the tolerance (it is reported), but it has no jumps that a rational fit would
     take for resonances. Meshes of the modal method need meet it at two of the probes:
-    beside a resonance, where the error is many times that elsewhere, the next mesh
+    near a resonance, where the error is many times that elsewhere, the next mesh
     takes over. The jump there is the true error of the coarser mesh, some tenth of its
     bar.
 

@@ -57,7 +57,7 @@ class ProxyTolerances:
             self.transmission_tolerance or FOLLOWED,
         )
 
-    def settled(self, entry_error: float) -> "ProxyTolerances":
+    def with_defaults(self, entry_error: float) -> "ProxyTolerances":
         """What is left out, by the errors of the entries themselves: no curve need
         follow what is not known.
         """
@@ -319,7 +319,7 @@ def _fitted(
     data = longest_monotonic_branch(
         library, wanted, across_resonances=across_resonances
     )
-    wanted = wanted.settled(entry_error(library, data.diameter_um))
+    wanted = wanted.with_defaults(entry_error(library, data.diameter_um))
     kept, proxy, terms = _followed(data, wanted)
     low, high = proxy.domain_um
     proxy = dataclasses.replace(
@@ -398,7 +398,7 @@ def _followed(
 def _shorter(
     data: MonotonicBranch, wanted: ProxyTolerances, terms: int
 ) -> tuple[MonotonicBranch, Proxy, int] | None:
-    """Without the last diameters, beside what bounds the domain, where the tolerances
+    """Without the last diameters, next to what bounds the domain, where the tolerances
     are met so; they are excluded as the resonance is, up to a tenth of the phase. None
     where that is not enough.
     """
@@ -650,7 +650,7 @@ def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
         library.wavelength_um,
         library.angle_rad,
     )
-    wanted = wanted.settled(entry_error(library, kept.diameter_um))
+    wanted = wanted.with_defaults(entry_error(library, kept.diameter_um))
     proxy = _widest(kept, middle - run.start, wanted)
     inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))

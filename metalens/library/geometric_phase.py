@@ -110,8 +110,8 @@ def mirror_jones(t: Array) -> Array:
 
 
 def period_rad(cell: Cell) -> float:
-    """Turn after which lattice and pillar are those of angle 0, turned as a whole, the
-    axes of the pillar aside.
+    """Turn after which lattice and pillar are those of angle 0, turned as a whole, but for
+    the axes of the pillar.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -144,7 +144,7 @@ def check_geometric_phase(cell: Cell, size_um: float) -> None:
     )
     if not quarter and cell.shape.kind != "polygon":
         raise CellError(
-            f"circular light: a {cell.shape.name} answers x and y alike and gives no geometric phase; "
+            f"circular light: a {cell.shape.name} responds equally to x and y and gives no geometric phase; "
             "need a rectangle, an ellipse or an own polygon that is longer along one axis"
         )
 

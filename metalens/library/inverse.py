@@ -56,7 +56,7 @@ def invert_phase(
 
 
 def is_tensor(values: object) -> bool:
-    """Whether ``values`` is a torch tensor, told without loading torch."""
+    """Whether ``values`` is a torch tensor; torch is not loaded."""
     return type(values).__module__.partition(".")[0] == "torch"
 
 

@@ -91,7 +91,7 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
 def library_figure(
     path: Path, library: "PillarLibrary", made: "ProxyFit | None"
 ) -> None:
-    """Phase and |t| with error bars, the bars by themselves beside the tolerance, and
+    """Phase and |t| with error bars, the bars by themselves with the tolerance, and
     what the proxy leaves.
 
     Args:

@@ -46,7 +46,7 @@ class Sweep:
         to the pitch less 0.05.
     samples: evenly spaced diameters; more are added around resonances.
     tolerance: error bar that is asked of every entry's t; left out, what the solver of
-        such cells reaches but beside resonances (:data:`USUAL`).
+        such cells reaches but near resonances (:data:`USUAL`).
     engine: auto, rcwa or modal.
     lengths_um: (least, largest) size along y of a rectangle or an ellipse; diameters_um
         is then that along x, and the library one over both sizes (``samples`` entries
@@ -118,7 +118,7 @@ class Sweep:
 
     @property
     def polarizations(self) -> tuple[Polarization, ...]:
-        """x at normal incidence alone (a square lattice treats x and y alike), else s
+        """x at normal incidence alone (a square lattice responds equally to x and y), else s
         and p; x and y for circular.
         """
         if self.light == "circular":
@@ -130,7 +130,7 @@ class Sweep:
         """The tolerance, that of round pillars where none is stated."""
         return USUAL["modal"] if self.tolerance is None else self.tolerance
 
-    def settled(self, cell: Cell) -> "Sweep":
+    def with_tolerance(self, cell: Cell) -> "Sweep":
         """The same with the tolerance that pillars of such a cell have where none is
         stated.
         """

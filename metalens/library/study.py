@@ -78,7 +78,7 @@ class CellStudy:
             )
         if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
             raise ConfigError(
-                f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
+                f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits with a gap of "
                 f"{self.min_gap_um} um"
             )
 

@@ -49,7 +49,7 @@ def sweep(
     if wavelengths_um is not None:
         settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
     check_sweep(cell, settings)
-    work = _SweepRun(cell, settings.settled(cell), console, checkpoint)
+    work = _SweepRun(cell, settings.with_tolerance(cell), console, checkpoint)
     return work.library()
 
 
@@ -111,7 +111,7 @@ class _SweepRun:
         self, wavelength_um: float, angle_deg: float, polarization: Polarization
     ) -> Incidence:
         """The plane wave of an entry. At normal incidence s and p are x and y: of cells
-        that are alike for both x alone, of others s is y (the plane of incidence is
+        that respond equally to both x alone, of others s is y (the plane of incidence is
         along x).
         """
         if not angle_deg and polarization in ("s", "p"):

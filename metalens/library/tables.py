@@ -183,7 +183,9 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
             "columns of a file without a header"
         ) from None
     if body.ndim != 2 or body.shape[1] != len(header):
-        raise DomainError(f"{path}: rows unlike the {len(header)} columns {header}")
+        raise DomainError(
+            f"{path}: rows do not match the {len(header)} columns {header}"
+        )
     return dict(zip(header, body.T, strict=True))
 
 

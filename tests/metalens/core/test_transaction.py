@@ -40,7 +40,7 @@ def put(target, **contents):
 
 def save(target, value, *, force=True):
     with transaction.claim_file(
-        target, beside=(".png", "_old.png"), terms=ClaimTerms(force=force)
+        target, companions=(".png", "_old.png"), terms=ClaimTerms(force=force)
     ) as draft:
         store.save(draft.path, "lens", {}, attributes={"value": value})
         draft.path.with_suffix(".png").write_bytes(
