@@ -95,14 +95,14 @@ def claim_file(
         new = scratch / "new"
         new.mkdir()
         yield OutputDraft(new / target.name, target)
-        made = sorted(p.name for p in new.iterdir())
+        written = {path.name for path in new.iterdir()} - {target.name}
         sync_files(new)
-        _refuse(target, {*names, *made} - {target.name}, terms, is_folder=False)
-        companions = {*names, *made} - {target.name}
-        for name in companions:  # a picture is missing after a kill, never another's
+        _refuse(target, {*names} | written, terms, is_folder=False)
+        # a picture is missing after a kill, never another's
+        for name in {*names} | written:
             target.with_name(name).unlink(missing_ok=True)
         (new / target.name).replace(target)
-        for name in companions & set(made):
+        for name in written:
             (new / name).replace(target.with_name(name))
         store.sync_file(target.parent)
 

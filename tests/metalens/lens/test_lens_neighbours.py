@@ -161,5 +161,5 @@ def test_a_lens_file_carries_its_rows(tmp_path):
     ids=["shapes", "only diagonal", "no slope"],
 )
 def test_rows_that_tell_nothing_are_refused(more):
-    with pytest.raises(LensError, match="rows of unlike pillars"):
+    with pytest.raises(LensError, match="rows of non-identical pillars"):
         rows(**more)
