@@ -127,7 +127,7 @@ def over_field(
     rows = []
     for angle in angles_deg:
         chief = origin if angle == 0 else _chief(lens, angle, depth, failures)
-        rows.append(_row(lens, angle, depth, (origin, chief), wanted / 1e3))
+        rows.append(_aberrations_at(lens, angle, depth, (origin, chief), wanted / 1e3))
         rows[-1]["illumination"] = rows[-1]["illumination"] / base
         if np.isnan(rows[-1]["sharpest_um"]).any():
             failures.append(f"no sharpest line about the sensor at {angle:g} degrees")
@@ -165,14 +165,22 @@ def _chief(
         return None
 
 
-def _row(
+def _aberrations_at(
     lens: Lens,
     angle_deg: float,
     depth_um: float,
     rays: tuple[ChiefRay | None, ChiefRay | None],
     per_um: Array,
 ) -> dict[str, Array | float]:
-    """One field angle; the rays are those of angle 0 and of this angle."""
+    """Columns of :class:`OverField` at one field angle.
+
+    Args:
+        lens: the lens.
+        angle_deg: along x.
+        depth_um: of the source.
+        rays: chief rays of angle 0 and of this angle.
+        per_um: (m,) frequencies of the MTF.
+    """
     angle, chief = (math.radians(angle_deg), 0.0), rays[1]
     none = np.full(2, math.nan)
     light = plane_waves_of_source(lens, angle, depth_um)

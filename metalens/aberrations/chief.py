@@ -80,31 +80,38 @@ def chief_ray(
     """
     source = source_at(lens, angle_rad, depth_um)
     at = middle_um(lens, source, depth_um)
-    slope, curved, doubt = _wave_front(lens, at, angle_rad)
-    p = _arriving(lens, at, source, depth_um) + slope
+    slope, curvature, deviations = _wave_front(lens, at, angle_rad)
+    p = _incident_direction(lens, at, source, depth_um) + slope
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     w = float(p @ p)
     if w >= 0.999 * after.layers[0][0] ** 2:
         raise PropagationError(
-            _lost(
+            _failure_text(
                 lens,
                 angle_rad,
                 f"leaves with n sin θ = {math.sqrt(w):.3f}, beyond the media",
             )
         )
-    q = curved + _change(lambda x: _arriving(lens, x, source, depth_um), at, 1.0)
+    q = curvature + _jacobian(
+        lambda x: _incident_direction(lens, x, source, depth_um), at, 1.0
+    )
     focus = _foci(after, p, q)
     real = np.isfinite(focus)
     error = np.where(
         real,
         np.sqrt(
-            sum((_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2 for d in doubt)
+            sum(
+                (_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2
+                for d in deviations
+            )
         ),
         np.inf,
     )
     step = STEP if math.isinf(depth_um) else STEP * depth_um
-    moved = _change(lambda s: _arriving(lens, at, s, depth_um), source, step)
-    walks = _change(lambda s: middle_um(lens, s, depth_um), source, step)
+    moved = _jacobian(
+        lambda s: _incident_direction(lens, at, s, depth_um), source, step
+    )
+    walks = _jacobian(lambda s: middle_um(lens, s, depth_um), source, step)
     moves = (
         _reach_derivative(after, p) @ moved
         + (np.eye(2) + _reach_derivative(after, p) @ q) @ walks
@@ -120,7 +127,7 @@ def chief_ray(
     )
 
 
-def _lost(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
+def _failure_text(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
     angle = ", ".join(f"{math.degrees(a):g}" for a in angle_rad)
     through = "its stop" if lens.layers.stop is not None else "the lens"
     return f"the chief ray of ({angle}) degrees, through the middle of {through}, {why}"
@@ -147,7 +154,7 @@ def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Ar
     )
 
 
-def _arriving(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
+def _incident_direction(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
     """(2,) n sin θ of the source's light at a place of the pillars."""
     if math.isinf(depth_um):
         return np.asarray(source / math.sqrt(1 + float(source @ source)))
@@ -177,7 +184,7 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
         return np.array([a @ w / w.sum() for a, w in zip(axes, weights, strict=True)])
     if between is None:
         return np.array(stop.centre_um)
-    p = _arriving(lens, np.zeros(2), source, depth_um)
+    p = _incident_direction(lens, np.zeros(2), source, depth_um)
     slopes = lens.layers.through_middle(
         p / math.sqrt(1 - float(p @ p)), depth_um, lens.wavelength_um
     )
@@ -187,7 +194,7 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
     )
 
 
-def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:
+def _jacobian(function: Callable[[Array], Array], x: Array, step: float) -> Array:
     """(2, 2) ∂function_i / ∂x_j by central differences."""
     columns = [
         (function(x + e) - function(x - e)) / (2 * step) for e in np.eye(2) * step
@@ -196,7 +203,7 @@ def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:
 
 
 def _reach_derivative(after: Media, p: Array) -> Array:
-    """(2, 2) B of the heading."""
+    """(2, 2) ∂ (lateral shift from the pillars to the sensor) / ∂ p, in um."""
     w, outer = float(p @ p), np.outer(p, p)
     return np.asarray(
         sum(
@@ -208,19 +215,24 @@ def _reach_derivative(after: Media, p: Array) -> Array:
 
 def _foci(after: Media, p: Array, q: Array) -> Array:
     """(2,) distances behind the pillars where close rays spread least along x and along
-    y.
+    y: of a bundle that spreads by S + z C, at z = -sum(S C) / sum(C²) behind the sensor.
+
+    Args:
+        after: media behind the pillars.
+        p: (2,) direction of the chief ray.
+        q: (2, 2) ∂p / ∂ place on the pillars, per um.
     """
-    w, cover = float(p @ p), after.index[0]
-    per_um = np.eye(2) / (cover**2 - w) ** 0.5 + np.outer(p, p) / (cover**2 - w) ** 1.5
-    rest, change = np.eye(2) + _reach_derivative(after, p) @ q, per_um @ q
+    rest = after.index[0] ** 2 - float(p @ p)
+    slopes = np.eye(2) / rest**0.5 + np.outer(p, p) / rest**1.5
+    spread, change = np.eye(2) + _reach_derivative(after, p) @ q, slopes @ q
     power = (change**2).sum(1)
-    more = np.divide(
-        -(rest * change).sum(1),
+    behind = np.divide(
+        -(spread * change).sum(1),
         power,
         out=np.full(2, np.inf),
         where=power > PARALLEL / sum(after.thickness_um) ** 2,
     )
-    return np.asarray(sum(after.thickness_um) + more)
+    return np.asarray(sum(after.thickness_um) + behind)
 
 
 def _wave_front(
@@ -235,15 +247,19 @@ def _wave_front(
         ZONES * math.sqrt(lens.wavelength_um * focal),
         math.sqrt(2 * LEAST * site / math.pi),
     )
-    x, y, phase, near = _about(lens, at, radius, library_incidence(lens, angle_rad))
-    wanted = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
-    if np.count_nonzero(near) < max(wanted, LEAST):
-        raise PropagationError(
-            _lost(lens, angle_rad, f"comes to the pillars' plane at ({at[0]:.1f}, {at[1]:.1f}) um, where the lens has "
-            f"{np.count_nonzero(near)} pillars; need {max(wanted, LEAST):.0f} about it")
-        )  # fmt: skip
+    x, y, phase, near = _pillars_near(
+        lens, at, radius, library_incidence(lens, angle_rad)
+    )
+    sites = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
+    wanted, count = max(sites, LEAST), np.count_nonzero(near)
+    if count < wanted:
+        why = (
+            f"comes to the pillars' plane at ({at[0]:.1f}, {at[1]:.1f}) um, where the "
+            f"lens has {count} pillars; need {wanted:.0f} about it"
+        )
+        raise PropagationError(_failure_text(lens, angle_rad, why))
     turn = np.where(near, np.exp(1j * phase), 0.0)
-    first = _guessed(
+    first = _initial_polynomial(
         turn,
         (x[0] + x[-1], y[0] + y[-1]),
         lens.diameters.steps_um,
@@ -252,14 +268,14 @@ def _wave_front(
     terms = np.stack(
         [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
     )[near]
-    series, scatter = _fitted(
+    series, scatter = _fit_polynomial(
         terms,
         turn[near],
         {(i, j): c * radius ** (i + j) for (i, j), c in first.items()},
     )
     if scatter > ROUGH:
         raise PropagationError(
-            _lost(
+            _failure_text(
                 lens,
                 angle_rad,
                 f"meets no wave front: phases scatter by {scatter:.2f} rad rms",
@@ -268,11 +284,11 @@ def _wave_front(
     named = dict(zip(POWERS, series / k, strict=True))
     slope = np.array([named[1, 0], named[0, 1]]) / radius
     inverse = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
-    doubt = [
+    deviations = [
         _curvature(dict(zip(POWERS, column, strict=True)), radius)
         for column in inverse.T
     ]
-    return slope, _curvature(named, radius), doubt
+    return slope, _curvature(named, radius), deviations
 
 
 def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
@@ -280,7 +296,7 @@ def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
     return np.array([[2 * named[2, 0], both], [both, 2 * named[0, 2]]]) / radius**2
 
 
-def _about(
+def _pillars_near(
     lens: Lens, at: Array, radius: float, tilt_rad: float
 ) -> tuple[Array, Array, Array, Array]:
     """x (x,) and y (y,) from a place, phase of the pillars (y, x), and which of them
@@ -306,7 +322,7 @@ def _about(
     )
 
 
-def _guessed(
+def _initial_polynomial(
     turn: Array,
     twice_um: tuple[float, float],
     steps: tuple[float, float],
@@ -344,7 +360,7 @@ def _guessed(
     return found
 
 
-def _fitted(
+def _fit_polynomial(
     terms: Array, turn: Array, first: dict[tuple[int, int], float]
 ) -> tuple[Array, float]:
     """(terms,) polynomial of the phase of (pillars,) unit numbers from a guess of some

@@ -71,17 +71,21 @@ def _check_size(size: int) -> None:
 
 
 def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and bytes of the data elements of level 5, one after the other."""
+    """Type and bytes of the data elements of level 5, one after the other: a tag of
+    8 bytes (type, size), the data, and zeros up to a multiple of 8 bytes.
+    """
     place = 0
     while place < len(content):
         kind, size = np.frombuffer(content[place : place + 8], f"{order}u4").tolist()
-        start, step = place + 8, size
-        if kind >> 16:  # small: type, size and data in 8 bytes
-            kind, size, start, step = kind & 0xFFFF, kind >> 16, place + 4, 0
-        if size > (len(content) - start if step else 4):
+        start = place + 8
+        room = len(content) - start
+        place = start + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        if kind >> 16:  # a tag of 4 bytes (size, type), the data in the other 4
+            kind, size = kind & 0xFFFF, kind >> 16
+            place, start, room = start, start - 4, 4
+        if size > room:
             raise ValueError("cut short")
         yield kind, content[start : start + size]
-        place += 8 + (step if kind == _COMPRESSED else -(-step // 8) * 8)
 
 
 def _level_5(content: bytes, order: str) -> Iterator[tuple[str, Array]]:
