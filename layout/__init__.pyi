@@ -1,5 +1,5 @@
-from .drc.check import check as check
 from .drc.lattice import check_plan as check_plan
+from .drc.library import check as check
 from .formats.compare import compare as compare
 from .formats.dxf import write_dxf as write_dxf
 from .formats.gdsii_read import read_gdsii as read_gdsii

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import apart, joined, parts, wafer
+from layout.arrange import joined, parts, separation, wafer
 from layout.arrange.record import CellPart, Floorplan, Placement, WaferSettings
 from layout.commands import make, page
 from layout.commands.job import FloorplanWork, Options
@@ -88,7 +88,7 @@ def _whole(work: FloorplanWork) -> MaskLibrary:
         wafer.refuse_marks_off(record.wafer)
     work.placed, marks = _parts(work)
     with work.stages("room between parts"):
-        work.near = apart.check_separation(work.placed, work.process)
+        work.near = separation.check_separation(work.placed, work.process)
     spaces = [
         f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
         for v in work.near
@@ -125,14 +125,17 @@ def _parts(
             )
             for part, plan in zip(record.lens, plans, strict=True)
         ]
-        box = apart.extent_of_copies([*sketches, *files], exposed=True) / joined.PER_UM
+        box = (
+            separation.extent_of_copies([*sketches, *files], exposed=True)
+            / joined.PER_UM
+        )
         plans.append(
             build.die_surroundings(
                 drawings[0].source,
                 process,
                 name="DIE",
                 size_um=record.die.size_um,
-                clear_um=float(max(-box[0], box[2])) + apart.reach_um(process),
+                clear_um=float(max(-box[0], box[2])) + separation.reach_um(process),
                 label=record.die.label or record.name,
             ).plan
         )
@@ -249,8 +252,8 @@ def _stepped(
     mark: parts.DieComponent | None,
 ) -> MaskLibrary:
     """The wafer: as many whole dies as it holds, and its marks."""
-    scattered = apart.reach_um(work.process)
-    inner = apart.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
+    scattered = separation.reach_um(work.process)
+    inner = separation.extent_of_copies(work.placed, exposed=True) / joined.PER_UM
     need = max(scattered, work.process.rules.minimum_gap_nm / 1e3)
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(inner[2 + axis] - inner[axis])
@@ -259,7 +262,7 @@ def _stepped(
                 f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, "
                 f"need {need:.4g}"
             )
-    box = apart.extent_of_copies(work.placed) / joined.PER_UM
+    box = separation.extent_of_copies(work.placed) / joined.PER_UM
     left, bottom, right, top = box.tolist()
     margin = max(scattered, joined.MARGIN_UM)
     box_um = left, bottom, right, top

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.arrange import apart, joined
+from layout.arrange import joined, separation
 from layout.arrange.record import WaferSettings
 from layout.arrange.wafer import WaferDies
 from layout.drc.report import DrcReport, Violation
@@ -201,7 +201,7 @@ def floorplan_box_um(placed: Sequence[joined.PartPlacement]) -> Array:
     Args:
         placed: parts on the die.
     """
-    return apart.extent_of_copies(placed) / joined.PER_UM
+    return separation.extent_of_copies(placed) / joined.PER_UM
 
 
 def plot_floorplan(
@@ -217,7 +217,7 @@ def plot_floorplan(
 
     figure, axes = report.make_figure(size=(7.2, 6.6))
     axes.grid(False)
-    for one in apart.standing_parts(placed):
+    for one in separation.standing_parts(placed):
         for colour, boxes in zip(_COLOURS, one.part.boxes.values(), strict=False):
             shapes = [rectilinear.box_corners(b) for b in one.moved(boxes)]
             corners = [shape / joined.PER_UM for shape in shapes]

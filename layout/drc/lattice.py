@@ -635,17 +635,17 @@ def _check_zone(
     """Pillars that share area with an exclusion zone."""
     scale = 1e3 / plan.unit_nm
     left, bottom = zone.x_um * scale, zone.y_um * scale
-    box = left, bottom, left + zone.width_um * scale, bottom + zone.height_um * scale
+    right, top = left + zone.width_um * scale, bottom + zone.height_um * scale
+    box = left, bottom, right, top
+    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     for number, places in _sites_near(plan, lattice, box):
         shape = plan.classes[number - 1]
         low, high = shape.outline.min(0) + places, shape.outline.max(0) + places
         meets = ((low < box[2:]) & (high > box[:2])).all(1)
         inside = ((low >= box[:2]) & (high <= box[2:])).all(1)
         for n in np.flatnonzero(meets & ~inside).tolist():
-            meets[n] = (
-                clipped_area([contour + places[n] for contour in shape.contours], box)
-                > 1e-9
-            )
+            moved = [contour + places[n] for contour in shape.contours]
+            meets[n] = region.overlap_area(moved, [corners]) > 1e-9
         hit = places[meets]
         text = f"{shape.name} in {zone.name}"
         boxes = (_moved_box(shape.outline, x, y) for x, y in hit.tolist())
@@ -681,35 +681,6 @@ def _sites_near(
         x = lattice.x0 + (column + left) * lattice.pitch
         y = lattice.y0 - (row + top) * lattice.down
         yield number, np.column_stack([x, y])
-
-
-def clipped_area(
-    contours: list[Array], box: tuple[float, float, float, float]
-) -> float:
-    """Area that contours (holes clockwise) share with a box: Sutherland-Hodgman
-    clipping, then the shoelace sum.
-    """
-    total = 0.0
-    for contour in contours:
-        points = contour.astype(float)
-        for axis, limit, sign in (
-            (0, box[0], 1),
-            (1, box[1], 1),
-            (0, box[2], -1),
-            (1, box[3], -1),
-        ):
-            depth = sign * (points[:, axis] - limit)
-            after, next_depth = np.roll(points, -1, axis=0), np.roll(depth, -1)
-            crossing = depth * next_depth < 0
-            share = np.where(
-                crossing, depth / np.where(crossing, depth - next_depth, 1.0), 0.0
-            )
-            cut = points + share[:, None] * (after - points)
-            both = np.stack([points, cut], 1).reshape(-1, 2)
-            points = both[np.stack([depth >= 0, crossing], 1).ravel()]
-        x, y = points.T
-        total += float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
-    return total
 
 
 def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> None:

@@ -1,9 +1,10 @@
-"""Hierarchical design-rule check of any mask file: width, space, notch and grid."""
+"""Design-rule check of any mask: hierarchical sweep for width, space, notch and grid."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -20,8 +21,11 @@ from layout.drc.geometry import (
     measure_polygon,
     measure_separation,
 )
+from layout.drc.lattice import check_plan
 from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
 from layout.formats.library import QUARTERS, MaskLibrary, Orientation, group_equal
+from layout.formats.reading import read_mask
+from layout.mask.plan import MaskPlan
 from layout.process.process import DesignRules, LayerNumber
 from layout.shapes import region
 from metalens.core.arrays import Array
@@ -32,6 +36,24 @@ GRID_TOLERANCE = 2**0.5
 UPRIGHT = QUARTERS[0]
 Metric = Literal["projection", "euclidean"]
 LayerChoice = tuple[int, int | None]  # layer number; datatype, None: all together
+
+
+def check(mask: MaskPlan | MaskLibrary | str | Path, rules: DesignRules) -> DrcReport:
+    """Check the design rules of a mask.
+
+    Args:
+        mask: plan of a lens (pairs of classes on its lattices), cells, or a GDSII or
+            OASIS file (hierarchical sweep, all layers).
+        rules: limits.
+
+    Raises:
+        MaskFileError: a file that cannot be read.
+        ProcessError: a plan of too many outlines.
+    """
+    if isinstance(mask, MaskPlan):
+        return check_plan(mask, rules)
+    library = mask if isinstance(mask, MaskLibrary) else read_mask(Path(mask))
+    return check_library(library, rules)
 
 
 def check_library(

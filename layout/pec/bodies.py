@@ -90,7 +90,10 @@ def split_ranges(
     total = float(mass.sum())
     wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
     reach = np.array(
-        [_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um]
+        [
+            _neighbour_exposure(drawn, number > 0, body.steps_um, width)
+            for width in point.widths_um
+        ]
     )
     far = point.widths_um >= COARSE * body.nearest_um
     middle = ~far & (
@@ -107,14 +110,16 @@ def split_ranges(
     )
 
 
-def _given(drawn: DrawnKinds, used: Array, steps_um: Array, width_um: float) -> float:
+def _neighbour_exposure(
+    drawn: DrawnKinds, used: Array, steps_um: Array, width_um: float
+) -> float:
     """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind
     that receives most.
     """
     found = [0.0]
     for entry in drawn.widest(used, steps_um) if used.any() else []:
-        at = drawn.edge_um(entry)[:, None] - steps_um
-        found.append(float(drawn.given(entry, at, width_um).sum(1).mean()))
+        at = drawn.edge_points_um(entry)[:, None] - steps_um
+        found.append(float(drawn.exposure_at(entry, at, width_um).sum(1).mean()))
     return max(found)
 
 
@@ -144,10 +149,10 @@ def exposure_table(
     if not used.any():
         raise ProcessError("no pillar is drawn: there is nothing to expose")
     area = np.where(used, drawn.area_um2, 0.0)
-    whole, slope = drawn.edges(used, point)
+    whole, slope = drawn.edge_exposure(used, point)
     own = np.where(used, whole - area * float(ranges.far.density(np.array(0.0))), 0.0)
-    beside = area * _beside(ranges.middle, body)
-    if own[used].min() < _FAINT or (beside >= 0.9 * own)[used].any():
+    neighbours = area * _neighbour_bound(ranges.middle, body)
+    if own[used].min() < _FAINT or (neighbours >= 0.9 * own)[used].any():
         thin = 1e3 * float(drawn.diameter_um[used][own[used].argmin()])
         raise ProcessError(
             f"a pillar of {thin:.0f} nm gives its own edge an exposure of {own[used].min():.3f} only, less than its "
@@ -156,7 +161,7 @@ def exposure_table(
     return ExposureTable(drawn, area, goal, own, slope, number)
 
 
-def _beside(middle: PointExposure, body: PillarArray) -> float:
+def _neighbour_bound(middle: PointExposure, body: PillarArray) -> float:
     """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to
     each other, per um^2.
 
@@ -168,7 +173,7 @@ def _beside(middle: PointExposure, body: PillarArray) -> float:
         np.arange(-n, n + 1)
         for n in (int(np.ceil(reach / step)) for step in (body.pitch_um, body.down_um))
     )
-    apart = np.hypot(i * body.pitch_um, (j * body.down_um)[:, None])
-    sites = apart[(i + j[:, None]) % 2 == 0] if body.centred else apart
+    distance = np.hypot(i * body.pitch_um, (j * body.down_um)[:, None])
+    sites = distance[(i + j[:, None]) % 2 == 0] if body.centred else distance
     itself = float(middle.density(np.array(0.0)))
     return min(itself, float(middle.density(sites).sum()) - itself)

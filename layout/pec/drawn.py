@@ -19,7 +19,7 @@ from layout.shapes.moments import (
 from metalens.core.arrays import Array
 
 _RIM = 2 * np.pi * (np.arange(24) + 0.5) / 24
-_SEEN = 48  # points along the edges that neighbours are seen from
+_EDGE_POINTS = 48  # points along the edges that neighbours are seen from
 _PANEL = 0.8  # of the narrowest Gaussian, between four Gauss points
 _PIXEL = 1 / 6  # of it, of the raster on which the level is found
 _MOST_PIXELS = 1200  # along a side
@@ -42,7 +42,7 @@ class DrawnDiscs:
         """R^2 / 2 of the disc and R^2 of the ring on which it is seen."""
         return np.asarray(1.5 * self.diameter_um**2 / 4)
 
-    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
+    def edge_exposure(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
         """Exposure of the edge by the pillar itself, and its fall; exact.
 
         Args:
@@ -62,13 +62,13 @@ class DrawnDiscs:
         )
         return np.asarray(own), np.where(used, slope, 0)
 
-    def edge_um(self, entry: int) -> Array:
+    def edge_points_um(self, entry: int) -> Array:
         """(n, 2) places along the edges, from the site."""
         return np.asarray(
             self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1)
         )
 
-    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
+    def exposure_at(self, entry: int, at_um: Array, width_um: float) -> Array:
         """Exposure by one Gaussian at unit dose, exact.
 
         Args:
@@ -106,7 +106,7 @@ class DrawnOutlines:
         """Mean squared distance from the centroid, over the area and over the edges."""
         return np.array([_wider(each) if each else 0.0 for each in self.contours])
 
-    def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
+    def edge_exposure(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
         """As of :class:`DrawnDiscs`; to 5e-4 of itself (pixels of a sixth of the
         narrowest
         Gaussian).
@@ -116,11 +116,11 @@ class DrawnOutlines:
             found[:, k] = _level(self.contours[k], float(self.area_um2[k]), point)
         return found[0], found[1]
 
-    def edge_um(self, entry: int) -> Array:
+    def edge_points_um(self, entry: int) -> Array:
         """As of :class:`DrawnDiscs`, evenly spaced."""
-        return points_along_edges(self.contours[entry], _SEEN)
+        return points_along_edges(self.contours[entry], _EDGE_POINTS)
 
-    def given(self, entry: int, at_um: Array, width_um: float) -> Array:
+    def exposure_at(self, entry: int, at_um: Array, width_um: float) -> Array:
         """As of :class:`DrawnDiscs`; four Gauss points to 0.8 widths, 1e-6."""
         places = at_um.reshape(-1, 2)
         y, weight, crossing = _lines(self.contours[entry], width_um)
@@ -148,7 +148,7 @@ DrawnKinds = DrawnDiscs | DrawnOutlines
 def _wider(contours: Contours) -> float:
     area, first, second = polygon_moments(contours)
     centre = first / area
-    points = points_along_edges(contours, 4 * _SEEN) - centre
+    points = points_along_edges(contours, 4 * _EDGE_POINTS) - centre
     return float(second / area - centre @ centre + (points**2).sum(1).mean())
 
 

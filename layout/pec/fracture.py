@@ -96,7 +96,7 @@ def fracture_boxes(
         _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
         longest = np.full(len(open_.box), _LONGEST * usual)
         _shorten(longest, open_.box * step_um, every[open_.of], corners)
-        _shorten_beside(longest, open_.box * step_um, lattices, around)
+        _shorten_near_lens(longest, open_.box * step_um, lattices, around)
         ratio = _change(open_, every, pairs, step_um, around) / change
         side = open_.box[:, 2:] - open_.box[:, :2]
         split = (side >= 2 * shortest) & (
@@ -127,8 +127,8 @@ def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
     whose energy counts at corners.
 
     There a Gaussian gives an eighth of its weight less than in the middle of what it
-    changes by. All that together change by less than ``change`` are left out: the doses
-    beside them are as even without.
+    changes by. All that together change by less than ``change`` are left out: the
+    doses there are as even without.
     """
     order = np.argsort(around.widths_um)
     widths, total = around.widths_um[order], np.cumsum(around.weights[order])
@@ -146,7 +146,7 @@ def _uncover(
     near: numbers of the boxes around each of ``whole``, from ``first`` on.
     """
     for n in range(box.shape[0]):
-        beside = near[first[of[n]] : first[of[n] + 1]]
+        neighbours = near[first[of[n]] : first[of[n] + 1]]
         for side in range(4):  # left, bottom, right, top
             if not outer[n, side]:
                 continue
@@ -154,7 +154,7 @@ def _uncover(
             low, reached = box[n, along], box[n, along] - 1
             while reached < low < box[n, along + 2]:
                 reached = low
-                for m in beside:
+                for m in neighbours:
                     b = whole[m]
                     over = (
                         b[across] < at <= b[across + 2]
@@ -187,10 +187,10 @@ def _shorten(longest: Array, box: Array, whole: Array, corners: list[float]) -> 
         longest[np.hypot(*ends) < _FEW * width] = _LONGEST * width
 
 
-def _shorten_beside(
+def _shorten_near_lens(
     longest: Array, box: Array, lattices: Array, around: PointExposure
 ) -> None:
-    """Shorter pieces beside a lens."""
+    """Shorter pieces near a lens, whose edge is no box."""
     for width in np.sort(around.widths_um)[::-1].tolist():
         for left, bottom, right, top in lattices.tolist():
             x = np.maximum(np.maximum(left - box[:, 2], box[:, 0] - right), 0)

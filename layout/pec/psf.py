@@ -97,14 +97,16 @@ def fit_point_spread(
     steps = max(8, int(np.ceil(4 * np.log2(radius[-1] / radius[0]))))
     widths = np.geomspace(radius[0], radius[-1], steps + 1)
     energy = radius**2 * value
-    heed = (
+    importance = (
         0.02 + energy / energy.max()
     ) / value  # relative errors count, most where the energy is
     design = (
-        np.exp(-((radius[:, None] / widths) ** 2)) / (np.pi * widths**2) * heed[:, None]
+        np.exp(-((radius[:, None] / widths) ** 2))
+        / (np.pi * widths**2)
+        * importance[:, None]
     )
     scale = design.max(axis=0)
-    weights = nnls(design / scale, value * heed)[0] / scale
+    weights = nnls(design / scale, value * importance)[0] / scale
     total = weights.sum()
     keep = weights > 1e-9 * total
     found = PointExposure(widths[keep], weights[keep] / total)

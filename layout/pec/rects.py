@@ -68,20 +68,22 @@ def pairs_near(
     starts = np.flatnonzero(
         np.r_[np.ones(len(group[:1]), bool), group[1:] != group[:-1], True]
     )
-    apart = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
+    distance = 6 * float(point.widths_um.max(initial=0.0)) + _OUTSIDE_UM
     counts = np.zeros(len(boxes), np.int64)
-    _pairs(boxes, starts, apart, counts, np.empty(0, np.int64))
+    _pairs(boxes, starts, distance, counts, np.empty(0, np.int64))
     first = np.cumsum(counts) - counts
     near = np.empty(int(counts.sum()), np.int64)
-    _pairs(boxes, starts, apart, first, near)
+    _pairs(boxes, starts, distance, first, near)
     one, two = order[np.repeat(np.arange(len(boxes)), counts)], order[near]
     rank = np.lexsort((two, one))
     return one[rank], two[rank]
 
 
 @compile_loop
-def _pairs(boxes: Array, starts: Array, apart: float, at: Array, near: Array) -> None:
-    """Boxes of a shape (sorted by their left sides) within ``apart`` of each of its
+def _pairs(
+    boxes: Array, starts: Array, distance: float, at: Array, near: Array
+) -> None:
+    """Boxes of a shape (sorted by their left sides) within ``distance`` of each of its
     boxes: written to ``near`` from
     ``at`` on, or counted there where ``near`` is empty.
     """
@@ -89,13 +91,13 @@ def _pairs(boxes: Array, starts: Array, apart: float, at: Array, near: Array) ->
         for n in range(starts[g], starts[g + 1]):
             found = 0
             for m in range(starts[g], starts[g + 1]):
-                if boxes[m, 0] > boxes[n, 2] + apart:
+                if boxes[m, 0] > boxes[n, 2] + distance:
                     break
-                if boxes[m, 2] < boxes[n, 0] - apart:
+                if boxes[m, 2] < boxes[n, 0] - distance:
                     continue
                 if (
-                    boxes[m, 1] > boxes[n, 3] + apart
-                    or boxes[m, 3] < boxes[n, 1] - apart
+                    boxes[m, 1] > boxes[n, 3] + distance
+                    or boxes[m, 3] < boxes[n, 1] - distance
                 ):
                     continue
                 if near.shape[0] > 0:
@@ -221,8 +223,8 @@ def _run(part: Array, group: Array, side: Array) -> tuple[Array, Array]:
     line = np.rint(part[:, 0] / _OUTSIDE_UM)
     order = np.lexsort((part[:, 1], line, side, group))
     keys = np.stack([group, side, line])[:, order]
-    apart = part[order[1:], 1] > part[order[:-1], 2] + _OUTSIDE_UM
-    new = np.r_[True, (keys[:, 1:] != keys[:, :-1]).any(0) | apart]
+    distance = part[order[1:], 1] > part[order[:-1], 2] + _OUTSIDE_UM
+    new = np.r_[True, (keys[:, 1:] != keys[:, :-1]).any(0) | distance]
     run = np.cumsum(new) - 1
     first = np.flatnonzero(new)
     low, high = np.empty(len(part)), np.empty(len(part))
@@ -248,13 +250,14 @@ def _free(
     """
     count = 0
     for n in range(boxes.shape[0]):
-        beside = boxes[near[starts[n] : starts[n + 1]]]
+        neighbours = boxes[near[starts[n] : starts[n + 1]]]
         for side in range(4):  # left, bottom, right, top
             across, along = side % 2, 1 - side % 2
             at = boxes[n, side]
             outside = at - step if side < 2 else at + step
-            over = beside[
-                (beside[:, across] <= outside) & (beside[:, across + 2] >= outside)
+            over = neighbours[
+                (neighbours[:, across] <= outside)
+                & (neighbours[:, across + 2] >= outside)
             ]
             over = over[np.argsort(over[:, along])]
             low, high = boxes[n, along], boxes[n, along + 2]

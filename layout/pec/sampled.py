@@ -164,7 +164,7 @@ def _close(
     place = np.column_stack([(j - column) * body.pitch_um, (row - i) * body.down_um])
     away = np.hypot(*place.T)
     mine = int(index[row, column])
-    edge = drawn.edge_um(mine)
+    edge = drawn.edge_points_um(mine)
     total = 0.0
     for width, weight in zip(
         point.widths_um.tolist(), point.weights.tolist(), strict=True
@@ -178,7 +178,7 @@ def _close(
         for kind in np.unique(entry[away < _reach(drawn, edge, width)]).tolist():
             same = entry == kind
             at = edge[:, None] - place[same]
-            seen = drawn.given(kind, at, width) * dose[same]
+            seen = drawn.exposure_at(kind, at, width) * dose[same]
             total += weight * float(seen.sum(-1).mean())
     return total
 

@@ -33,6 +33,11 @@ def overlap_contours(
     return _contours(_section(contours, filled=False) ^ _section(polygons))
 
 
+def overlap_area(contours: Iterable[Array], polygons: Iterable[Array]) -> float:
+    """Area that ``contours`` (outlines and holes) share with ``polygons``."""
+    return float((_section(contours, filled=False) ^ _section(polygons)).area())
+
+
 def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
     """The same area as polygons that any mask file holds: cut upright through the
     middle of each hole, and again.

@@ -202,19 +202,19 @@ def _beside(lens: Lens, process: Process) -> str:
     """What the numbers are not of: light that keeps its hand, and walls that the
     process leans otherwise.
     """
-    told, wall, made = "", lens.cell.sidewall_rad / deg, process.etch.sidewall_deg
+    text, wall, made = "", lens.cell.sidewall_rad / deg, process.etch.sidewall_deg
     if lens.hand:
-        told += (
+        text += (
             " All of it for the light that changes hand: what keeps its hand has no focus, and lies under the image "
             "as a haze of no more than what the converted light lacks."
         )
     if abs(made - wall) > process.spread.sidewall_deg:
-        told += (
+        text += (
             f" The pillars are studied with the walls of their cell, {wall:.3g} deg from upright; the process makes "
             f"{made:.3g} deg, which is beyond its spread: sweep and design with sidewall_rad = {made * deg:.3g} "
             "in [cell]."
         )
-    return told
+    return text
 
 
 def _bands(study: ToleranceReport) -> bytes:

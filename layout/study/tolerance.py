@@ -196,13 +196,13 @@ def _outcome(
     batches = [
         lenses[start : start + _BATCH] for start in range(0, len(lenses), _BATCH)
     ]
-    parts = executor.gather_parallel(_seen, (model, reference, step_um), batches)
+    parts = executor.gather_parallel(_outcome_of, (model, reference, step_um), batches)
     return ToleranceOutcome(
         *(np.concatenate(column) for column in zip(*parts, strict=True))
     )
 
 
-def _seen(
+def _outcome_of(
     about: tuple[SpreadModel, Array, float], lenses: list[State]
 ) -> tuple[Array, ...]:
     """Fields of :class:`ToleranceOutcome` of some lenses.

@@ -287,7 +287,7 @@ def _of_themselves(
     one outline and several doses are worked out once.
     """
     if isinstance(scene.kinds, DrawnDiscs):
-        return scene.kinds.edges(used, point)
+        return scene.kinds.edge_exposure(used, point)
     contours = scene.kinds.contours if isinstance(scene.kinds, DrawnOutlines) else ()
     first: dict[bytes, int] = {}
     same = np.arange(len(contours))
@@ -296,7 +296,7 @@ def _of_themselves(
         same[k] = first.setdefault(key, k)
     once = np.zeros(len(contours), bool)
     once[list(first.values())] = True
-    own, slope = scene.kinds.edges(once, point)
+    own, slope = scene.kinds.edge_exposure(once, point)
     return own[same], slope[same]
 
 
@@ -346,12 +346,12 @@ def _edges(scene: WrittenMask, field: _Field, point: PointExposure) -> EdgeError
     """
     core = max((a for a, _ in field.close), default=0.0)
     points = polygon_edges.sample_edges(scene.others, core)
-    every = np.concatenate([points.at_um, *polygon_edges.slope_aside(points)])
+    every = np.concatenate([points.at_um, *polygon_edges.points_across(points)])
     close = polygon_edges.exposure_at_edges(every, scene.others, field.close)
     here, outside, inside = np.split(close, 3)
     x, y = points.at_um.T
     here = here + field.grid.sample(field.far, x, y)
-    slope = np.maximum(inside - outside, 1e-12) / polygon_edges.aside_um()
+    slope = np.maximum(inside - outside, 1e-12) / polygon_edges.ACROSS_UM
     return EdgeErrors(
         x, y, here / THRESHOLD, (here - THRESHOLD) / slope / nm, points.layer
     )

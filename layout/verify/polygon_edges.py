@@ -13,7 +13,7 @@ from metalens.core.units import nm
 
 _STEP_UM = 1.0  # between the samples along an edge
 _FAR = 5.0  # ranges at which a polygon no longer counts: exp(-25)
-_ASIDE_UM = 2 * nm  # for the slope across an edge
+ACROSS_UM = 4 * nm  # for the slope across an edge
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,21 +120,14 @@ def exposure_at_edges(
     return total
 
 
-def slope_aside(found: EdgeSamples) -> tuple[Array, Array]:
-    """Points just outside and just inside the edges.
+def points_across(found: EdgeSamples) -> tuple[Array, Array]:
+    """Points just outside and just inside the edges, ``ACROSS_UM`` from each other.
 
     Args:
         found: samples on edges.
     """
-    return (
-        found.at_um + _ASIDE_UM * found.normal,
-        found.at_um - _ASIDE_UM * found.normal,
-    )
-
-
-def aside_um() -> float:
-    """Distance between the two points of :func:`slope_aside`."""
-    return 2 * _ASIDE_UM
+    away = ACROSS_UM / 2 * found.normal
+    return found.at_um + away, found.at_um - away
 
 
 def _near(at_um: Array, polygons: ExposedPolygons, reach: float) -> tuple[Array, Array]:

@@ -29,15 +29,18 @@ def test_the_polygon_of_a_circle_exposes_as_the_disc_does():
     corners: 1e-4.
     """
     polygon, disc = round_ones()
-    (own, slope), (want, fall) = polygon.edges(ONE, POINT), disc.edges(ONE, POINT)
+    (own, slope), (want, fall) = (
+        polygon.edge_exposure(ONE, POINT),
+        disc.edge_exposure(ONE, POINT),
+    )
     assert own[1] == pytest.approx(want[1], rel=2e-3)
     assert slope[1] == pytest.approx(fall[1], rel=1e-2)
     assert polygon.area_um2[1] == pytest.approx(disc.area_um2[1], rel=1e-9)
     assert polygon.wider_um2[1] == pytest.approx(disc.wider_um2[1], rel=1e-4)
     at = np.array([[0.13, 0.04], [0.02, -0.1], [-0.4, 0.2]])
     for width in POINT.widths_um:
-        assert polygon.given(1, at + OFF, width) == pytest.approx(
-            disc.given(1, at, width), abs=1e-4
+        assert polygon.exposure_at(1, at + OFF, width) == pytest.approx(
+            disc.exposure_at(1, at, width), abs=1e-4
         )
 
 
@@ -59,7 +62,7 @@ def test_a_rectangle_and_its_hole_are_products_of_error_functions():
         )
 
     want = plain(0.13, 0.06) - plain(0.05, 0.021)
-    assert shape.given(1, at, width) == pytest.approx(
+    assert shape.exposure_at(1, at, width) == pytest.approx(
         want, abs=1e-6
     )  # four Gauss points on 0.8 widths
 
@@ -110,23 +113,23 @@ def test_a_turn_leaves_the_level_of_a_shape_as_it_is(sides, turn_deg):
         [[c, s], [-s, c]]
     )
     want = level_of_a_rectangle(a, b)
-    assert DrawnOutlines([(), [corners + OFF]]).edges(ONE, POINT)[0][
+    assert DrawnOutlines([(), [corners + OFF]]).edge_exposure(ONE, POINT)[0][
         1
     ] == pytest.approx(want, rel=5e-4)
 
 
 def test_edges_are_seen_from_places_that_divide_them():
     discs = DrawnDiscs(np.array([0.0, 0.31, D]))
-    around = discs.edge_um(2)
+    around = discs.edge_points_um(2)
     assert np.hypot(*around.T) == pytest.approx(D / 2)
     steps = np.linalg.norm(around - np.roll(around, -1, axis=0), axis=1)
     assert steps == pytest.approx(
         D * math.sin(math.pi / len(around))
     )  # of a regular polygon
-    assert discs.edge_um(1) == pytest.approx(around * 0.31 / D)
+    assert discs.edge_points_um(1) == pytest.approx(around * 0.31 / D)
     box = DrawnOutlines(
         [(), [np.array([[1.0, 2.0], [1.3, 2.0], [1.3, 2.1], [1.0, 2.1]])]]
-    ).edge_um(1)
+    ).edge_points_um(1)
     assert len(box) == 48  # 18 along each long side, 6 along each short one
     on = [
         np.isclose(box[:, k], place).sum()
@@ -153,6 +156,6 @@ def test_the_widest_reach_farthest_along_the_steps_of_those_used():
 def test_what_is_not_used_has_no_edge():
     polygon, disc = round_ones()
     for shapes in (polygon, disc):
-        own, slope = shapes.edges(np.array([False, False]), POINT)
+        own, slope = shapes.edge_exposure(np.array([False, False]), POINT)
         assert not own.any()
         assert not slope.any()

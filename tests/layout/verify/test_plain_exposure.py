@@ -182,9 +182,9 @@ def test_the_slope_across_an_edge_is_that_of_an_error_function(alpha_um):
     )
     outside, inside = (
         polygon_edges.exposure_at_edges(at, drawn, [(alpha_um, 1.0)])
-        for at in polygon_edges.slope_aside(points)
+        for at in polygon_edges.points_across(points)
     )
     want = 1.3 / (alpha_um * np.sqrt(np.pi))
-    assert (inside - outside) / polygon_edges.aside_um() == pytest.approx(
+    assert (inside - outside) / polygon_edges.ACROSS_UM == pytest.approx(
         [want] * 2, rel=0.016
     )

@@ -166,10 +166,10 @@ def _between(
         )
         least, box = math.inf, np.zeros(4)
         for each in second if len(first) else ():
-            apart = box_distance(first, each)
-            n = int(apart.argmin())
-            if apart[n] < least:
-                least, box = float(apart[n]), box_around(np.stack([first[n], each]))
+            distance = box_distance(first, each)
+            n = int(distance.argmin())
+            if distance[n] < least:
+                least, box = float(distance[n]), box_around(np.stack([first[n], each]))
         if least >= need:
             continue
         left, bottom, right, top = (int(v) for v in box)
