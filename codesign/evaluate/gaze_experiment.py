@@ -483,7 +483,7 @@ def finer_imager(source: FinishedRun) -> Imager | None:
         return None
     scenes = source.settings.scenes
     try:
-        made = formed.make_imager(
+        return formed.make_imager(
             settings,
             source.run.trainer.model.coefficients_rad,
             scenes.pixels + 2 * scenes.margin,
@@ -492,7 +492,6 @@ def finer_imager(source: FinishedRun) -> Imager | None:
         )
     except (SceneError, PropagationError):
         return None
-    return made if isinstance(made, Imager) else None
 
 
 def sphere_calibrator(

@@ -2,6 +2,7 @@
 formed anew where it moved, and their frames on the sensor.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -79,15 +80,23 @@ class StepImaging:
             coefficients_rad: (polynomials,) phase coefficients of the lens, rad.
         """
         self._live = None
+        make = functools.partial(
+            formed.make_imager,
+            self.optics,
+            frame=frame,
+            margin=margin,
+            device=self.device,
+        )
         if self.stacks:
-            return self._drawn(step, coefficients_rad, frame, margin)
+            return self._drawn(step, coefficients_rad, make)
         if self.optics.image == "uniform":
             return self._uniform(step, coefficients_rad, frame, margin, live=live)
-        made = self._true(step, coefficients_rad.detach(), frame, margin, live=live)
+        made = self._true(step, coefficients_rad.detach(), make, live=live)
         if not live:
             return made
+        drawn = seeded_generator(self.seed, step, 9)  # field points and wavelengths
         self._live = formed.make_differentiable_imager(
-            self.optics, made, draw_nodes(made.plan, self.draws, self._generator(step))
+            self.optics, made, draw_nodes(made.plan, self.draws, drawn)
         )
         return self._live.ready
 
@@ -101,13 +110,6 @@ class StepImaging:
         if self._live is not None:
             self._live.pass_on(self.optics, coefficients_rad)
             self._live = None
-
-    def _generator(self, step: int) -> torch.Generator:
-        """Of the field points and wavelengths that pass the gradient of a step on."""
-        seed = int(
-            np.random.SeedSequence([self.seed, step, 9]).generate_state(1, np.uint64)[0]
-        )
-        return torch.Generator().manual_seed(seed >> 1)
 
     def _uniform(
         self,
@@ -134,8 +136,7 @@ class StepImaging:
         self,
         step: int,
         coefficients_rad: Tensor,
-        frame: int,
-        margin: int,
+        make: Callable[..., Imager],
         *,
         live: bool,
     ) -> Imager:
@@ -144,43 +145,33 @@ class StepImaging:
         drawn = not first and self.draw(self.imaged_step) is not None
         waited = step - self.imaged_step >= self.refresh
         if first or (moved and not live) or ((moved or drawn) and waited):
-            self.imaged_step, self.imaged_rad, self._ready = (
-                step,
-                coefficients_rad.clone(),
-                None,
-            )
-        if not isinstance(self._ready, Imager):
+            self.imaged_step, self.imaged_rad = step, coefficients_rad.clone()
+            self._ready = None
+        if self._ready is None:
             error = self.draw(self.imaged_step)
-            about: dict[str, Any] = {
-                "margin": margin,
-                "error": error,
-                "device": self.device,
-            }
-            self._ready = formed.make_imager(
-                self.optics, self.imaged_rad, frame, **about
-            )
-        if not isinstance(self._ready, Imager):
-            raise TypeError("the true image needs a field of PSFs")
+            self._ready = make(coefficients_rad=self.imaged_rad, error=error)
         return self._ready
 
     def _drawn(
-        self, step: int, coefficients_rad: Tensor, frame: int, margin: int
+        self, step: int, coefficients_rad: Tensor, make: Callable[..., Imager]
     ) -> Imager:
         """The given PSFs that this step draws."""
-        number = int(
-            np.random.default_rng([self.seed, step, 4]).integers(len(self.stacks))
-        )
+        generator = np.random.default_rng([self.seed, step, 4])
+        number = int(generator.integers(len(self.stacks)))
         if number not in self._given:
             made = self.stacks[number]
-            about: dict[str, Any] = {
-                "margin": margin,
-                "made": made,
-                "device": self.device,
-            }
-            self._given[number] = formed.make_imager(
-                self.optics, coefficients_rad, frame, **about
-            )
+            self._given[number] = make(coefficients_rad=coefficients_rad, made=made)
         return self._given[number]
+
+
+def seeded_generator(seed: int, step: int, stream: int) -> torch.Generator:
+    """Random generator of a step of a training.
+
+    Args:
+        seed: of the training. step: its number. stream: what is drawn.
+    """
+    words = np.random.SeedSequence([seed, step, stream]).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(words[0]) >> 1)
 
 
 def read_out(

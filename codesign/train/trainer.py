@@ -40,7 +40,13 @@ from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.settings import Place
 from codesign.train.evolution import Count, sample_sandwich
-from codesign.train.imaging import StepImaging, frame_wide, network_macs, read_out
+from codesign.train.imaging import (
+    StepImaging,
+    frame_wide,
+    network_macs,
+    read_out,
+    seeded_generator,
+)
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
@@ -514,7 +520,7 @@ class Trainer:
         """Frames of the sensor. All readings of a step begin the same noise: networks
         differ by what they see.
         """
-        noise = self._generator(1, step)
+        noise = seeded_generator(self.inner.seed, step, 1)
         return read_out(
             light,
             self.optics.sample_um,
@@ -605,8 +611,8 @@ class Trainer:
         )
         return optics, every * found.loss.value  # of weight optics_weight on average
 
-    def _lens_error(self, step: int | None = None) -> DrawnLensErrors | None:
-        return self.optics.spread.draw(self._generator(2, step))
+    def _lens_error(self, step: int) -> DrawnLensErrors | None:
+        return self.optics.spread.draw(seeded_generator(self.inner.seed, step, 2))
 
     def _members(self, count: Count) -> Sequence[Architecture]:
         if self.architecture is not None:
@@ -628,15 +634,6 @@ class Trainer:
             if self.budgets_mmacs
             else 0.0
         )
-
-    def _generator(self, stream: int, step: int | None = None) -> torch.Generator:
-        at = self.step if step is None else step
-        seed = int(
-            np.random.SeedSequence([self.inner.seed, at, stream]).generate_state(
-                1, np.uint64
-            )[0]
-        )
-        return torch.Generator().manual_seed(seed >> 1)
 
     def _apply(self, rates: dict[str, float], *, finite: bool) -> None:
         if not finite:
