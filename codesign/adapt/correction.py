@@ -449,12 +449,14 @@ def judge_correction(
     ranges = [
         (name, *result.interval(name)) for name in part.names if name in result.names
     ]
-    told = ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges)
+    intervals = ", ".join(
+        f"{name} {low:.3g} to {high:.3g}" for name, low, high in ranges
+    )
     return CorrectionSpread(
         drawn,
         sigma,
         f"no correction: the posterior leaves {part.words} open by {sigma.max():.1f} nm (1 sigma, at most "
-        f"{wide_nm:g} allowed; {told}). Settle it by {_settled(result, table, sigma, (part, wide_nm))}",
+        f"{wide_nm:g} allowed; {intervals}). Settle it by {_settled(result, table, sigma, (part, wide_nm))}",
     )
 
 

@@ -162,14 +162,16 @@ def _places(folder: Path) -> dict[str, Path | None]:
         TrainingError: it is not finished, or of a version that did not note them.
     """
     try:
-        told: dict[str, Any] = json.loads((folder / RESULT).read_text("utf-8"))["given"]
+        inputs: dict[str, Any] = json.loads((folder / RESULT).read_text("utf-8"))[
+            "given"
+        ]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise TrainingError(
             f"{folder} holds a retraining that is not finished, or of a version that did not note its run and fit: go "
             f"on with `metalens retrain RUN_DIR --asbuilt FILE -o {folder} --resume`"
         ) from None
     return {
-        name: folder / told[name] if told.get(name) else None
+        name: folder / inputs[name] if inputs.get(name) else None
         for name in ("run", "asbuilt", "truth")
     }
 

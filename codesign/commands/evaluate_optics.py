@@ -112,7 +112,7 @@ def _measure(
         for name, lens in zip(names, made, strict=True)
         if not design.lens_has_focus(lens)
     ]
-    told = [f"{name} {SPREAD}" for name in spread]
+    remarks = [f"{name} {SPREAD}" for name in spread]
     try:
         scenes = dict(
             zip(
@@ -122,9 +122,9 @@ def _measure(
             )
         )
     except PropagationError as error:
-        raise ConfigError("; ".join([str(error), *told])) from error
+        raise ConfigError("; ".join([str(error), *remarks])) from error
     tables = [
-        *evaluate_optics.format_tables(axial, scenes, measured, spread=told),
+        *evaluate_optics.format_tables(axial, scenes, measured, spread=remarks),
         *field_page.field_tables(seen),
     ]
     values = evaluate_optics.table_values(axial, scenes, measured)
@@ -162,10 +162,10 @@ def _read(
             judge_lenses(made, setting), total=len(made), label="reader"
         )
     )
-    told = {name: one.values() for name, one in found.items()}
+    numbers = {name: one.values() for name, one in found.items()}
     return reader.reader_table(found, setting), {
         "settings": dataclasses.asdict(setting),
-        "lenses": told,
+        "lenses": numbers,
     }
 
 

@@ -44,22 +44,22 @@ def run(options: Options) -> int:
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
         if options.runs and options.measure:
             _measure(options, draft.path)
-        told = paper.claim_lines(
+        claims = paper.claim_lines(
             collect_measurements(draft.path, runs, options.others), draft.path
         )
-        _write(draft.path, told)
+        _write(draft.path, claims)
         values = [
             {
                 **asdict(t.claim),
                 "ours": asdict(t.ours) if t.ours else None,
                 "picture": t.picture,
             }
-            for t in told
+            for t in claims
         ]
         store.write_text(
             draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n"
         )
-    text = f"{claims_table(told)}\nopen {folder / PAGE}"
+    text = f"{claims_table(claims)}\nopen {folder / PAGE}"
     return options.console.judged(
         {"lines": values, "folder": str(folder)}, text, measurement_failures(folder)
     )
@@ -163,13 +163,13 @@ def _measure(options: Options, folder: Path) -> None:
 
 def _measure_gaze(options: Options, path: Path) -> None:
     """Gaze of the proposed run; not measured again where it is in the file."""
-    told = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+    measured = json.loads(path.read_text("utf-8")) if path.is_file() else {}
     folder = options.runs[0]
-    if str(folder) in told:
+    if str(folder) in measured:
         return
     options.console.say(f"measuring: gaze of {folder}")
-    told[str(folder)] = {"rows": paper.gaze_rows(folder)}
-    store.write_text(path, json.dumps(told, indent=1) + "\n")
+    measured[str(folder)] = {"rows": paper.gaze_rows(folder)}
+    store.write_text(path, json.dumps(measured, indent=1) + "\n")
 
 
 def _named(folder: Path, name: str, run_dir: Path) -> Path:
@@ -180,22 +180,22 @@ def _named(folder: Path, name: str, run_dir: Path) -> Path:
     return kept / f"{name}.h5"
 
 
-def claims_table(told: list[ClaimLine]) -> str:
+def claims_table(claims: list[ClaimLine]) -> str:
     """The lines as text.
 
     Args:
-        told: claims with their measurements.
+        claims: with their measurements.
     """
     head = ("place", "what", "paper", "ours", "ratio", "conditions")
-    return report.Table(head, [line.words() for line in told]).text
+    return report.Table(head, [line.words() for line in claims]).text
 
 
-def _write(folder: Path, told: list[ClaimLine]) -> None:
-    places = list(dict.fromkeys(t.claim.place for t in told))
+def _write(folder: Path, claims: list[ClaimLine]) -> None:
+    places = list(dict.fromkeys(t.claim.place for t in claims))
     head = ("what", "paper", "ours", "ratio", "conditions")
     sections = []
     for place in places:
-        mine = [t for t in told if t.claim.place == place]
+        mine = [t for t in claims if t.claim.place == place]
         items: list[report.Figure | report.Table] = (
             [report.Table(head, [t.words()[1:] for t in mine if not t.picture])]
             if any(not t.picture for t in mine)
@@ -207,9 +207,9 @@ def _write(folder: Path, told: list[ClaimLine]) -> None:
             if t.picture
         ]
         sections.append(report.Section(place, items=items))
-    done = sum(t.ours is not None or bool(t.picture) for t in told)
+    done = sum(t.ours is not None or bool(t.picture) for t in claims)
     keys = [
-        report.KeyFigure("claims of the paper", str(len(told))),
+        report.KeyFigure("claims of the paper", str(len(claims))),
         report.KeyFigure("measured here", str(done)),
     ]
     lead = "Every table and figure of the paper beside ours. What was not measured says which command would."

@@ -578,7 +578,7 @@ def _result(
 ) -> RunResult:
     read = read_from(kept, source)
     predicted, judged = calibrated_gaze(read, trial, config, how)
-    told, _ = calibrated_gaze(
+    exact, _ = calibrated_gaze(
         replace(read, slip_mm=trial.slip_mm),
         trial,
         config,
@@ -586,7 +586,7 @@ def _result(
     )
     error, told_error = (
         np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
-        for p in (predicted, told)
+        for p in (predicted, exact)
     )
     mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
     centre, iou = (

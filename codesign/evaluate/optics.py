@@ -506,7 +506,7 @@ def _axial(
     rows: list[tuple[str, ...]] = []
     for name, found in axial.items():
         for k, b in enumerate(setting.binnings):
-            told = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
+            means = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
             least = (
                 [
                     f"{float(found.encircled[0].min()):.2f}",
@@ -516,7 +516,7 @@ def _axial(
                 else []
             )
             rows.append(
-                (name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""]))
+                (name if k == 0 else "", f"{b} × {b}", *means, *(least or ["", ""]))
             )
     return Table(head, rows, caption)
 

@@ -157,10 +157,10 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
     Raises:
         StoreError: no such file, or of another version.
     """
-    told = _json(path, "runs", "ratios", "settings")
-    about = told["settings"]
+    content = _json(path, "runs", "ratios", "settings")
+    about = content["settings"]
     found: dict[str, MeasuredNumber] = {}
-    for run in told["runs"]:
+    for run in content["runs"]:
         words = f"{about['subjects']} synthetic subjects, {run['mmacs']:.1f} MMACs, seed {about['seed']}"
         for key, name in (
             ("slip", "slip_mm"),
@@ -173,7 +173,7 @@ def of_experiment(path: Path) -> dict[str, MeasuredNumber]:
                 found[f"{key}/{run['name']}"] = MeasuredNumber(
                     run[name], low, high, words
                 )
-    for entry in told["ratios"]:
+    for entry in content["ratios"]:
         if entry["against"] != "hyperbolic":
             continue
         for key, name in (
@@ -226,21 +226,19 @@ def of_optics(path: Path) -> dict[str, MeasuredNumber]:
     Raises:
         StoreError: no such file, or of another version.
     """
-    told = _json(path, "lenses", "angles_deg", "normalisation")
+    content = _json(path, "lenses", "angles_deg", "normalisation")
     found: dict[str, MeasuredNumber] = {}
-    base = told["lenses"].get("hyperbolic")
-    for name, values in told["lenses"].items():
+    base = content["lenses"].get("hyperbolic")
+    for name, values in content["lenses"].items():
         for kind, (value, low, high) in values["scene_ratios"].items():
             found[f"scenes/{kind}/{name}"] = MeasuredNumber(
                 value, low, high, "same states, images of equal light"
             )
         if base is None:
             continue
-        for i, angle in enumerate(told["angles_deg"]):
+        for i, angle in enumerate(content["angles_deg"]):
             one, other = (sum(v["information_per_mm2"][i][0]) for v in (values, base))
-            words = (
-                f"honest I(z), {told['normalisation']} normalisation, pixels not binned"
-            )
+            words = f"honest I(z), {content['normalisation']} normalisation, pixels not binned"
             found[f"information/{angle:g}/{name}"] = MeasuredNumber(
                 one / other, conditions=words
             )
@@ -279,19 +277,19 @@ def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, MeasuredNumbe
 
 def _json(path: Path, *needed: str) -> dict[str, Any]:
     try:
-        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise StoreError(f"{path}: no such file; measure it first") from None
     except json.JSONDecodeError as error:
         raise StoreError(
             f"{path}: not a JSON file ({error}); measure it again"
         ) from None
-    missing = [name for name in needed if name not in told]
+    missing = [name for name in needed if name not in content]
     if missing:
         raise StoreError(
             f"{path}: {', '.join(missing)} missing: made by another version; measure it again"
         )
-    return told
+    return content
 
 
 def frozen_parts(folder: Path) -> tuple[str, ...]:
@@ -363,14 +361,14 @@ def gaze_rows(
     return out
 
 
-def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
+def of_gaze(content: Mapping[str, Mapping[str, Any]]) -> dict[str, MeasuredNumber]:
     """Table 2 from gaze.json, {folder: {rows of :func:`gaze_rows`}}: the first run is
     the proposed one. Networks of others are not rebuilt here.
 
     Args:
-        told: content of gaze.json.
+        content: of gaze.json.
     """
-    for entry in told.values():
+    for entry in content.values():
         rows = entry["rows"]
         accurate = min(rows, key=lambda r: float(r["personal_deg"]))
         return {

@@ -287,8 +287,8 @@ def _learn_depth(
     for rows in _steps(
         made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01
     ):
-        told, _ = made.branch(learn.pixels[rows])
-        losses.depth_loss(told, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
+        predicted, _ = made.branch(learn.pixels[rows])
+        losses.depth_loss(predicted, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
 
 
 def _learn_slip(
@@ -299,8 +299,10 @@ def _learn_slip(
     for rows in _steps(made.slip, len(features), passes, batch, rate=2e-3, decay=0.03):
         found = made.slip(features[rows])
         miss, spread = found[:, :3] - truth[rows], found[:, 3:].clamp(-4, 2)
-        told = (0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread).mean()
-        loss = F.smooth_l1_loss(found[:, :3], truth[rows], beta=0.3) + 0.1 * told
+        uncertainty = (
+            0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread
+        ).mean()
+        loss = F.smooth_l1_loss(found[:, :3], truth[rows], beta=0.3) + 0.1 * uncertainty
         loss.backward()
 
 
@@ -345,17 +347,17 @@ def _judge(
     ratio = (error[:, 2] / spread).sort().values
     reach = float(ratio[min(math.ceil(SHARE * (len(ratio) + 1)), len(ratio)) - 1])
     error, spread = slip(judged)
-    told = torch.cat(
+    predicted = torch.cat(
         [
             made.branch(judged.pixels[i : i + 256])[0]
             for i in range(0, len(judged.pixels), 256)
         ]
     )
     truth = blur.depth_mm(judged.vergence)
-    depth = blur.depth_mm(told[:, 0])
+    depth = blur.depth_mm(predicted[:, 0])
     window = (depth - truth).abs()
     trusted = window.flatten()[
-        (depth**2 * told[:, 1].exp()).flatten().argsort()[: window.numel() // 2]
+        (depth**2 * predicted[:, 1].exp()).flatten().argsort()[: window.numel() // 2]
     ]
     guess = float((truth - truth.median()).abs().mean())
     inside = float((error[:, 2] <= reach * spread).float().mean())

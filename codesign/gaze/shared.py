@@ -91,18 +91,18 @@ def _again(
         np.empty_like(v) for v in (found.mean, found.variance, found.noise)
     )
     for k in range(2):
-        told = [found._of(design[rows], answers[rows], k) for rows in people]
+        effects = [found._of(design[rows], answers[rows], k) for rows in people]
         theirs = np.zeros(len(design))
-        for rows, (u, _) in zip(people, told, strict=True):
+        for rows, (u, _) in zip(people, effects, strict=True):
             theirs[rows] = design[rows] @ u
         mean[:, k] = np.linalg.lstsq(design, answers[:, k] - theirs, rcond=None)[0]
         variance[:, k] = (
-            np.mean([u**2 + np.diag(cov) for u, cov in told], axis=0) + LEAST
+            np.mean([u**2 + np.diag(cov) for u, cov in effects], axis=0) + LEAST
         )
         left = ((answers[:, k] - design @ mean[:, k] - theirs) ** 2).sum()
         unsure = sum(
             np.sum((design[rows] @ cov) * design[rows])
-            for rows, (_, cov) in zip(people, told, strict=True)
+            for rows, (_, cov) in zip(people, effects, strict=True)
         )
         noise[k] = (left + unsure) / len(design) + LEAST
     return MixedModel(mean, variance, noise)

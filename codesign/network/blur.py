@@ -193,13 +193,13 @@ class BlurBranch(nn.Module):
         GRID), and its mean.
         """
         power, mean = window_spectra(frames)
-        told = self.norm(
+        features = self.norm(
             torch.cat([torch.log(power + FLOOR), mean, gradient_statistics(frames)], 1)
         )
-        told = torch.cat(
-            [told, self.place + torch.zeros_like(mean)], 1
+        features = torch.cat(
+            [features, self.place + torch.zeros_like(mean)], 1
         )  # of as many frames, traced too
-        return self.first(told) * self.gain + self.offset, mean
+        return self.first(features) * self.gain + self.offset, mean
 
     def _read(self, weighed: Tensor) -> Tensor:
         """(batch, HIDDEN[1], GRID, GRID) of every window with its neighbours."""

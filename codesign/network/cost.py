@@ -93,8 +93,8 @@ def network_cost(space: SearchSpace, architecture: Architecture) -> MacPolynomia
     )  # depthwise 3x3, then the mask itself and the landmarks
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
-    told = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
-    heads = told * SLIP_HIDDEN + SLIP_HIDDEN * ((3 + 2) * SLIP_HIDDEN + 3 * 3)
+    features = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
+    heads = features * SLIP_HIDDEN + SLIP_HIDDEN * ((3 + 2) * SLIP_HIDDEN + 3 * 3)
     heads += blur.content_macs(MASK_CHANNELS)
     return MacPolynomial(per_pixel, body.constant + heads, blur=True)
 

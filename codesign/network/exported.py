@@ -65,7 +65,7 @@ class ExportedNetwork(nn.Module):
         deviation = torch.sqrt((centred**2).sum((-2, -1), keepdim=True) / (size**2 - 1))
         found = self.net.net(centred / deviation.clamp_min(1e-6), self.net.architecture)
         unit = torch.tensor(self.scale.slip_mm)
-        told = {
+        outputs = {
             "mask_logits": found.mask_logits,
             "pupil_mm": found.centre * self.scale.frame_mm,
             "slip_mm": found.slip * unit,
@@ -73,7 +73,7 @@ class ExportedNetwork(nn.Module):
             "points_mm": found.points * self.scale.frame_mm,
             "axis_deg": self._angles(found.axis),
         }
-        return tuple(told[name] for name in self.scale.outputs)
+        return tuple(outputs[name] for name in self.scale.outputs)
 
     def _angles(self, axis: Tensor) -> Tensor:
         """As :func:`codesign.gaze.face_angles`, of axes of any length."""

@@ -60,16 +60,16 @@ def slip_loss(
     return F.smooth_l1_loss(predicted, truth / scale, beta=knee)
 
 
-def depth_loss(told: Tensor, vergence: Tensor) -> Tensor:
+def depth_loss(predicted: Tensor, vergence: Tensor) -> Tensor:
     """Negative log likelihood of the windows' vergences under normal distributions,
     less its constant.
 
     Args:
-        told: (batch, 2, y, x) mean and logarithm of the standard deviation. vergence:
+        predicted: (batch, 2, y, x) mean and logarithm of the standard deviation. vergence:
             (batch, y, x) the truth.
     """
-    miss = told[:, 0] - vergence
-    return (0.5 * miss**2 * torch.exp(-2 * told[:, 1]) + told[:, 1]).mean()
+    miss = predicted[:, 0] - vergence
+    return (0.5 * miss**2 * torch.exp(-2 * predicted[:, 1]) + predicted[:, 1]).mean()
 
 
 def uncertainty_loss(found: Prediction, truth: Tensor) -> Tensor:
@@ -129,12 +129,12 @@ def depth_reading_loss(
         scale_mm: (3,) unit of the network's slippage.
         depth_weight: of the depths of windows.
     """
-    told = (
+    depth_term = (
         found.slip.new_zeros(())
         if found.depth is None
         else depth_weight * depth_loss(found.depth, vergence)
     )
-    return told + SPREAD_WEIGHT * uncertainty_loss(found, slip_mm / scale_mm)
+    return depth_term + SPREAD_WEIGHT * uncertainty_loss(found, slip_mm / scale_mm)
 
 
 def pose_loss(

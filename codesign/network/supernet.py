@@ -27,11 +27,9 @@ from codesign.network.cost import (
     SLIP_GRID,
     SLIP_HIDDEN,
     lateral_strides,
-    network_cost,
 )
 from codesign.network.running import RunningNorm
 from codesign.network.windows import resample_image
-from metalens.core.arrays import Array
 from metalens.core.errors import TrainingError
 
 
@@ -299,9 +297,8 @@ class Supernet(nn.Module):
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
         seen = resize_frames(frames, architecture.resolution)
-        x = self.stem(
-            seen, self._stem(architecture), kernel=3, stride=2, act="hardswish"
-        )
+        channels = stem_channels(self.space, architecture)
+        x = self.stem(seen, channels, kernel=3, stride=2, act="hardswish")
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(
@@ -312,27 +309,15 @@ class Supernet(nn.Module):
             if i in kept:
                 features.append(x)
         logits, maps, decoded = self.perception(features)
-        depth, told, axial = self.blur(seen, decoded)
+        depth, blur_features, axial = self.blur(seen, decoded)
         points, spread_out = soft_argmax_maps(maps)
         slip, spread, axis = self.calibration(
-            x, told, torch.cat([points.flatten(1), spread_out], 1)
+            x, blur_features, torch.cat([points.flatten(1), spread_out], 1)
         )
         slip = slip + F.pad(axial[:, None], (2, 0))
         return Prediction(
             logits, soft_argmax(logits), slip, depth, spread, points, axis
         )
-
-    def counts(self, architecture: Architecture, sizes: Array) -> Array:
-        """Multiply-accumulates of a member for square frames of these sizes after
-        scaling (integers), exact.
-
-        Args:
-            architecture: member of the search space.
-        """
-        return network_cost(self.space, architecture).at(sizes)
-
-    def _stem(self, architecture: Architecture) -> int:
-        return stem_channels(self.space, architecture)
 
 
 def resize_frames(frames: Tensor, resolution: float) -> Tensor:

@@ -194,10 +194,10 @@ def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         )
         ** 2
     )
-    told = torch.log1p(square / STEP_FLOOR)
+    logs = torch.log1p(square / STEP_FLOOR)
     return (
-        told,
-        told**2,
+        logs,
+        logs**2,
         (square**2) ** 2,
     )  # squares twice: a power of four is a function call a number
 

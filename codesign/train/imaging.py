@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from codesign.batches import parallel
-from codesign.network import Architecture, Supernet, cost
 from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack, formed
 from codesign.optics import stack as lens
 from metalens.image import Imager, Sensor, draw_nodes
@@ -272,16 +271,3 @@ def frame_wide(samples: int, sample_um: float, pitch_um: float) -> float:
     """
     wide = pixel_count(samples, sample_um, pitch_um) * pitch_um / (samples * sample_um)
     return 1.0 if abs(wide - 1) < 1e-9 else wide
-
-
-def network_macs(
-    net: Supernet, architecture: Architecture, window_um: float, pitch_um: Tensor
-) -> Tensor:
-    """Multiply-accumulates of one member at this pitch, differentiable.
-
-    Args:
-        net: elastic network. architecture: member of the search space.
-        window_um: edge of the image. pitch_um: () pitch of the pixels, um.
-    """
-    size = window_um / pitch_um * architecture.resolution
-    return cost.interpolate_counts(lambda sizes: net.counts(architecture, sizes), size)

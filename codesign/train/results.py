@@ -292,11 +292,11 @@ def window_depth_bound(run: CodesignRun) -> dict[str, list[float]]:
         run: run with its model.
     """
     made = lens.lens_psf_stack(run.trainer.optics, run.trainer.model.coefficients_rad)
-    told = depth_information(made)
+    information = depth_information(made)
     middle = (made.depths_um[1:] + made.depths_um[:-1]) / 2
     return {
         "depth_mm": (1e-3 * middle).tolist(),
-        "window_depth_mm": told.clamp_min(1e-12).rsqrt().tolist(),
+        "window_depth_mm": information.clamp_min(1e-12).rsqrt().tolist(),
     }
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 
 from codesign.batches import (
     TRAINING,
@@ -29,7 +28,6 @@ from codesign.optics import OpticsConfig
 from codesign.settings import Part
 from codesign.train import checkpoint, evolution
 from codesign.train.evolution import EvolutionSettings, EvolutionState
-from codesign.train.imaging import network_macs
 from codesign.train.trainer import (
     InnerConfig,
     LearningRateSchedule,
@@ -182,7 +180,7 @@ class CodesignRun:
         """Multiply-accumulates that run for a frame of whole pixels at the pitch that
         was found.
 
-        Training counts smoothly with the pitch (:func:`network_macs`), up to a row of
+        Training counts smoothly with the pitch (:func:`codesign.network.cost.macs_of_size`), up to a row of
         pixels less.
 
         Args:
@@ -202,7 +200,7 @@ class CodesignRun:
             self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um
         )
         sizes = np.array([round(pixels * architecture.resolution)])
-        return float(self.trainer.model.net.counts(architecture, sizes)[0])
+        return float(cost.network_cost(self.settings.space, architecture).at(sizes)[0])
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
@@ -301,9 +299,8 @@ def _counter(run: CodesignRun, architecture: Architecture) -> Callable[[float], 
     """
 
     def count(pitch_um: float) -> float:
-        pitch = torch.tensor(pitch_um, dtype=torch.float64)
-        net = run.trainer.model.net
-        smooth = float(network_macs(net, architecture, run.window_um, pitch))
+        size = run.window_um / pitch_um * architecture.resolution
+        smooth = float(cost.macs_of_size(run.settings.space, architecture, size))
         return max(smooth, run.counted(architecture, pitch_um))
 
     return count

@@ -144,10 +144,10 @@ def search_architectures(
             seed=settings.inner.seed + i,
             start=before,
         )
-        told = len(before.history) if before else 0
+        reported = len(before.history) if before else 0
         for state in states:
-            yield from ((budget, born) for born in state.history[told:])
-            told = len(state.history)
+            yield from ((budget, born) for born in state.history[reported:])
+            reported = len(state.history)
             run.searches[i:] = [state]
             save_run(path, run)
 

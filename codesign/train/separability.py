@@ -165,11 +165,11 @@ def depth_information(made: PixelPsfStack) -> Tensor:
     spectrum = _texture(psfs.shape[-1]).to(psfs)
     gaps = (made.depths_um[1:] - made.depths_um[:-1]).tolist()
     pairs = torch.stack([psfs[:-1], psfs[1:]], 1)
-    told = [
+    information = [
         texture_information(pair, step_um=gap, spectrum=spectrum, noise=1e-3)[0]
         for pair, gap in zip(pairs, gaps, strict=True)
     ]
-    return torch.stack(told)
+    return torch.stack(information)
 
 
 def texture_depth_loss(
@@ -184,9 +184,11 @@ def texture_depth_loss(
     Args:
         made: PSFs over depth. settings: of the lens and its image.
     """
-    told, psfs = depth_information(made), made.intensity
+    information, psfs = depth_information(made), made.intensity
     share = encircled_energy(psfs, settings.sample_um, radius_um=2 * settings.sample_um)
-    return -torch.log(told + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+    return (
+        -torch.log(information + 0.05).mean() + 50 * torch.relu(energy - share).mean()
+    )
 
 
 def _texture(size: int) -> Tensor:

@@ -40,13 +40,7 @@ from codesign.optics import DrawnLensErrors, OpticsConfig, PixelPsfStack
 from codesign.optics import stack as lens
 from codesign.settings import Place
 from codesign.train.evolution import Count, sample_sandwich
-from codesign.train.imaging import (
-    StepImaging,
-    frame_wide,
-    network_macs,
-    read_out,
-    seeded_generator,
-)
+from codesign.train.imaging import StepImaging, frame_wide, read_out, seeded_generator
 from codesign.train.separability import (
     SeparabilityConfig,
     fisher_separability,
@@ -537,9 +531,12 @@ class Trainer:
         scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
         size = given.light.shape[-1] * self.optics.sample_um
         self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
-        members = self._members(
-            lambda a: float(network_macs(self.model.net, a, size, pitch.detach()))
-        )
+        space = self.model.net.space
+
+        def count(a: Architecture, pitch_um: Tensor) -> Tensor:
+            return cost.macs_of_size(space, a, size / pitch_um * a.resolution)
+
+        members = self._members(lambda a: float(count(a, pitch.detach())))
         finer = {a: pitch_moves and a.resolution < 1 for a in members}
         frames = {False: given.seen} if given.seen is not None else {
             resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
@@ -565,9 +562,7 @@ class Trainer:
             parts.append(
                 loss if pose is None else loss + self._pose(answer, pose, wide)
             )
-        macs = torch.stack(
-            [network_macs(self.model.net, a, size, pitch) for a in members]
-        )
+        macs = torch.stack([count(a, pitch) for a in members])
         return torch.stack(parts).mean(), macs
 
     def _pose(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
