@@ -321,7 +321,10 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
         )
         for r in values["runs"]
     ]
-    words = [_told(values["settings"]), *(f"{line}." for line in _remarks(values))]
+    words = [
+        _method_text(values["settings"]),
+        *(f"{line}." for line in _remarks(values)),
+    ]
     sections = [
         report.Section("Numbers", " ".join(words), experiment_tables(values)),
         report.Section("Figures", "", figures),
@@ -329,7 +332,7 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
     report.write_report(path, "Virtual experiment", sections, key_figures=keys)
 
 
-def _told(about: dict[str, Any]) -> str:
+def _method_text(about: dict[str, Any]) -> str:
     """How the numbers were made."""
     return (
         f"{about['subjects']} subjects whom training never saw, {about['frames']} frames. Each is calibrated on "

@@ -105,13 +105,18 @@ def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
     for name, one in seen.items():
         for k, angle in enumerate(one.angles_deg):
             label = name if k == 0 else ""
-            focus = [_told(v, 1) for v in (*one.close_um[k], *one.sharpest_um[k])]
+            focus = [
+                _format_value(v, 1) for v in (*one.close_um[k], *one.sharpest_um[k])
+            ]
             bent, lost = (
-                _told(100 * v[k], 2) for v in (one.distortion, one.vignetting)
+                _format_value(100 * v[k], 2) for v in (one.distortion, one.vignetting)
             )
-            chief, light = _told(one.chief_um[k, 0], 2), _told(one.illumination[k], 3)
+            chief, light = (
+                _format_value(one.chief_um[k, 0], 2),
+                _format_value(one.illumination[k], 3),
+            )
             rows.append((label, f"{angle:g}", chief, bent, *focus, lost, light))
-            mtf = [_told(v, 3) for pair in one.mtf[k].T for v in pair]
+            mtf = [_format_value(v, 3) for pair in one.mtf[k].T for v in pair]
             curves.append((label, f"{angle:g}", *mtf))
     frequencies = next(iter(seen.values())).frequencies_per_mm
     over = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
@@ -136,7 +141,7 @@ def _caption(seen: Mapping[str, OverField]) -> str:
     )
 
 
-def _told(value: float, digits: int) -> str:
+def _format_value(value: float, digits: int) -> str:
     if not math.isfinite(value):
         return "–"
     shown = f"{value:.{digits}f}"

@@ -126,7 +126,7 @@ class PopulationPrior:
         Args:
             read: pupil, slippage and axis as a network reads them.
         """
-        return _terms(_together(read), self.middle, self.spread)
+        return _terms(_joined_readings(read), self.middle, self.spread)
 
     def person(self, read: NetworkReadings, gaze_deg: Array) -> "MixedModelPerson":
         """Calibrate a person who looked at ``gaze_deg`` (n, 2), across and down.
@@ -172,7 +172,7 @@ def learn_population(
     Raises:
         TrainingError: too few people or frames, or readings without an axis.
     """
-    together = _together(read)
+    together = _joined_readings(read)
     middle, spread = together.mean(0), np.maximum(together.std(0), 1e-9)
     design = _terms(together, middle, spread)
     first = np.full(design.shape[1], OTHERS_DEG**2)
@@ -192,7 +192,7 @@ def _axis(read: NetworkReadings) -> Array:
     return read.axis_deg
 
 
-def _together(read: NetworkReadings) -> Array:
+def _joined_readings(read: NetworkReadings) -> Array:
     return np.concatenate([_axis(read), read.pupil_mm, read.slip_mm], 1)
 
 

@@ -186,7 +186,7 @@ class BlurBranch(nn.Module):
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         weighed, mean = self._weighed(frames)
-        return self._told(self.depth(self._read(weighed)), mean)
+        return self._read_windows(self.depth(self._read(weighed)), mean)
 
     def _weighed(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID,
@@ -206,7 +206,7 @@ class BlurBranch(nn.Module):
         read: Tensor = F.hardswish(self.second(self.together(F.hardswish(weighed))))
         return read
 
-    def _told(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    def _read_windows(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
         spread = out[:, 1].clamp(-3, 2)
         depth = torch.stack([out[:, 0], spread], 1)
         trust = torch.exp(-2 * spread)
@@ -243,5 +243,5 @@ class InformedBranch(BlurBranch):
         weighed, mean = self._weighed(frames)
         read = self._read(weighed + self.content(window_content(content)))
         estimate, claim = self.vote(read).flatten(2).unbind(1)
-        depth, features = self._told(self.depth(read), mean)
+        depth, features = self._read_windows(self.depth(read), mean)
         return depth, features, (torch.softmax(claim, 1) * estimate).sum(1)

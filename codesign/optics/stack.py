@@ -316,7 +316,7 @@ def _node_factor(
 ) -> Tensor:
     """(nodes, nodes) complex transmission on top of the hyperbolic focus."""
     if settings.parameters == "diameters":
-        seen, wave = _seen(settings), pillar_wave(settings, coefficients_rad)
+        seen, wave = _pupil_view(settings), pillar_wave(settings, coefficients_rad)
         angle = math.radians(settings.angle_deg)
         found = wave.factor(seen.x_um, seen.y_um, settings.focus.wavelength_um, angle)
         return torch.as_tensor(found)
@@ -528,7 +528,7 @@ def _modes(settings: OpticsConfig) -> Tensor:
     terms, mix = _polynomials(settings.pupil, settings.polynomials, settings.family)
     if not settings.angle_deg:
         return terms
-    seen, rim = _seen(settings), settings.pupil.radius_um
+    seen, rim = _pupil_view(settings), settings.pupil.radius_um
     raw = torch.stack(
         families.phase_terms(
             seen.x_um / rim, seen.y_um / rim, len(mix), settings.family
@@ -539,12 +539,12 @@ def _modes(settings: OpticsConfig) -> Tensor:
 
 @functools.lru_cache(maxsize=8)
 def _start(settings: OpticsConfig) -> Tensor:
-    seen, rim = _seen(settings), settings.pupil.radius_um
+    seen, rim = _pupil_view(settings), settings.pupil.radius_um
     return families.double_helix_phase(seen.x_um / rim, seen.y_um / rim, settings.zones)
 
 
 @functools.lru_cache(maxsize=8)
-def _seen(settings: OpticsConfig) -> PupilView:
+def _pupil_view(settings: OpticsConfig) -> PupilView:
     """The pupil from where the chief ray meets the sensor; its nodes are those of the
     lens on axis.
     """
@@ -558,7 +558,7 @@ def _carriers(settings: OpticsConfig) -> Tensor:
     """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic
     lens, complex64.
     """
-    seen, k = _seen(settings), 2 * math.pi / settings.pupil.wavelength_um
+    seen, k = _pupil_view(settings), 2 * math.pi / settings.pupil.wavelength_um
     tangents = Field(math.radians(settings.angle_deg)).tangents
     paths = [
         source_path(seen.x_um, seen.y_um, tangents, 1 / float(z))
@@ -670,7 +670,7 @@ def phase_at(
 
 
 def _error_phase(settings: OpticsConfig, error: DrawnLensErrors) -> Tensor:
-    seen, rim = _seen(settings), settings.pupil.radius_um
+    seen, rim = _pupil_view(settings), settings.pupil.radius_um
     return _wave_front(settings, error, seen.x_um / rim, seen.y_um / rim)
 
 

@@ -169,7 +169,7 @@ def has_finite_gradients(parameters: Iterable[nn.Parameter]) -> bool:
     return all(bool(torch.isfinite(one)) for one in largest)
 
 
-def laid_out(optimiser: torch.optim.Optimizer) -> None:
+def align_moments(optimiser: torch.optim.Optimizer) -> None:
     """Moments laid out in memory as their parameters: a fused step walks through both
     in one order without asking.
 
@@ -437,7 +437,7 @@ class Trainer:
             self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
-            laid_out(optimiser)
+            align_moments(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
@@ -453,11 +453,11 @@ class Trainer:
             rates["pitch"] > 0,
             rates["optics"] > 0 and "optics" in self.optimisers,
         )
-        return self._stepped(
-            self._given(self.step, batch, live=live, seen=not moves), rates
+        return self._take_step(
+            self._prepare_step(self.step, batch, live=live, seen=not moves), rates
         )
 
-    def _stepped(self, given: StepInputs, rates: dict[str, float]) -> LogRecord:
+    def _take_step(self, given: StepInputs, rates: dict[str, float]) -> LogRecord:
         """A step of every optimiser on what is given."""
         means = running.keep_running_means(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
@@ -492,7 +492,7 @@ class Trainer:
         """The frames of a step, by its number alone."""
         return parallel.batch_share(self.scenes.batch(step, self.inner.batch))
 
-    def _given(
+    def _prepare_step(
         self, step: int, batch: FrameBatch, *, live: bool, seen: bool
     ) -> StepInputs:
         """What a step trains on; ``seen``: as the pixels give it, which takes a pitch
@@ -500,17 +500,19 @@ class Trainer:
         """
         margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
-            optics, optics_loss = self._light(step, batch.frames, live)
+            optics, optics_loss = self._form_images(step, batch.frames, live)
             light = sensor_irradiance(batch.frames, optics)
         vergence = blur.window_vergence(
             depth_um(batch.frames, margin=margin, device=self.light.device)
         )
-        frames = self._read(step, light, pitch, False) if seen else None
+        frames = self._read_pixels(step, light, pitch, False) if seen else None
         return StepInputs(
             step, batch.to(self.light.device), light, optics_loss, vergence, frames
         )
 
-    def _read(self, step: int, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
+    def _read_pixels(
+        self, step: int, light: Tensor, pitch: Tensor, resized: bool
+    ) -> Tensor:
         """Frames of the sensor. All readings of a step begin the same noise: networks
         differ by what they see.
         """
@@ -539,7 +541,7 @@ class Trainer:
         members = self._members(lambda a: float(count(a, pitch.detach())))
         finer = {a: pitch_moves and a.resolution < 1 for a in members}
         frames = {False: given.seen} if given.seen is not None else {
-            resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
+            resized: self._read_pixels(given.step, given.light, pitch, resized) for resized in set(finer.values())
         }  # fmt: skip
         batch, pose, parts = given.batch, given.batch.pose, []
         wide = frame_wide(
@@ -560,19 +562,19 @@ class Trainer:
                 depth_weight=self.inner.depth_weight,
             )
             parts.append(
-                loss if pose is None else loss + self._pose(answer, pose, wide)
+                loss if pose is None else loss + self._pose_loss(answer, pose, wide)
             )
         macs = torch.stack([count(a, pitch) for a in members])
         return torch.stack(parts).mean(), macs
 
-    def _pose(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
+    def _pose_loss(self, answer: Prediction, pose: EyePose, wide: float) -> Tensor:
         weights = {
             "axis_weight": self.inner.axis_weight,
             "point_weight": self.inner.point_weight,
         }
         return losses.pose_loss(answer, pose.axis, pose.points / wide, **weights)
 
-    def _light(
+    def _form_images(
         self, step: int, frames: Frames | SingleSurfaceFrames, live: bool
     ) -> tuple[Imager, Tensor]:
         """What images this step's frames, and the optics loss."""

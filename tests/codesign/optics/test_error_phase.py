@@ -22,7 +22,7 @@ def phase(**amounts):
     """Over the lens, with its places in units of its radius."""
     x, y = (
         c.double() / SETTINGS.pupil.radius_um
-        for c in (optics._seen(SETTINGS).x_um, optics._seen(SETTINGS).y_um)
+        for c in (optics._pupil_view(SETTINGS).x_um, optics._pupil_view(SETTINGS).y_um)
     )
     inside = torch.hypot(x, y) <= 1
     return (
