@@ -45,7 +45,7 @@ def read_gdsii(
 def parse_gdsii(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
+    """As :func:`read_gdsii`, from the bytes of a GDSII stream as uint8; ``where`` names them
     in errors.
 
     Args:

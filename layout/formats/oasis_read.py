@@ -51,7 +51,7 @@ def read_oasis(
 def parse_oasis(
     data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
 ) -> MaskLibrary:
-    """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
+    """As :func:`read_oasis`, from the bytes of an OASIS file as uint8; ``where`` names them
     in errors.
 
     Args:
