@@ -6,25 +6,361 @@ An interruption leaves what stood at the output; the same command begins anew.
 
 import importlib
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 import tyro
 
-from metalens import design, lens, psf
+from metalens import design, lens, propagate, psf
 from metalens.cell import describe_order_loss
 from metalens.commands import far_field
-from metalens.commands import psf_words as words
 from metalens.commands.common import CommonOptions, MaybeOutput
-from metalens.commands.psf_settings import PsfSettings, read_psf_settings
+from metalens.commands.design import format_place
 from metalens.core import config, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import ConfigError
-from metalens.core.report import write_report
+from metalens.core.report import (
+    Figure,
+    KeyFigure,
+    Section,
+    Table,
+    figure_png,
+    make_figure,
+    write_report,
+)
 from metalens.core.store import Provenance, write_bytes
+from metalens.lens import reach
+from metalens.optics import Layers
 from metalens.psf import export as psf_export
+from metalens.psf import spectrum as spectra
+
+MOST_SAMPLES, MOST_DEPTHS = 16_384, 100_000
+PIXEL_UM = 3.0  # of a camera, on which axial information is shown
+AIRY = 28.0  # width of a window in units of wavelength / NA
+
+
+@dataclass(frozen=True, slots=True)
+class PsfSettings:
+    """What is computed; kept in the file.
+
+    depths_mm: nearest and farthest source, and the largest step between depths; left
+    out: infinity for a lens for collimated light, else 21 depths, its focus among them,
+    over which the rim
+        of this lens goes from 1.75 waves out of focus on one side to as many on the
+        other.
+    sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
+    angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the
+    image of a positive angle lies
+        at +x; left out: 0 and the half field over which a hyperbolic lens of this focus
+        is diffraction-limited (Strehl ratio 0.8), or the angles that a lens was
+        measured at. angles_y_deg: along y (down), one for each or none for 0.
+    window_um, samples: full width along x of the window that follows the chief ray, and
+    samples along it; without a
+        width 28 wavelength / NA, or 8 blur radii at the worst depth where that is more.
+    height_um: its height, of samples as far apart; 0 for a square window.
+    offset_um: [x, y] from the chief ray to the window's middle.
+    source_um: full size of an incoherent source: diameter of a disc, side of a square,
+    full width at half maximum of a
+        gaussian; 0 for a point. source_deg: the same as an angle, for sources at
+        infinity too.
+    source_shape: disc, square or gaussian.
+    led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
+    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose
+    product is the spectrum (LED,
+        filter, sensor).
+    wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add.
+    weights: of each; none for equal.
+    tolerance: relative L2 error of the PSFs.
+    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in
+    NA), ``flux`` (that of both
+        polarisations, which a pixel counts), ``vector`` (Ex, Ey, Ez of both, squares
+        added), or ``auto``: the scalar
+        where its distance to the flux is below the tolerance, else the flux.
+    layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
+    light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean
+    of the two, where they are
+        focused from and to the same distances (any light, for other lenses).
+    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell
+    (seconds to minutes): the PSFs then
+        hold the factor of those neighbours, the error budget what is left. A lens of
+        ``design --own-cell`` holds its
+        rows. Without either, pillars are taken one by one, and those terms are rough,
+        of the default cell.
+    """
+
+    depths_mm: tuple[float, float, float] | None = None
+    sources_mm: tuple[float, ...] = field(default=(), metadata={"may_be_inf": True})
+    angles_deg: tuple[float, ...] | None = None
+    angles_y_deg: tuple[float, ...] = ()
+    window_um: float | None = None
+    samples: int = 192
+    height_um: float = 0.0
+    offset_um: tuple[float, float] = (0.0, 0.0)
+    source_um: float = 0.0
+    source_deg: float = field(default=0.0, metadata={"signed": False})
+    source_shape: psf.SourceShape = "disc"
+    led_fwhm_nm: float = 0.0
+    spectrum: tuple[Path, ...] = ()
+    wavelengths_nm: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
+    tolerance: float = 1e-4
+    polarisation: psf.Polarisation = "scalar"
+    layers: Layers | None = None
+    own_cell: bool = False
+    light: Literal["both", "x", "y"] = "both"
+
+    def __post_init__(self) -> None:
+        self._check_sources()
+        self._check_window()
+        self._check_light()
+
+    def _check_sources(self) -> None:
+        """Depths, angles and the size of a source."""
+        near, far, step = self.depths_mm or (1.0, 1.0, 1.0)
+        if not (0 < near <= far < np.inf and step > 0):
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
+            )
+        if not all(depth > 0 for depth in self.sources_mm):
+            raise ConfigError(
+                f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave"
+            )
+        if (far - near) / step > MOST_DEPTHS or max(
+            map(abs, (*(self.angles_deg or ()), *self.angles_y_deg, 0.0))
+        ) >= 90:
+            raise ConfigError(
+                f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
+                "angles within 90 degrees"
+            )
+        along_x = len(self.angles_deg or ())
+        if self.angles_deg == () or len(self.angles_y_deg) not in (0, along_x):
+            raise ConfigError(
+                f"{along_x} angles along x, {len(self.angles_y_deg)} along y: need one for each"
+            )
+        if (self.source_um and self.source_deg) or not (
+            self.source_um >= 0 and 0 <= self.source_deg < 90
+        ):
+            raise ConfigError(
+                f"source_um = {self.source_um}, source_deg = {self.source_deg}: need one of both, or 0 for a point"
+            )
+        if self.source_um and math.inf in self.sources_mm:
+            raise ConfigError(
+                f"source_um = {self.source_um}, sources_mm = {self.sources_mm}: a source at infinity has no size in "
+                "um; give source_deg"
+            )
+
+    def _check_window(self) -> None:
+        width = 1.0 if self.window_um is None else self.window_um
+        if not (2 <= self.samples <= MOST_SAMPLES and 0 < width < np.inf):
+            raise ConfigError(
+                f"samples = {self.samples}, window_um = {self.window_um}: need 2 to {MOST_SAMPLES} samples, window > 0"
+            )
+        if self.window_um is None:
+            if self.height_um:
+                raise ConfigError(f"height_um = {self.height_um}: need window_um too")
+            return
+        down = self.samples_y
+        if not (self.height_um >= 0 and 1 <= down <= MOST_SAMPLES):
+            raise ConfigError(
+                f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples"
+            )
+        step = self.window_um / self.samples
+        if self.height_um and abs(self.height_um / step - down) > 1e-6 * down:
+            raise ConfigError(
+                f"height_um = {self.height_um}: need a whole number of samples of window_um / samples = {step:g} "
+                f"um, as {down * step:g}"
+            )
+
+    def _check_light(self) -> None:
+        """Tolerance and spectrum."""
+        if not (0 < self.tolerance < 1 and self.led_fwhm_nm >= 0):
+            raise ConfigError(
+                f"tolerance = {self.tolerance}, led_fwhm_nm = {self.led_fwhm_nm}: need 0 < tolerance < 1, width >= 0"
+            )
+        if bool(self.spectrum) + bool(self.led_fwhm_nm) + bool(self.wavelengths_nm) > 1:
+            raise ConfigError(
+                "two of spectrum, led_fwhm_nm and wavelengths_nm are given: each is the whole spectrum; give one"
+            )
+        if not all(0 < nm < np.inf for nm in self.wavelengths_nm):
+            raise ConfigError(
+                f"wavelengths_nm = {self.wavelengths_nm}: need wavelengths above 0"
+            )
+        good = len(self.weights) == len(self.wavelengths_nm) and sum(self.weights) > 0
+        if self.weights and not (good and min(self.weights) >= 0):
+            raise ConfigError(
+                f"weights = {self.weights} for wavelengths_nm = {self.wavelengths_nm}: need one of 0 or more for each"
+            )
+
+    @property
+    def samples_y(self) -> int:
+        """Samples along y."""
+        return (
+            round(self.height_um / self.width_um * self.samples)
+            if self.height_um
+            else self.samples
+        )
+
+    @property
+    def width_um(self) -> float:
+        """Of the window.
+
+        Raises:
+            ConfigError: it is that of a lens, and no lens was named (:meth:`about`).
+        """
+        if self.window_um is None:
+            raise ConfigError("window_um is left to the lens, and there is none")
+        return self.window_um
+
+    def about(
+        self, device: lens.Lens, angles_rad: Array | None = None
+    ) -> "PsfSettings":
+        """These with depths, angles and window of this lens where they were left out.
+
+        angles_rad: (n, 2) angles that it was measured at, in place of its field's.
+        """
+        filled = self
+        if self.angles_deg is None:
+            x, y = _angles_deg(device, angles_rad)
+            filled = replace(filled, angles_deg=x, angles_y_deg=y)
+        collimated = math.isinf(device.source_distance_um)
+        if not self.sources_mm and self.depths_mm is None:
+            if collimated:
+                filled = replace(filled, sources_mm=(math.inf,))
+            else:
+                near, far = (depth * 1e-3 for depth in reach.depth_range_um(device))
+                depths = np.linspace(near, far, 21)
+                focus_mm = device.source_distance_um * 1e-3
+                if near < focus_mm < far:  # one of them lies in focus
+                    depths[np.abs(1 / depths - 1 / focus_mm).argmin()] = focus_mm
+                filled = replace(
+                    filled,
+                    depths_mm=(near, far, (far - near) / 20),
+                    sources_mm=tuple(depths.tolist()),
+                )
+        if self.window_um is not None:
+            return filled
+        ends = self.sources_mm or (filled.depths_mm or filled.sources_mm)[:2]
+        ends_um = tuple(z * 1e3 for z in ends)
+        return replace(filled, window_um=reach.window_um(device, ends_um, airy=AIRY))
+
+    @property
+    def view(self) -> "psf.View":
+        """Depths, angles, window and source in um and rad.
+
+        Raises:
+            ConfigError: depths or window are those of a lens, and no lens was named
+                (:meth:`about`).
+        """
+        if self.sources_mm:
+            depths = np.array(self.sources_mm) * 1e3
+        elif self.depths_mm is None:
+            raise ConfigError("depths_mm are left to the lens, and there is none")
+        else:
+            near, far, step = self.depths_mm
+            depths = (
+                np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
+                * 1e3
+            )
+        if self.angles_deg is None:
+            raise ConfigError("angles_deg are left to the lens, and there is none")
+        along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
+        pairs = [
+            tuple(np.deg2rad([x, y]).tolist())
+            for x, y in zip(self.angles_deg, along_y, strict=True)
+        ]
+        angles = tuple(propagate.to_angle_pair(pair) for pair in pairs)
+        window = self.width_um, self.width_um / self.samples * self.samples_y
+        return psf.View(
+            tuple(depths.tolist()),
+            angles,
+            window,
+            (self.samples, self.samples_y),
+            self.offset_um,
+            self.source,
+        )
+
+    @property
+    def source(self) -> "psf.Extent | None":
+        """Size and shape of the source, None for a point."""
+        if not (self.source_um or self.source_deg):
+            return None
+        return psf.Extent(
+            self.source_shape,
+            self.source_um,
+            2 * math.tan(math.radians(self.source_deg) / 2),
+        )
+
+    def spectrum_of(
+        self, device: lens.Lens
+    ) -> spectra.SpectralNodes | spectra.Source | spectra.MeasuredSpectrum | None:
+        """Wavelengths with weights, a diode or measured curves; None for the design
+        wavelength alone.
+        """
+        if self.wavelengths_nm:
+            share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
+            return spectra.SpectralNodes(
+                np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0
+            )
+        if self.spectrum:
+            return spectra.read_measured_spectrum(
+                self.spectrum, within_um=device.proxy.wavelengths_um
+            )
+        return (
+            spectra.Source(device.wavelength_um * 1e3, self.led_fwhm_nm)
+            if self.led_fwhm_nm
+            else None
+        )
+
+
+def _angles_deg(
+    device: lens.Lens, angles_rad: Array | None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """(x, y) field angles that a lens was measured at, or of its field."""
+    if angles_rad is not None and len(angles_rad):
+        x, y = np.rad2deg(np.unique(angles_rad, axis=0)).T
+        return tuple(x.tolist()), tuple(y.tolist())
+    distances = device.sensor_distance_um, device.source_distance_um
+    focus = design.Focus(device.wavelength_um, *distances, device.layers)
+    radius_um = device.diameters.radius_um + device.diameters.pitch_um / 2
+    half = math.degrees(design.field_angle(focus, radius_um))
+    return (0.0, float(f"{half:.2g}")), (0.0, 0.0)
+
+
+def read_psf_settings(path: Path | None, over: dict[str, Any]) -> PsfSettings:
+    """Settings of a file (None: those of the record) with what was given on the command
+    line in their place.
+
+    Args:
+        path: file to read or write.
+
+    Raises:
+        ConfigError: as :func:`metalens.core.config.load`.
+    """
+    table = {} if path is None else config.read(path, PsfSettings, empty=False)
+    given = {name: value for name, value in over.items() if value is not None}
+    where = " and ".join(
+        [
+            *([str(path)] if path is not None else []),
+            *(["the command line"] if given else []),
+        ]
+    )
+    return config.from_table(table | given, PsfSettings, where=where or "metalens psf")
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """stack: PSFs. figures: of the sharpest depth of every angle. meets_um: (x, y, z)
+    behind the lens where rays of the design source meet, None where they do not.
+    scan: along z, of a lens for collimated light.
+    """
+
+    stack: psf.PsfStack
+    figures: tuple[psf.FocusMetrics, ...]
+    meets_um: tuple[float, float, float] | None
+    scan: "psf.FocusScan | None" = None
+
 
 # by kind of file, the module whose ``load`` gives a :class:`AsBuiltSource`; filled by
 # the
@@ -140,9 +476,11 @@ def run(options: Options) -> int:
         return _far(options)
     target, settings = options.output or Path("psf.h5"), options.settings
     psf_export.check_psf_format(target)
-    made, built = _read(options.lens)
-    made = made if settings.layers is None else replace(made, layers=settings.layers)
-    settings = settings.about(made, None if built is None else built.angle_rad)
+    device, built = _read(options.lens)
+    device = (
+        device if settings.layers is None else replace(device, layers=settings.layers)
+    )
+    settings = settings.about(device, None if built is None else built.angle_rad)
     view = settings.view
     pixels = (
         len(view.depths_um)
@@ -154,16 +492,16 @@ def run(options: Options) -> int:
     with options.claim(
         target, companions=ends, room=transaction.ROOM + 4 * pixels
     ) as draft:
-        found = _compute(options.lens, settings, made, built)
-        _write(draft.path, found, page=options.report)
+        computed = _compute(options.lens, settings, device, built)
+        _write(draft.path, computed, page=options.report)
     failures = [
-        words.tolerance_excess(found.stack),
-        made.proxy.doubt,
-        words.dark_window(found),
+        tolerance_excess(computed.stack),
+        device.proxy.doubt,
+        dark_window(computed),
     ]
-    values = words.psf_numbers(found) | {"doubt": made.proxy.doubt}
-    text = words.psf_text(target, found)
-    text += describe_order_loss(made.cell, float(found.stack.wavelengths_um.min()))
+    values = psf_numbers(computed) | {"doubt": device.proxy.doubt}
+    text = psf_text(target, computed)
+    text += describe_order_loss(device.cell, float(computed.stack.wavelengths_um.min()))
     return options.console.judged(values, text, failures)
 
 
@@ -177,9 +515,9 @@ def _far(options: Options) -> int:
         raise ConfigError(
             f"{options.lens}: the far field of a design (lens.h5), not of a file of kind {kind}"
         )
-    made = lens.load(options.lens)
+    device = lens.load(options.lens)
     wanted, inputs = (
-        far_field.far_field_request(options, made),
+        far_field.far_field_request(options, device),
         {options.lens.name: store.sha256(options.lens)},
     )
     with options.claim(
@@ -187,13 +525,13 @@ def _far(options: Options) -> int:
         companions=("_far.png", ".html"),
         room=transaction.ROOM + 4 * wanted.samples**2,
     ) as draft:
-        found = far_field.compute_far_fields(made, wanted, options.console)
+        fields = far_field.compute_far_fields(device, wanted, options.console)
         far_field.save_far_fields(
-            draft.path, wanted, found, inputs=inputs, page=options.report
+            draft.path, wanted, fields, inputs=inputs, page=options.report
         )
     options.console.result(
-        far_field.far_field_values(wanted, found),
-        far_field.far_field_text(target, wanted, found),
+        far_field.far_field_values(wanted, fields),
+        far_field.far_field_text(target, wanted, fields),
     )
     return 0
 
@@ -223,60 +561,106 @@ def _read(path: Path) -> tuple[lens.Lens, AsBuiltSource | None]:
     kind = store.kind_of(path)
     if kind not in SOURCES:
         return lens.load(path), None
-    found: AsBuiltSource = importlib.import_module(SOURCES[kind]).load(path)
-    return found.design, found
+    source: AsBuiltSource = importlib.import_module(SOURCES[kind]).load(path)
+    return source.design, source
 
 
 def _compute(
-    path: Path, settings: PsfSettings, made: lens.Lens, built: AsBuiltSource | None
-) -> words.Computed:
+    path: Path, settings: PsfSettings, device: lens.Lens, built: AsBuiltSource | None
+) -> Computed:
     """PSFs, the figures of the sharpest of every angle, and a scan behind a lens for
     collimated light.
     """
     if built is not None:
         stack = _of_built(path, settings, built)
-        figures = psf.focus_metrics(stack, made)
-        return words.Computed(stack, figures, design.lens_meeting_um(made))
-    made = _in_light(path, made, settings)
-    known = _own_cell(made, settings) if settings.own_cell else None
+        figures = psf.focus_metrics(stack, device)
+        return Computed(stack, figures, design.lens_meeting_um(device))
+    device = _in_light(path, device, settings)
+    known = _own_cell(device, settings) if settings.own_cell else None
     if known is not None and isinstance(known.neighbours, lens.NeighbourRows):
-        made = replace(made, neighbours=known.neighbours)
-    stack = _of_design(made, settings, known, _provenance(path, settings))
-    figures = psf.focus_metrics(stack, made, power_error=design.power_error(made))
-    lit = figures[0].window_share >= words.DARK
-    scan = _scan(made, settings, stack) if lit else None
-    return words.Computed(stack, figures, design.lens_meeting_um(made), scan)
+        device = replace(device, neighbours=known.neighbours)
+    stack = _of_design(device, settings, known, _provenance(path, settings))
+    figures = psf.focus_metrics(stack, device, power_error=design.power_error(device))
+    lit = figures[0].window_share >= DARK
+    scan = _scan(device, settings, stack) if lit else None
+    return Computed(stack, figures, design.lens_meeting_um(device), scan)
 
 
 def _scan(
-    made: lens.Lens, settings: PsfSettings, stack: psf.PsfStack
+    device: lens.Lens, settings: PsfSettings, stack: psf.PsfStack
 ) -> "psf.FocusScan | None":
     """Behind a lens for collimated light, unless its sources were stated."""
-    if not math.isinf(made.source_distance_um) or settings.sources_mm != (math.inf,):
+    if not math.isinf(device.source_distance_um) or settings.sources_mm != (math.inf,):
         return None
     nodes = psf.SpectralNodes(stack.wavelengths_um, stack.weights, 0.0)
-    return psf.focus_scan(made, offset_um=settings.offset_um, nodes=nodes)
+    return psf.focus_scan(device, offset_um=settings.offset_um, nodes=nodes)
 
 
-def _write(path: Path, found: words.Computed, *, page: bool) -> None:
+def _write(path: Path, computed: Computed, *, page: bool) -> None:
     """The file of PSFs, its pictures, and with ``page`` its report."""
     from metalens.psf import plots as psf_plots
 
-    psf_export.export_psf(path, found.stack)
-    limit = max((one.limit for one in found.figures), key=lambda one: one.cutoff_per_um)
-    pictures = psf_plots.psf_pictures(found.stack, limit=limit, scan=found.scan)
+    psf_export.export_psf(path, computed.stack)
+    limit = max(
+        (one.limit for one in computed.figures), key=lambda one: one.cutoff_per_um
+    )
+    pictures = psf_plots.psf_pictures(computed.stack, limit=limit, scan=computed.scan)
+    depths = computed.stack.depths_um
+    if len(depths) > 1 and np.isfinite(depths).all() and np.diff(depths).all():
+        pictures["information"] = plot_information(computed.stack)
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
     if page:
-        sections = words.psf_sections(
-            found, {CAPTIONS[n]: i for n, i in pictures.items()}
-        )
+        sections = psf_sections(computed, {CAPTIONS[n]: i for n, i in pictures.items()})
         write_report(
             path.with_suffix(".html"),
             "Point spread functions",
             sections,
-            key_figures=words.key_figures(found),
+            key_figures=key_figures(computed),
         )
+
+
+def plot_information(stack: psf.PsfStack) -> bytes:
+    """I(z) of Eq. 11 on pixels of 3 µm (three samples, if that is more), binned 1, 2
+    and 3 times, under two normalisations.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
+    import torch
+
+    from metalens import fisher
+
+    light = torch.as_tensor(stack.intensity).double()
+    light = light.reshape(len(stack.angles_rad), *light.shape[-3:])
+    pitch = max(PIXEL_UM, 3 * stack.step_um)
+    steps_mm = np.diff(stack.depths_um) * 1e-3
+    middle_mm = (stack.depths_um[1:] + stack.depths_um[:-1]) / 2e3
+    names: dict[fisher.Normalisation, str] = {"sum": "sum", "l2": "L2 norm"}
+    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
+    for panel, (name, word) in zip(axes, names.items(), strict=True):
+        for bins in (1, 2, 3):
+            value = fisher.axial_information(
+                light[:, :-1],
+                light[:, 1:],
+                step_um=1e3,
+                sample_um=stack.step_um,
+                pixel_um=pitch * bins,
+                normalisation=name,
+            )
+            for i in sorted({0, len(value) - 1}):
+                x, y = np.rad2deg(stack.angles_rad[i])
+                label = f"{bins}×{bins}, ({x:.3g}°, {y:.3g}°)"
+                line = "-" if i == 0 else "--"
+                curve = value[i].numpy() / steps_mm**2
+                panel.plot(middle_mm, curve, line, color=f"C{bins}", label=label)
+        panel.set(title=f"normalised by the {word}", xlabel="source depth / mm")
+        panel.set(ylabel="I(z) / mm⁻²", ylim=(0, None))
+    axes[1].legend(fontsize=7, title=f"bins of {pitch:g} µm pixels", title_fontsize=7)
+    figure.suptitle(
+        "Axial information of Eq. 11, mean over 9 sub-pixel positions; the normalisation decides the ranking"
+    )
+    return figure_png(figure)
 
 
 def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.PsfStack:
@@ -292,34 +676,36 @@ def _of_built(path: Path, settings: PsfSettings, given: AsBuiltSource) -> psf.Ps
     if settings.polarisation in ("flux", "vector"):
         stated = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
         raise ConfigError(f"{path}: {stated}")
-    found = given.psf_stack(settings.view, tolerance=settings.tolerance)
+    stack = given.psf_stack(settings.view, tolerance=settings.tolerance)
     posterior = given.psf_posterior(settings.view)
-    budget = replace(found.budget or psf.Budget(found.error), posterior=posterior)
+    budget = replace(stack.budget, posterior=posterior)
     return replace(
-        found,
-        error=math.hypot(found.error, posterior),
+        stack,
+        error=math.hypot(stack.error, posterior),
         budget=budget,
         provenance=_provenance(path, settings),
     )
 
 
-def _in_light(path: Path, made: lens.Lens, settings: PsfSettings) -> lens.Lens:
+def _in_light(path: Path, device: lens.Lens, settings: PsfSettings) -> lens.Lens:
     """The lens for the polarisation that is asked for."""
     if settings.light == "both" or (
-        made.pairs is None and made.one_light == f"light along {settings.light}"
+        device.pairs is None and device.one_light == f"light along {settings.light}"
     ):
-        return made
-    if made.pairs is not None:
-        return made.seen(settings.light)
-    known = f"know {made.one_light} alone" if made.one_light else "treat x and y alike"
-    known = "are turned, for circular light" if made.hand else known
+        return device
+    if device.pairs is not None:
+        return device.seen(settings.light)
+    known = (
+        f"know {device.one_light} alone" if device.one_light else "treat x and y alike"
+    )
+    known = "are turned, for circular light" if device.hand else known
     raise ConfigError(
         f"{path}: light = {settings.light!r} is for pillars of two sizes; these {known}"
     )
 
 
 def _of_design(
-    made: lens.Lens,
+    device: lens.Lens,
     settings: PsfSettings,
     known: psf.LeftOut | None,
     provenance: Provenance,
@@ -337,9 +723,9 @@ def _of_design(
             left_out=known,
         )
 
-    if made.pairs is None or settings.light != "both":
-        return of(made)
-    x, y = made.seen("x"), made.seen("y")
+    if device.pairs is None or settings.light != "both":
+        return of(device)
+    x, y = device.seen("x"), device.seen("y")
     if (x.sensor_distance_um, x.source_distance_um) != (
         y.sensor_distance_um,
         y.source_distance_um,
@@ -357,12 +743,247 @@ def _provenance(path: Path, settings: PsfSettings) -> Provenance:
     )
 
 
-def _own_cell(made: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
+def _own_cell(device: lens.Lens, settings: PsfSettings) -> psf.LeftOut:
     """Neighbours and angle of the lens's own pillars, at the largest aperture and angle
     of the view.
     """
-    apertures = [psf.sine_aperture(made, angle) for angle in settings.view.angles_rad]
+    apertures = [psf.sine_aperture(device, angle) for angle in settings.view.angles_rad]
     incidence = max(
         float(np.arctan(np.hypot(*np.tan(angle)))) for angle in settings.view.angles_rad
     )
-    return design.left_out(made, aperture=max(apertures), incidence_rad=incidence)
+    return design.left_out(device, aperture=max(apertures), incidence_rad=incidence)
+
+
+DARK = 0.1  # share of the light in the window, below which it holds no image
+BUDGET_WORDS = (
+    "What computation and model are wrong by, each alone, the worst over angles: the terms of the model are those "
+    "of a perfect lens of the same aperture."
+)
+FIGURES = (
+    "x / deg",
+    "y / deg",
+    "source / mm",
+    "FWHM / um",
+    "limit",
+    "Strehl ratio",
+    "MTF50 along x / mm",
+    "along y",
+    "limit",
+    "efficiency",
+    "limit",
+)
+
+
+def tolerance_excess(stack: psf.PsfStack) -> str:
+    """That the computed error is above the tolerance, and its cure; else empty.
+
+    Args:
+        stack: PSFs over angle, depth and wavelength.
+    """
+    if stack.converged:
+        return ""
+    error = stack.budget.computed
+    return f"the relative error {error:.2g} is above the tolerance {stack.tolerance:g}: {stack.budget.cure}"
+
+
+def dark_window(computed: Computed) -> str:
+    """That windows hold hardly any light, and where the rays meet; else empty.
+
+    Args:
+        found: what was computed.
+    """
+    missed = [one for one in computed.figures if not one.window_share >= DARK]
+    if not missed:
+        return ""
+    angles = ", ".join(_angle(one.angle_rad) for one in missed)
+    share = max(one.window_share for one in missed)
+    meets = computed.meets_um
+    where = (
+        "rays of the design source meet nowhere (psf --far-field shows where its light goes)"
+        if meets is None
+        else f"rays of the design source meet {format_place(meets)}; --offset-um moves the window"
+    )
+    return f"the window of {angles} holds {share:.2g} of the light: {where}"
+
+
+def psf_text(target: Path, computed: Computed) -> str:
+    """Lines for people.
+
+    Args:
+        target: output file.
+        found: what was computed.
+    """
+    stack = computed.stack
+    counts = (
+        ("angle", stack.angles_rad),
+        ("depth", stack.depths_um),
+        ("wavelength", stack.weights),
+    )
+    shape = " x ".join(
+        f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts
+    )
+    lines = [
+        f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})",
+        f"  {stack.budget.text}",
+        *(_figures(one) for one in computed.figures),
+    ]
+    if computed.scan is not None:
+        ends = computed.scan.shift_um[[0, -1]]
+        lines.append(
+            f"  scan behind the lens, {ends[0]:+.3g} to {ends[1]:+.3g} um about the sensor: brightest at "
+            f"{computed.scan.best_um:+.2g} um"
+        )
+    meets = computed.meets_um
+    if meets is not None and math.hypot(*meets[:2]) > stack.step_um:
+        lines.append(f"  rays of the design source meet {format_place(meets)}")
+    return "\n".join(lines)
+
+
+def _figures(one: psf.FocusMetrics) -> str:
+    where = f"  at {_angle(one.angle_rad)}, source at {_depth(one.depth_um)}"
+    if not one.window_share >= DARK:
+        return f"{where}: no image, {one.window_share:.2g} of the light in the window"
+    mtf = " / ".join(f"{1e3 * f:.4g}" for f in one.mtf50_per_um)
+    error = 1e3 * max(one.mtf50_error_per_um)
+    return (
+        f"{where}: FWHM {one.fwhm_um:.4g} +- {one.fwhm_error_um:.2g} um (diffraction limit {one.limit.fwhm_um:.4g}), "
+        f"Strehl ratio {one.strehl:.3f} +- {one.strehl_error:.2g},\n"
+        f"    MTF50 along x / y {mtf} +- {error:.2g} cycles/mm (limit {1e3 * one.limit.mtf50_per_um:.4g}, cut-off "
+        f"{1e3 * one.limit.cutoff_per_um:.4g}),\n"
+        f"    focusing efficiency {one.efficiency:.3f} +- {one.efficiency_error:.2g}: power within three FWHM over "
+        f"power on the aperture (limit {one.limit.efficiency:.3f}); {one.window_share:.1%} of the light in the window"
+    )
+
+
+def _angle(angle_rad: tuple[float, float]) -> str:
+    x, y = np.rad2deg(angle_rad)
+    return f"({x:.3g}, {y:.3g}) deg"
+
+
+def _depth(depth_um: float) -> str:
+    return "infinity" if math.isinf(depth_um) else f"{1e-3 * depth_um:.4g} mm"
+
+
+def psf_numbers(computed: Computed) -> dict[str, Any]:
+    """Numbers for programs; None for what JSON does not know.
+
+    Args:
+        found: what was computed.
+    """
+    stack = computed.stack
+    values: dict[str, Any] = {
+        "error": stack.error,
+        "computed_error": stack.budget.computed,
+        "budget": {name: _plain(v) for name, v in asdict(stack.budget).items()},
+        "tolerance": stack.tolerance,
+        "converged": stack.converged,
+        "reason": stack.reason,
+        "depths_um": [_plain(depth) for depth in stack.depths_um.tolist()],
+        "angles_rad": stack.angles_rad.tolist(),
+        "wavelengths_um": stack.wavelengths_um.tolist(),
+        "focus": [_plain(asdict(one)) for one in computed.figures],
+    }
+    meets = computed.meets_um
+    values["rays_meet_um"] = None if meets is None else list(meets)
+    if computed.scan is not None:
+        names = ("shift_um", "peak", "fwhm_um")
+        scan = {name: _plain(getattr(computed.scan, name).tolist()) for name in names}
+        values["z_scan"] = scan | {"best_um": computed.scan.best_um}
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """A value with None in place of numbers that are not finite."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def key_figures(computed: Computed) -> list[KeyFigure]:
+    """What was computed, how well, and what the focus is worth.
+
+    Args:
+        found: what was computed.
+    """
+    stack, budget, best = computed.stack, computed.stack.budget, computed.figures[0]
+    shape = len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)
+    figures = [
+        KeyFigure("field angles × depths × wavelengths", " × ".join(map(str, shape))),
+        KeyFigure(
+            "relative error of what is computed",
+            f"{budget.computed:.2g}",
+            stack.converged,
+        ),
+        KeyFigure("with what the model leaves out", f"{budget.total:.2g}"),
+        KeyFigure("focusing efficiency", f"{best.efficiency:.3f}"),
+        KeyFigure("Strehl ratio", f"{best.strehl:.3f}"),
+    ]
+    if math.isnan(budget.outside):
+        return figures
+    beside = KeyFigure("of the light falls beside the window", f"{budget.outside:.2g}")
+    return [*figures, beside]
+
+
+def psf_sections(computed: Computed, pictures: dict[str, bytes]) -> list[Section]:
+    """Of the report; pictures by their captions.
+
+    Args:
+        found: what was computed.
+    """
+    stack = computed.stack
+    figures = [Figure(image, caption, wide=True) for caption, image in pictures.items()]
+    focus = Table(
+        FIGURES,
+        [
+            [
+                *(f"{x:.3g}" for x in np.rad2deg(one.angle_rad)),
+                "∞" if math.isinf(one.depth_um) else f"{1e-3 * one.depth_um:.4g}",
+                f"{one.fwhm_um:.4g} ± {one.fwhm_error_um:.2g}",
+                one.limit.fwhm_um,
+                f"{one.strehl:.3f} ± {one.strehl_error:.2g}",
+                *(f"{1e3 * f:.4g}" for f in one.mtf50_per_um),
+                1e3 * one.limit.mtf50_per_um,
+                f"{one.efficiency:.3f} ± {one.efficiency_error:.2g}",
+                one.limit.efficiency,
+            ]
+            for one in computed.figures
+        ],
+        "The sharpest depth of every field angle; efficiency: power within three FWHM over power on the aperture.",
+    )
+    energy = np.asarray(stack.energy_um2)
+    rows = [
+        [f"{x:.3g}", f"{y:.3g}", float(e.min()), float(e.max())]
+        for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
+    ]
+    table = Table(
+        ("x / deg", "y / deg", "least", "most"),
+        rows,
+        "Light in the window for unit irradiance, µm², over depth.",
+    )
+    return [
+        Section("Pictures", items=figures),
+        Section("Focus", items=[focus]),
+        Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
+        Section("Energy", f"Method: {stack.reason}.", [table]),
+    ]
+
+
+def _budget_table(stack: psf.PsfStack) -> Table:
+    budget = stack.budget
+    rows = [
+        [name, "not known" if math.isnan(v) else f"{v:.2g}"]
+        for name, v in asdict(budget).items()
+    ]
+    rows += [
+        ["computed", f"{budget.computed:.2g}"],
+        ["of the device", f"{budget.total:.2g}"],
+    ]
+    return Table(
+        ("cause", "relative L2"),
+        rows,
+        "The tolerance is about what is computed; outside is a share of light.",
+    )

@@ -28,12 +28,18 @@ def chebyshev_interpolant(function: Callable[[Any], Any], u: Any) -> Any:
             lambda unit: function(middle + reach * unit), degree
         )
         if np.abs(found[-2:]).max() <= LEFT * np.abs(found).max():
-            return _horner(chebyshev.cheb2poly(found), (u - middle) / reach)
+            return horner(chebyshev.cheb2poly(found), (u - middle) / reach)
     return function(u)
 
 
-def _horner(powers: np.ndarray, unit: Any) -> Any:
-    total = unit * powers[-1] + powers[-2]
-    for power in powers[-3::-1]:
+def horner(powers: np.ndarray, unit: Any) -> Any:
+    """Polynomial Σ powers[n] unitⁿ, elementwise.
+
+    Args:
+        powers: (n,) coefficients, lowest first.
+        unit: array or tensor.
+    """
+    total = unit * 0 + powers[-1]
+    for power in powers[-2::-1]:
         total = total * unit + power
     return total

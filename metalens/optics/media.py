@@ -14,6 +14,7 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.optics import paths
+from metalens.optics.interpolant import horner
 
 NEWTON = 14  # steps at most; each doubles the digits
 Pairs = Sequence[
@@ -256,6 +257,9 @@ def solve_direction_square(layers: Pairs, reach2: Any, along2: Any = 0.0) -> Any
     Args:
         layers: (index, thickness) of each medium.
     """
+    if len(layers) == 1:
+        ((n, t),) = layers
+        return (along2 * t * t + reach2 * n * n) / (t * t + reach2)
     low2 = min(n for n, _ in layers) ** 2
     reach2 = reach2 + along2 * 0
     s = along2 / (low2 - along2) + reach2 * 0
@@ -344,7 +348,7 @@ class SaddleCorrection:
         w.
         """
         u = ((self.rarest * self.rarest - w) ** 0.5 - self.middle) / self.half
-        return _horner(self.real, u), _horner(self.imaginary, u)
+        return horner(self.real, u), horner(self.imaginary, u)
 
     def error(self, w: Array) -> Array:
         """Relative error of the amplitude of rays of w = p²."""
@@ -413,7 +417,7 @@ def _saddle(
         series[: int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 1]
     )
     real, imaginary = (np.ascontiguousarray(part) for part in (power.real, power.imag))
-    missed = np.abs(_horner(power, u) - want) / turns
+    missed = np.abs(horner(power, u) - want) / turns
     return SaddleCorrection(
         rarest,
         middle,
@@ -482,10 +486,3 @@ def _passed_of(order: tuple[float, ...], w: Any, light: Light) -> Any:
     """Power of this light that the faces let through."""
     s_power, p_power = passed_on(order, w)
     return {"s": s_power, "p": p_power, "mean": (s_power + p_power) / 2}[light]
-
-
-def _horner(series: Array, u: Any) -> Any:
-    total = u * 0 + series[-1]
-    for coefficient in series[-2::-1]:
-        total = total * u + coefficient
-    return total

@@ -198,14 +198,14 @@ def _by_part(
     windows: list[list[NodeLight]], points: Array
 ) -> list[tuple[list[NodeLight], Array, tuple[Array, Array]]]:
     """Each part, which points lie in it, and their (row, column)."""
-    found, first = [], 0
+    parts, first = [], 0
     for part in windows:
         rows, columns = part[0].case.samples
         mine = (points >= first) & (points < first + rows * columns)
         row, column = np.divmod(points[mine] - first, columns)
-        found.append((part, mine, (row, column)))
+        parts.append((part, mine, (row, column)))
         first += rows * columns
-    return found
+    return parts
 
 
 def _direct_fields(

@@ -89,6 +89,11 @@ class PropagationCase:
         return 2 * np.pi / self.wavelength_um
 
     @property
+    def media(self) -> Media:
+        """From lens to sensor; one of index 1 where no films are given."""
+        return self.behind or Media((1.0,), (self.sensor_distance_um,))
+
+    @property
     def steps_um(self) -> tuple[float, float]:
         """(y, x) distance of neighbouring rows and columns."""
         return self.row_um or self.pitch_um, self.pitch_um
@@ -295,7 +300,7 @@ def make_case(
         + float(offset_um[i])
         for i in (0, 1)
     ]
-    made = PropagationCase(
+    case = PropagationCase(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
         wavelength_um=float(wavelength_um),
@@ -309,8 +314,8 @@ def make_case(
         site_um2=float(site_um2),
         **films,
     )
-    _check_rays(made)
-    return made
+    _check_rays(case)
+    return case
 
 
 def _films(
@@ -324,7 +329,10 @@ def _films(
         )
     if layers is None or layers.plain or not sensor_distance_um > 0:
         return {}
-    return film_settings(layers, sensor_distance_um, wavelength_um)
+    before = layers.before(math.inf, wavelength_um)
+    films = zip(before.index[1:], before.thickness_um[1:], strict=True)
+    front = tuple((n, t) for n, t in films if t > 0)
+    return {"front": front, "behind": layers.after(sensor_distance_um, wavelength_um)}
 
 
 def _check_rays(case: PropagationCase) -> None:
@@ -389,28 +397,6 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
             f"{height / max(down, 1):g} um; need square ones"
         )
     return step, (down, across)
-
-
-def film_settings(
-    layers: Layers, sensor_distance_um: float, wavelength_um: float
-) -> dict[str, Any]:
-    """``front`` and ``behind`` of a :class:`Case` with these films.
-
-    Args:
-        layers: films around the lens.
-        sensor_distance_um: from lens to sensor.
-        wavelength_um: in vacuum.
-
-    Raises:
-        PropagationError: films thicker than the distance, or of metal.
-    """
-    before = layers.before(math.inf, wavelength_um)
-    films = tuple(
-        (n, t)
-        for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True)
-        if t > 0
-    )
-    return {"front": films, "behind": layers.after(sensor_distance_um, wavelength_um)}
 
 
 def chief_ray_offset(

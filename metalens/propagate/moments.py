@@ -153,12 +153,12 @@ def choose_blocks(
         for n in LENGTHS[0]
         if n <= case.shape[0] and _carried(case, reference, n, itemsize)
     )
-    found = []
+    chosen = []
     for axis, longest in ((0, height), (1, LENGTHS[1][0])):
         options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
         blocks = [_needed(case, axis, n, kernel, tolerance, more) for n in options]
-        found.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
-    return found[0], found[1]
+        chosen.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
+    return chosen[0], chosen[1]
 
 
 def _needed(
@@ -234,9 +234,9 @@ def _powers(
     u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
     values = carrier_turns(case, reference, x, rows[0] + rows[1] * u[:, None])
     middle = values[..., order // 2 : order // 2 + 1, :]
-    found = np.asarray(_to_powers(order) @ (values - middle))
-    found[..., :1, :] += middle
-    return found
+    powers = np.asarray(_to_powers(order) @ (values - middle))
+    powers[..., :1, :] += middle
+    return powers
 
 
 @functools.cache
@@ -281,10 +281,10 @@ class ReferencePhase:
         out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
         for first in range(start, stop, TABLE_ROWS):
             some = slice(first, min(first + TABLE_ROWS, stop))
-            found = self._coefficients(some, order)
-            padded = np.zeros((*found.shape[:2], chunks * self.chunk), dtype)
-            padded[..., :columns] = found
-            parts = padded.reshape(*found.shape[:2], chunks, self.chunk)
+            coefficients = self._coefficients(some, order)
+            padded = np.zeros((*coefficients.shape[:2], chunks * self.chunk), dtype)
+            padded[..., :columns] = coefficients
+            parts = padded.reshape(*coefficients.shape[:2], chunks, self.chunk)
             out[some.start - start : some.stop - start] = parts.swapaxes(1, 2)
         return out
 
@@ -292,11 +292,11 @@ class ReferencePhase:
         """(block, order, column) float64 of some block rows."""
         middles = self.rows.middles_um(self.case.steps_um[0])[some, None, None]
         half = (self.rows.length - 1) / 2 * self.case.steps_um[0]
-        found = _powers(
+        coefficients = _powers(
             self.case, self.reference, (middles, half), self.case.pillars_um[1], order
         )
-        found[:, 0] -= np.rint(found[:, 0])
-        return found
+        coefficients[:, 0] -= np.rint(coefficients[:, 0])
+        return coefficients
 
 
 # (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
@@ -392,8 +392,8 @@ def plan_moments(
     table = None
     if case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
-    found = [weight(place) for weight, place in zip(weights, places, strict=True)]
-    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in found]
+    values = [weight(place) for weight, place in zip(weights, places, strict=True)]
+    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in values]
     return PillarMoments(
         blocks,
         wave,
@@ -401,7 +401,7 @@ def plan_moments(
         dtype,
         polynomials[0],
         polynomials[1],
-        (_bands(found[0]), _bands(found[1])),
+        (_bands(values[0]), _bands(values[1])),
     )
 
 
@@ -636,38 +636,18 @@ EXACT = {
 }  # order of sums is kept: the phase is reduced in two steps
 
 
-_PER_RAD = 1 / (2 * np.pi)
+PER_RAD = 1 / (2 * np.pi)
 
 
-_SCALE, _FIRST = (
-    np.float32(_PER_RAD),
-    np.float32(6.28125),
-)  # few bits, so that its multiples are exact
-
-
-_SECOND = np.float32(2 * np.pi - 6.28125)
-
-
-def whole_turns_off(phase: Any, like: Any) -> Any:
-    """Phase in turns less its whole turns, in the precision of ``like``; compiled loops
-    choose while compiled.
+@numba.njit(inline="always")
+def whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
+    """Phase in turns less its whole turns, in the precision of ``like``: 2π in two
+    parts, the first of few bits, so that its multiples are exact.
     """
-    return (_single if like.dtype == np.float32 else _double)(phase, like)  # type: ignore[no-untyped-call]
-
-
-def _double(phase, like):  # type: ignore[no-untyped-def]
-    t = phase * _PER_RAD
-    return t - np.rint(t)
-
-
-def _single(phase, like):  # type: ignore[no-untyped-def]
-    r = np.rint(phase * _SCALE)
-    return ((phase - r * _FIRST) - r * _SECOND) * _SCALE
-
-
-@overload(whole_turns_off, inline="always")
-def _whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
-    return _single if like.dtype == numba.float32 else _double
+    number = like.dtype.type
+    whole = np.rint(phase * number(PER_RAD))
+    rest = (phase - whole * number(6.28125)) - whole * number(2 * np.pi - 6.28125)
+    return rest * number(PER_RAD)
 
 
 def reference_phase_at(table: Any, u: Any, j: Any, like: Any) -> Any:

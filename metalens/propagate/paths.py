@@ -9,7 +9,7 @@ import numpy as np
 
 from metalens.core.arrays import Array
 from metalens.optics import Media, media, saddle_correction
-from metalens.optics.paths import hypot_minus_length, sensor_path
+from metalens.optics.paths import sensor_path
 from metalens.propagate.geometry import PropagationCase
 
 SOME = 32  # pillars along an axis whose rays tell what films leave out
@@ -55,7 +55,7 @@ def to_sensor(
     if case.behind is None:
         return sensor_path(x, y, (cx, cy), case.sensor_distance_um)
     reach2 = cx * cx + cy * cy
-    pairs = case.behind.layers
+    pairs = case.media.layers
     more = x * x + y * y - 2 * (x * cx + y * cy)
     return media.path_difference(
         pairs, media.solve_direction_square(pairs, reach2), reach2, more
@@ -70,9 +70,7 @@ def chief_path(case: PropagationCase) -> float:
         case: geometry of the propagation.
     """
     reach2 = case.centre_um[0] ** 2 + case.centre_um[1] ** 2
-    if case.behind is None:
-        return float(np.sqrt(reach2 + case.sensor_distance_um**2))
-    pairs = case.behind.layers
+    pairs = case.media.layers
     return float(media.whole_path(pairs, media.solve_direction_square(pairs, reach2)))
 
 
@@ -87,16 +85,10 @@ def ray_to_offset(
     """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
     more = X * X + Y * Y + 2 * (X * dx + Y * dy)
-    if case.behind is None:
-        k, d = case.wavenumber, case.sensor_distance_um
-        r_w = np.sqrt(dx * dx + dy * dy + d * d)
-        away = hypot_minus_length(r_w, more)
-        r = r_w + away
-        return d / (2 * np.pi * r * r) * (1 / r - 1j * k), away
-    reach2 = dx * dx + dy * dy
-    w0 = media.solve_direction_square(case.behind.layers, reach2)
-    w, away = media.path_difference(case.behind.layers, w0, reach2, more)
-    return ray_amplitude(case.behind, case.wavenumber, w, case.reach_um), away
+    behind, reach2 = case.media, dx * dx + dy * dy
+    w0 = media.solve_direction_square(behind.layers, reach2)
+    w, away = media.path_difference(behind.layers, w0, reach2, more)
+    return ray_amplitude(behind, case.wavenumber, w, case.reach_um), away
 
 
 def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> Any:
@@ -149,18 +141,18 @@ def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]
         1 / (k * media.whole_path(behind.layers, w)),
         saddle_correction(behind, k, case.reach_um).at(w),
     )
-    found = []
+    amplitudes = []
     every = (
         saddle_correction(behind, k, case.reach_um, "s"),
         saddle_correction(behind, k, case.reach_um, "p"),
     )
     for own, power in zip(every, powers, strict=True):
-        own_ahead, own_aside = own.at(w)
-        waves = (1 - turn * own_aside + 1j * turn * own_ahead) / (
+        own_ahead, own_imaginary = own.at(w)
+        waves = (1 - turn * own_imaginary + 1j * turn * own_ahead) / (
             1 - turn * aside + 1j * turn * ahead
         )
-        found.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
-    return found[0], found[1]
+        amplitudes.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
+    return amplitudes[0], amplitudes[1]
 
 
 def films_error(case: PropagationCase, level: Array) -> float:
@@ -199,9 +191,7 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
     Args:
         case: geometry of the propagation.
     """
-    if case.behind is None:
-        return across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
-    pairs = case.behind.layers
+    pairs = case.media.layers
     return across / media.reach_per_direction(
         pairs, media.solve_direction_square(pairs, across * across + far * far)
     )
@@ -214,11 +204,7 @@ def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
         case: geometry of the propagation.
     """
     far = e - case.centre_um[1]
-    if case.behind is None:
-        return (
-            far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
-        )
-    pairs = case.behind.layers
+    pairs = case.media.layers
     return far / media.reach_per_direction(
         pairs, media.solve_direction_square(pairs, far * far, p * p)
     )
@@ -235,19 +221,11 @@ def residual_path(
         Y: offset along y from the window centre, um.
     """
     far = e - case.centre_um[1]
-    if case.behind is None:
-        k, d = case.wavenumber, case.sensor_distance_um
-        r_w = np.sqrt((far * far + d * d) / (1 - p * p))
-        g = p * X + cosine_y(case, p, e) * Y
-        q = X * X + Y * Y - 2 * r_w * g
-        r = np.sqrt(r_w * r_w + q)
-        path = (X * X + Y * Y + g * q / (r + r_w)) / (r + r_w)
-        return d / (2 * np.pi * r * r) * (1 / r - 1j * k), path
     w0, g, more = _from_ray(case, p, far, X, Y)
     w, away = media.path_difference(
-        case.behind.layers, w0, (p * g) ** 2 + far * far, more
+        case.media.layers, w0, (p * g) ** 2 + far * far, more
     )
-    level = ray_amplitude(case.behind, case.wavenumber, w, case.reach_um)
+    level = ray_amplitude(case.media, case.wavenumber, w, case.reach_um)
     return level, away + p * X + far / g * Y
 
 
@@ -257,7 +235,7 @@ def _from_ray(
     """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x
     from ``far`` rows away.
     """
-    pairs: Any = case.behind.layers if case.behind is not None else ()
+    pairs = case.media.layers
     w0 = media.solve_direction_square(pairs, far * far, p * p)
     g = media.reach_per_direction(pairs, w0)
     return w0, g, X * X + Y * Y - 2 * (g * p * X + far * Y)
@@ -265,7 +243,8 @@ def _from_ray(
 
 def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
     """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x
-    and y, at fixed pillar.
+    and y, at fixed pillar;
+    the medium behind the pillars takes what the distance gains; by complex steps.
 
     Args:
         case: geometry of the propagation.
@@ -274,33 +253,14 @@ def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) ->
         X: offset along x from the window centre, um.
         Y: offset along y from the window centre, um.
     """
-    k, d = case.wavenumber, case.sensor_distance_um
-    far = e - case.centre_um[1]
-    if case.behind is not None:
-        return _slopes(case, p, far, X, Y)
-    r_w = np.sqrt((far * far + d * d) / (1 - p * p))
-    g = p * X + cosine_y(case, p, e) * Y
-    r = np.sqrt(r_w * r_w + X * X + Y * Y - 2 * r_w * g)
-    radial = 1j * k - 2 / r - 1 / (r * r) / (1 / r - 1j * k)
-    along = np.stack(np.broadcast_arrays(d / r, (X - r_w * p) / r, (Y - far) / r))
-    out = np.asarray(radial * along)
-    out[0] += 1 / d
-    return out
-
-
-def _slopes(case: PropagationCase, p: Any, far: Any, X: Any, Y: Any) -> Array:
-    """As :func:`kernel_derivatives` through films: the cover takes what the distance
-    gains; by
-    complex steps.
-    """
-    h = 1e-30
-    behind: Any = case.behind
+    h, behind, far = 1e-30, case.media, e - case.centre_um[1]
     _, g, more = _from_ray(case, p, far, X, Y)
     reach2 = (p * g) ** 2 + far * far + more
     across, down = X - g * p, Y - far
     out = []
     for step in (0, 1, 2):
-        pairs, moved = behind.layers, reach2 + 0j
+        pairs: media.Pairs = behind.layers
+        moved = reach2 + 0j
         if step == 0:
             pairs = [
                 (n, t + (1j * h if n == behind.index[0] else 0))
@@ -356,7 +316,7 @@ def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float
     p = ray_cosines(case, edge, np.array([[np.abs(far).min()], [np.abs(far).max()]]))
     low, high = float(p.min()), float(p.max())
     spare = max(1e-9, 1e-6 * (high - low))
-    most = 1.0 if case.behind is None else case.behind.layers[0][0]
+    most = case.media.layers[0][0]
     return max(low - spare, -most + 1e-15), min(high + spare, most - 1e-15)
 
 

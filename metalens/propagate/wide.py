@@ -3,7 +3,6 @@ window ask for.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,10 +11,12 @@ from typing import Any
 import numpy as np
 import scipy.special
 import torch
+from scipy.fft import next_fast_len
 
 from metalens.core import legendre
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
+from metalens.core.threads import one_blas_thread
 from metalens.optics import media
 from metalens.propagate.geometry import PropagationCase
 from metalens.propagate.moments import (
@@ -146,18 +147,14 @@ def wide_axes(
         math.sqrt(2 * fade * fit.most / width)
         for width, fit in zip(widths, fits, strict=True)
     ]
-    if fits[0].steepest + max(guards) > STEEPEST * _rarest(case):
+    if fits[0].steepest + max(guards) > STEEPEST * case.media.layers[0][0]:
         return None
     beyond = _beyond(case, fits, guards)
-    made = [
+    axes = [
         _axis(case, i, fits[i], (guards[i], sharp, beyond[i]), tolerance)
         for i in (0, 1)
     ]
-    return None if made[0] is None or made[1] is None else (made[0], made[1])
-
-
-def _rarest(case: PropagationCase) -> float:
-    return 1.0 if case.behind is None else case.behind.layers[0][0]
+    return None if axes[0] is None or axes[1] is None else (axes[0], axes[1])
 
 
 def _beyond(
@@ -171,16 +168,13 @@ def _beyond(
         for f, g in zip(fits, guards, strict=True)
     )
     w = y[:, None] ** 2 + x**2
-    seen = w <= (fits[0].steepest + max(guards)) ** 2
-    pairs = (
-        [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
-    )
-    bend = media.reach_per_direction(pairs, np.where(seen, w, 0.0))
-    found = []
+    inside = w <= (fits[0].steepest + max(guards)) ** 2
+    bend = media.reach_per_direction(case.media.layers, np.where(inside, w, 0.0))
+    excess = []
     for fit, p in zip(fits, (y[:, None], x), strict=True):
         left = p * bend - fit.reach_um - fit.stretch_um * (p - fit.middle)
-        found.append(float(np.abs(np.where(seen, left, 0)).max()))
-    return found
+        excess.append(float(np.abs(np.where(inside, left, 0)).max()))
+    return excess
 
 
 def is_wide(case: PropagationCase, tolerance: float) -> bool:
@@ -191,14 +185,14 @@ def is_wide(case: PropagationCase, tolerance: float) -> bool:
         case: geometry of the propagation.
         tolerance: relative error of the field.
     """
-    found = wide_axes(case, tolerance)
-    if found is None:
+    axes = wide_axes(case, tolerance)
+    if axes is None:
         return False
     waves = (
         4 * axis.most * half / case.wavelength_um
-        for axis, half in zip(found, case.half_window_um, strict=True)
+        for axis, half in zip(axes, case.half_window_um, strict=True)
     )
-    return min(*waves, *(axis.count - 2 * axis.taps for axis in found)) > WIDE
+    return min(*waves, *(axis.count - 2 * axis.taps for axis in axes)) > WIDE
 
 
 def _fitted(
@@ -215,7 +209,7 @@ def _fitted(
         np.asarray(ray_cosines(case, *at)) for at in ((y[:, None], x), (x, y[:, None]))
     ]
     steepest = float(np.sqrt((both[0] ** 2 + both[1] ** 2).max()))
-    if steepest > STEEPEST * _rarest(case):
+    if steepest > STEEPEST * case.media.layers[0][0]:
         return None
     out = []
     for along, p in zip((y[:, None], x), both, strict=True):
@@ -283,20 +277,8 @@ def _axis(
 
 
 def _quick(points: float) -> int:
-    """Size of a transform: a multiple of 4 of factors 2, 3, 5 and 7; others take up to
-    twice as long a point.
-    """
-    return next(
-        n for n in itertools.count(4 * math.ceil((points - 1e-9) / 4), 4) if _smooth(n)
-    )
-
-
-@functools.lru_cache(maxsize=4096)
-def _smooth(n: int) -> bool:
-    for factor in (2, 3, 5, 7):
-        while n % factor == 0:
-            n //= factor
-    return n == 1
+    """Size of a transform: the next multiple of 4 with small prime factors."""
+    return int(4 * next_fast_len(math.ceil((points - 1e-9) / 4)))
 
 
 def _band(case: PropagationCase, i: int, extra: float) -> float:
@@ -388,25 +370,10 @@ class WidePlan:
         y, x = (grid_um(axis) for axis in self.axes)
         return y, x
 
-    @property
-    def bytes(self) -> int:
-        """Memory that its arrays take."""
-        held = [
-            self.fields,
-            self.coefficients,
-            self.chirp,
-            self.transfer,
-            self.moments.rows,
-            self.moments.columns,
-        ]
-        table = self.moments.table
-        return sum(int(t.nbytes) for t in held) + (
-            int(table.nbytes) if table is not None else 0
-        )
 
-
-def wide_plan(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
-    """A new plan.
+@functools.lru_cache(maxsize=2)
+def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
+    """Plan a wide window; the last two are kept.
 
     Args:
         case, tolerance: geometry, and relative error of the field.
@@ -415,41 +382,43 @@ def wide_plan(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
     Raises:
         PropagationError: rays too steep, or too unlike a quadratic, for the method.
     """
-    found = wide_axes(case, tolerance)
-    if found is None:
-        raise PropagationError(
-            "rays to this window are too steep for Fourier transforms; see propagate.choose"
+    with one_blas_thread():
+        axes = wide_axes(case, tolerance)
+        if axes is None:
+            raise PropagationError(
+                "rays to this window are too steep for Fourier transforms; see propagate.choose"
+            )
+        pillars = plan_moments(
+            case,
+            reference_depth(case),
+            tuple(functools.partial(spread_weights, axis) for axis in axes),
+            over_blocks(case),
+            tolerance=tolerance,
+            dtype=dtype,
+            sums=dtype,
+            nodes=max(axis.count for axis in axes) // 2,
         )
-    pillars = plan_moments(
-        case,
-        reference_depth(case),
-        tuple(functools.partial(spread_weights, axis) for axis in found),
-        over_blocks(case),
-        tolerance=tolerance,
-        dtype=dtype,
-        sums=dtype,
-        nodes=max(axis.count for axis in found) // 2,
-    )
-    kind = torch.complex64 if dtype == torch.float32 else torch.complex128
-    fields, coefficients = _depth_fields(case, found, tolerance / 2)
-    lens = _lens_phase(case, found)
-    arrays = coefficients, *(np.ascontiguousarray(a.T) for a in _behind(case, found))
-    given = [torch.tensor(a, dtype=kind) for a in arrays]
-    table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind)
-    for one, field in zip(table, fields, strict=True):
-        one.copy_(torch.from_numpy(field * lens))
-    return WidePlan(
-        case, found, pillars, table, given[0], given[1], given[2], tolerance
-    )
+        kind = torch.complex64 if dtype == torch.float32 else torch.complex128
+        fields, coefficients = _depth_fields(case, axes, tolerance / 2)
+        lens = _lens_phase(case, axes)
+        arrays = (
+            coefficients,
+            *(np.ascontiguousarray(a.T) for a in _behind(case, axes)),
+        )
+        given = [torch.tensor(a, dtype=kind) for a in arrays]
+        table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind)
+        for one, field in zip(table, fields, strict=True):
+            one.copy_(torch.from_numpy(field * lens))
+    return WidePlan(case, axes, pillars, table, given[0], given[1], given[2], tolerance)
 
 
 def _depth_fields(
-    case: PropagationCase, found: tuple[WideAxis, WideAxis], tolerance: float
+    case: PropagationCase, axes: tuple[WideAxis, WideAxis], tolerance: float
 ) -> tuple[Iterator[Array], Array]:
     """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth,
     b) coefficients.
     """
-    grids = [grid_um(axis) for axis in found]
+    grids = [grid_um(axis) for axis in axes]
     counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
     e, x = (
         legendre.mapped_nodes(n, g[0], g[-1])
@@ -477,13 +446,13 @@ def _coarse(case: PropagationCase, i: int, grid: Array) -> int:
     return 24 + math.ceil(6 * turns)
 
 
-def _lens_phase(case: PropagationCase, found: tuple[WideAxis, WideAxis]) -> Array:
+def _lens_phase(case: PropagationCase, axes: tuple[WideAxis, WideAxis]) -> Array:
     """(y, x) what the light of the grid is multiplied by before the first transform,
     all constants included.
     """
     k, lam = case.wavenumber, case.wavelength_um
     total, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
-    for i, (axis, c) in enumerate(zip(found, case.centre_um[::-1], strict=True)):
+    for i, (axis, c) in enumerate(zip(axes, case.centre_um[::-1], strict=True)):
         x, x0 = grid_um(axis), c - axis.reach_um
         path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (c - x)
         turn = np.exp(
@@ -494,32 +463,29 @@ def _lens_phase(case: PropagationCase, found: tuple[WideAxis, WideAxis]) -> Arra
             if i == 0
             else (total + path, ramp * turn)
         )
-    y, x = (grid_um(axis) for axis in found)
+    y, x = (grid_um(axis) for axis in axes)
     away = np.asarray(to_sensor(case, x, y[:, None]))
     scale = case.area_um2 / (
-        1j * lam * math.sqrt(found[0].stretch_um * found[1].stretch_um)
+        1j * lam * math.sqrt(axes[0].stretch_um * axes[1].stretch_um)
     )
-    start = float(_phase_path(case, found[0].middle ** 2 + found[1].middle ** 2))
+    start = float(_phase_path(case, axes[0].middle ** 2 + axes[1].middle ** 2))
     return np.asarray(scale * ramp * np.exp(1j * k * (total - away + start)))
 
 
 def _phase_path(case: PropagationCase, w: Any) -> Any:
     """Φ = Σ t √(n² - w), um."""
-    pairs = (
-        [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
-    )
-    return sum(t * (n * n - w) ** 0.5 for n, t in pairs)
+    return sum(t * (n * n - w) ** 0.5 for n, t in case.media.layers)
 
 
 def _behind(
-    case: PropagationCase, found: tuple[WideAxis, WideAxis]
+    case: PropagationCase, axes: tuple[WideAxis, WideAxis]
 ) -> tuple[Array, Array]:
     """(Y, X) chirp of the window behind the first transform, and transfer of what the
     quadratic leaves.
     """
     k = case.wavenumber
     chirps, ramps, squares, paths = [], [], [], []
-    for axis, samples, c in zip(found, case.samples, case.centre_um[::-1], strict=True):
+    for axis, samples, c in zip(axes, case.samples, case.centre_um[::-1], strict=True):
         period = axis.fine * case.step_um / axis.every
         n, width = np.arange(axis.size) - axis.size // 2, period / axis.size
         place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
@@ -541,18 +507,17 @@ def _behind(
         squares.append((axis.middle + u) ** 2)
         paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
     w = squares[0][:, None] + squares[1]
-    narrow = max(found, key=lambda axis: axis.guard)
-    seen = w < (narrow.steepest + 1.1 * narrow.guard) ** 2
-    w = np.where(seen, w, 0.0)
+    narrow = max(axes, key=lambda axis: axis.guard)
+    inside = w < (narrow.steepest + 1.1 * narrow.guard) ** 2
+    w = np.where(inside, w, 0.0)
     psi = _phase_path(case, w) - _phase_path(
-        case, found[0].middle ** 2 + found[1].middle ** 2
+        case, axes[0].middle ** 2 + axes[1].middle ** 2
     )
     psi = psi + paths[0][:, None] + paths[1]
     level = _fade(narrow, np.sqrt(w) - narrow.steepest)
-    if case.behind is not None:
-        level = level * np.sqrt(media.passed_at(case.behind.order, w))
+    level = level * np.sqrt(media.passed_at(case.media.order, w))
     transfer = np.where(
-        seen, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0
+        inside, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0
     )
     return chirps[0][:, None] * chirps[1], transfer
 
@@ -580,8 +545,10 @@ def light_wide(
         maps: (map, y, x) phase and transmission. plan: of :func:`plan_wide`.
         pupils: factors on the light of the maps; None for the |U|² of one map.
     """
-    found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
-    grid, total = torch.stack([g for g, _ in found]), None
+    reduced = [
+        reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
+    ]
+    grid, total = torch.stack([g for g, _ in reduced]), None
     for sign, light in mix_components(grid, pupils, plan.judged_um):
         mixture, coefficients = (
             (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
@@ -589,7 +556,7 @@ def light_wide(
         here = _mixed(fields_wide(light, plan, mixture), coefficients)
         here = here if sign == 1 else sign * here
         total = here if total is None else total + here
-    powers = [power for _, power in found]
+    powers = [power for _, power in reduced]
     return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
@@ -644,13 +611,13 @@ def fields_wide(
         light = torch.fft.ifft(light, n=y.fine, norm="forward")[
             ..., : my * y.every : y.every
         ].mT
-        seen = torch.fft.ifft(light, n=x.fine, norm="forward")[
+        field = torch.fft.ifft(light, n=x.fine, norm="forward")[
             ..., : mx * x.every : x.every
         ]
         if out is None:
-            parts.append(seen)
+            parts.append(field)
         else:
-            out[some] = seen
+            out[some] = field
     return torch.cat(parts) if out is None else out
 
 

@@ -4,6 +4,7 @@ the lens.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -49,7 +50,7 @@ MOST_TABLE = 4e6
 EDGE = 8
 
 
-PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
+MOST_PARTS = 16  # tiles along an axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,18 +75,20 @@ class NodeCounts:
 @dataclass(frozen=True, slots=True)
 class WindowLayout:
     """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
-    sizes: of every tile; work: products for all tiles."""
+    sizes: of every tile."""
 
     nodes: tuple[int, int]
     parts: int
     sizes: NodeCounts
-    work: float
 
 
 @functools.lru_cache(maxsize=1024)
 def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """How the window is cut so that it costs least; None where no cut brings the tables
+    """Nodes over the lens and tiles of the window; None where no cut brings the tables
     down to some 100 MB.
+
+    The work on the window falls with the tiles along an axis, that of handing light
+    down to them rises: near a quarter of √nodes their sum is least.
 
     Args:
         case: geometry of the propagation.
@@ -96,23 +99,19 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
             for this method.
     """
     nodes = lens_nodes(case, tolerance / 4)
-    best = None
-    for parts in PARTS:
-        if parts > max(case.samples):
-            break
+    parts, most = max(1, round(math.sqrt(max(nodes)) / 4)), max(case.samples)
+    while True:
+        parts = min(parts, most)
         rows = window_tiles(case, parts)[1]
         corners = {
             _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
         }
-        found = _largest([node_counts(tile, tolerance) for tile in corners])
-        tile, depths = rows[0][0], len(case.inverse_depths_per_um)
-        handing_down = nodes[0] * nodes[1] * (50 + found.nodes[0])
-        work = parts**2 * (_products(tile, found, depths) + handing_down)
-        if found.table <= MOST_TABLE and (best is None or work < best.work):
-            best = WindowLayout(nodes, parts, found, work)
-        elif best is not None:
-            break
-    return best
+        sizes = _largest([node_counts(tile, tolerance) for tile in corners])
+        if sizes.table <= MOST_TABLE:
+            return WindowLayout(nodes, parts, sizes)
+        if parts in (most, MOST_PARTS):
+            return None
+        parts = min(2 * parts, MOST_PARTS)
 
 
 def _alike(tile: PropagationCase) -> PropagationCase:
@@ -126,22 +125,13 @@ def _alike(tile: PropagationCase) -> PropagationCase:
     return replace(tile, centre_um=(x, y))
 
 
-def _largest(found: list[NodeCounts]) -> NodeCounts:
+def _largest(counts: list[NodeCounts]) -> NodeCounts:
     """Counts that do for all."""
     pairs = [
-        tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1))
+        tuple(max(getattr(s, name)[i] for s in counts) for i in (0, 1))
         for name in ("nodes", "window", "lens")
     ]
-    return NodeCounts(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
-
-
-def _products(case: PropagationCase, found: NodeCounts, depths: int) -> float:
-    """Complex products of one tile: along y, along x, and of the depth fields; reading
-    a node counts as 25 of them."""
-    (my, mx), (ny, nx), b = case.samples, found.nodes, min(depths, 14)
-    fields = 0.75 * b * max(found.window)
-    along = found.directions * fields * (ny * (25 + my) + mx * my)
-    return 1e5 + along + 30 * b * ny * nx
+    return NodeCounts(pairs[0], max(s.directions for s in counts), pairs[1], pairs[2])
 
 
 def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
@@ -198,11 +188,11 @@ def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
 def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
     count = 32
     while count <= 1.5 * MOST_NODES:
-        found = legendre.needed_node_count(
+        needed = legendre.needed_node_count(
             lines(legendre.gauss_legendre_nodes(count)[0]), tolerance
         )
-        if found <= min(count, MOST_NODES):
-            return max(found, 2)
+        if needed <= min(count, MOST_NODES):
+            return max(needed, 2)
         count *= 2
     raise PropagationError(
         f"windowed propagation needs more than {MOST_NODES} nodes ({what}); "
@@ -561,19 +551,6 @@ class WindowPlan:
         ny, nx = self.layout.nodes
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
 
-    @property
-    def bytes(self) -> int:
-        """Memory that its arrays take."""
-        held = [
-            *self.tensors.values(),
-            *(t for made in self.slopes.values() for t in made.values()),
-        ]
-        held += [self.moments.rows, self.moments.columns]
-        arrays = [self.depths.basis, self.depths.coefficients, self.moments.table]
-        return sum(int(t.nbytes) for t in held) + sum(
-            int(a.nbytes) for a in arrays if a is not None
-        )
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MovingGeometry:
@@ -587,38 +564,52 @@ class MovingGeometry:
     centre: torch.Tensor
 
 
-def window_plan(
+@functools.lru_cache(maxsize=64)
+def plan_window(
     case: PropagationCase,
     tolerance: float,
     dtype: torch.dtype,
+    moving: bool = False,
     *,
-    moving: bool,
-    smooth: bool,
+    smooth: bool = False,
 ) -> WindowPlan:
-    """A new plan."""
-    found = plan_layout(case, tolerance)
-    if found is None:
-        raise PropagationError(
-            "the window is too large for one plan; see propagate.choose, or make it smaller"
+    """Plan a windowed propagation; those used last are kept.
+
+    Args:
+        case, tolerance: geometry, and relative error of the field.
+        dtype: of the maps; sums over blocks of pillars are in float64.
+        moving: for use with :class:`MovingGeometry`.
+        smooth: with factors (``Pupils``) on the light of the nodes.
+
+    Raises:
+        PropagationError: the window is too large for the method.
+    """
+    with one_blas_thread():
+        layout = plan_layout(case, tolerance)
+        if layout is None:
+            raise PropagationError(
+                "the window is too large for one plan; see propagate.choose, or make it smaller"
+            )
+        lens, inside = SMOOTH if smooth else (0, 0)
+        ny, nx = (n + lens for n in layout.nodes)
+        layout = dataclasses.replace(layout, nodes=(ny, nx))
+        reference = reference_depth(case)
+        pillars = plan_moments(
+            case,
+            reference,
+            legendre_bases(case, (ny + MORE, nx + MORE)),
+            over_blocks(case),
+            tolerance=tolerance,
+            dtype=dtype,
+            more=inside,
         )
-    lens, inside = SMOOTH if smooth else (0, 0)
-    ny, nx = (n + lens for n in found.nodes)
-    found = dataclasses.replace(found, nodes=(ny, nx))
-    reference = reference_depth(case)
-    pillars = plan_moments(
-        case,
-        reference,
-        legendre_bases(case, (ny + MORE, nx + MORE)),
-        over_blocks(case),
-        tolerance=tolerance,
-        dtype=dtype,
-        more=inside,
-    )
-    depths = depth_basis(
-        case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving
-    )
-    tensors = _shared(case, found, depths) | _stacked(case, found, depths, tolerance)
-    return WindowPlan(case, tolerance, found, depths, pillars, tensors)
+        depths = depth_basis(
+            case, _nodes_um(case, layout.sizes.nodes), tolerance / 2, moving=moving
+        )
+        tensors = _shared(case, layout, depths) | _stacked(
+            case, layout, depths, tolerance
+        )
+    return WindowPlan(case, tolerance, layout, depths, pillars, tensors)
 
 
 def legendre_bases(
@@ -646,21 +637,21 @@ def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Ar
 
 
 def _shared(
-    case: PropagationCase, found: WindowLayout, depths: DepthBasis
+    case: PropagationCase, layout: WindowLayout, depths: DepthBasis
 ) -> dict[str, torch.Tensor]:
     """Moments to the nodes of the window, those to the nodes of the tiles, and the
     depths.
     """
     arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
     for name, all_, few in zip(
-        ("rows", "columns"), found.nodes, found.sizes.nodes, strict=True
+        ("rows", "columns"), layout.nodes, layout.sizes.nodes, strict=True
     ):
         arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
         arrays[f"{name}_to_tile"] = legendre.interpolation_matrix(
             few, legendre.gauss_legendre_nodes(all_)[0]
         )
-    e, x = _nodes_um(case, found.nodes)
-    parts = [part for row in window_tiles(case, found.parts)[1] for part in row]
+    e, x = _nodes_um(case, layout.nodes)
+    parts = [part for row in window_tiles(case, layout.parts)[1] for part in row]
     away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
     return {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
@@ -668,7 +659,7 @@ def _shared(
 
 def _stacked(
     case: PropagationCase,
-    found: WindowLayout,
+    layout: WindowLayout,
     depths: DepthBasis,
     tolerance: float,
     slope: int | None = None,
@@ -676,23 +667,23 @@ def _stacked(
     """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any
     of them needs; ``fields`` are
     the depth fields of the pairs."""
-    parts = [part for row in window_tiles(case, found.parts)[1] for part in row]
-    made = [
-        build_operators(part, found.sizes, tolerance, slope=slope) for part in parts
+    parts = [part for row in window_tiles(case, layout.parts)[1] for part in row]
+    operators = [
+        build_operators(part, layout.sizes, tolerance, slope=slope) for part in parts
     ]
-    most = max(len(one.strength) for one in made)
-    strength = np.max([_padded(one.strength, most) for one in made], axis=0)
+    most = max(len(one.strength) for one in operators)
+    strength = np.max([_padded(one.strength, most) for one in operators], axis=0)
     kept = significant_pairs(strength, depths.strength, tolerance / 2)
     arrays = {
-        name: np.stack([getattr(one, name) for one in made])
+        name: np.stack([getattr(one, name) for one in operators])
         for name in ("along_y", "along_x")
     }
     for name in ("lens_terms", "window_terms"):
         arrays[name] = np.stack(
-            [_padded(getattr(one, name), most)[..., kept[0]] for one in made]
+            [_padded(getattr(one, name), most)[..., kept[0]] for one in operators]
         )
     out = {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
-    directions = np.concatenate([one.to_directions for one in made])
+    directions = np.concatenate([one.to_directions for one in operators])
     out["to_directions"] = torch.tensor(directions)
     out["fields"] = torch.tensor(kept[1])
     return out
@@ -742,8 +733,13 @@ def light_windowed(
         moving: geometry with gradients. pupils: factors on the light of the maps, for a
             plan made ``smooth``; None for the |U|² of one map.
     """
-    found = [reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
-    moments, powers = torch.stack([m for m, _ in found]), [power for _, power in found]
+    reduced = [
+        reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
+    ]
+    moments, powers = (
+        torch.stack([m for m, _ in reduced]),
+        [power for _, power in reduced],
+    )
     parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
     total: Any = 0
     for sign, light in parts:

@@ -35,20 +35,20 @@ def phase_slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
         light: (..., y, x) irradiance.
         pitch_um: lattice constant, um.
     """
-    found = []
+    slopes = []
     for axis in (-1, -2):
         count = light.shape[axis]
         if count < 2:
-            found.append(torch.zeros_like(light.real))
+            slopes.append(torch.zeros_like(light.real))
             continue
         pairs = (
             light.narrow(axis, 1, count - 1) * light.narrow(axis, 0, count - 1).conj()
         )
         around = _around(pairs, along=axis)
-        lit = around.abs() > 0
-        turn = torch.angle(torch.where(lit, around, torch.ones_like(around)))
-        found.append(turn / pitch_um)
-    return found[0], found[1]
+        paired = around.abs() > 0
+        turn = torch.angle(torch.where(paired, around, torch.ones_like(around)))
+        slopes.append(turn / pitch_um)
+    return slopes[0], slopes[1]
 
 
 def _around(pairs: Tensor, *, along: int) -> Tensor:
@@ -122,16 +122,16 @@ def apply_jones_coupling(
 
 def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
     """Rows of the map with those around them, and which of these count."""
-    rows, found = light.shape[-2], []
+    rows, shares = light.shape[-2], []
     for start in range(0, rows, ROWS):
         first, last = max(start - REACH - 1, 0), min(start + ROWS + REACH + 1, rows)
-        found.append(
+        shares.append(
             (
                 slice(start - first, min(start + ROWS, rows) - first),
                 light[..., first:last, :],
             )
         )
-    return found
+    return shares
 
 
 def _turned(

@@ -10,6 +10,7 @@ from scipy.special import jv
 from metalens.core.arrays import Array
 from metalens.lens import CURVED, Lens, NeighbourRows
 from metalens.optics import media
+from metalens.psf.spectrum import SpectralNodes
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
@@ -60,9 +61,6 @@ class LeftOut:
         angle = "" if self.of else "; angle: of the default cell, rough"
         at = f"at {self.neighbours.wavelength_um:g} um and normal incidence"
         return f"unlike neighbours counted, by {len(self.neighbours.sine)} solved rows {at}{angle}"
-
-
-ROUGH = LeftOut()
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,64 +171,57 @@ def _largest(values: list[float]) -> float:
 
 def with_model(
     budget: Budget,
-    *,
-    aperture: float,
+    lens: Lens,
+    angle_rad: tuple[float, float],
+    nodes: SpectralNodes,
     polarisation: Polarisation,
-    incidence_rad: float,
-    has_angles: bool,
-    ghost: float,
-    uneven: float = 0.0,
-    left_out: LeftOut = ROUGH,
-    light: tuple[Array, Array] | None = None,
-    lit: float = math.inf,
-    proxy: float = math.nan,
+    left_out: LeftOut,
 ) -> Budget:
-    """The budget with what the model of a lens leaves out.
+    """The budget of one direction with the spectrum, and what the model of a lens
+    leaves out: terms of a perfect lens of the same aperture.
+
+    The term of the response curve is that of pillars off by at most this much of t, a
+    function of the diameter and so of the phase: its mean only dims the focus; the rest
+    leaves for other orders, which cross the focus as broad as the lens.
 
     Args:
-        incidence_rad: angle of incidence in air, rad.
-        aperture: half the spread in sin θ of the rays to the sensor. uneven: as in
-            :func:`scalar_error`.
-        polarisation: that was computed. has_angles: whether the pillars answer at the
-            light's angle.
-        light: wavelengths in um, and weights of sum 1; None for that of the rows of
-            unlike neighbours.
-        lit: area of the lens in squared wavelengths, which scattered light fills.
-        proxy: largest error of a pillar's t by its curve, relative to it.
+        budget: of what was computed.
+        lens: aperture, response table, films.
+        angle_rad: (x, y) field angle.
+        nodes: wavelengths with weights, and the error of their quadrature.
+        polarisation: that was computed.
+        left_out: what is known of neighbours and angles.
     """
-    slanted = min(1.0, left_out.angle * math.sin(incidence_rad) ** 2)
+    aperture, wavelength_um = sine_aperture(lens, angle_rad), lens.wavelength_um
+    slanted = min(1.0, left_out.angle * incidence_sine(angle_rad) ** 2)
+    area = lens.diameters.pillars * lens.diameters.site_um2 / wavelength_um**2
+    pairs = lens.pairs
+    curve = pairs.entry_error if pairs else lens.proxy.error(wavelength_um)
+    rays = budget.polarisation
+    if polarisation == "scalar":
+        uneven = obliquity_variation(lens, angle_rad)
+        rays = _together(scalar_error(aperture, uneven), rays)
     return replace(
         budget,
-        polarisation=_of_scalar(budget, aperture, uneven)
-        if polarisation == "scalar"
-        else budget.polarisation,
+        spectrum=nodes.error,
+        polarisation=rays,
         neighbours=_neighbours(
-            aperture, left_out.neighbours, polarisation, _Seen(light, slanted, lit)
+            aperture, left_out.neighbours, polarisation, nodes, slanted, area
         ),
-        angle=0.0 if has_angles else slanted,
-        glass=ghost,
-        proxy=_of_proxy(aperture, proxy, lit),
+        angle=0.0 if lens.proxy.max_angle_rad > 0 else slanted,
+        glass=lens.layers.ghost(wavelength_um),
+        proxy=curve * min(2.0, 2 * _crossed(aperture, _scalar(aperture), area)),
     )
 
 
-def _of_proxy(aperture: float, error: float, lit: float) -> float:
-    """Of pillars off by at most ``error`` of t: a function of the diameter, so of the
-    phase, whose mean only dims the
-    focus; the rest leaves for other orders, which cross the focus as broad as the lens,
-    here in phase with it.
+def incidence_sine(angle_rad: tuple[float, float]) -> float:
+    """Sine of the angle of incidence in air.
 
-    Of 40 PSFs (hyperbolic and double helix of 0.1 and 0.5 mm, in focus and out of it,
-    proxies of 6 to 16 coefficients)
-    all lie below, at 1e-4 to 0.8 of it.
+    Args:
+        angle_rad: (x, y) field angle.
     """
-    return error * min(2.0, 2 * _crossed(aperture, _scalar(aperture), lit))
-
-
-def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
-    """Of one scalar: of a perfect lens in one medium, and of films as measured on the
-    light.
-    """
-    return _together(scalar_error(aperture, uneven), budget.polarisation)
+    slope = math.hypot(*map(math.tan, angle_rad))
+    return slope / math.hypot(1.0, slope)
 
 
 def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
@@ -241,8 +232,7 @@ def sine_aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
         angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
-    centre = float(media.lateral_reach(after, sine))
+    centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
     edges = centre + np.array([-1.0, 1.0]) * (
         lens.diameters.radius_um + lens.diameters.pitch_um / 2
     )
@@ -258,9 +248,7 @@ def obliquity_variation(lens: Lens, angle_rad: tuple[float, float]) -> float:
         angle_rad: field angles along x and y, rad.
     """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    centre = float(
-        media.lateral_reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad)))))
-    )
+    centre = float(media.lateral_reach(after, incidence_sine(angle_rad)))
     node, share = np.polynomial.legendre.leggauss(RINGS)
     radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt(
         (node + 1) / 2
@@ -292,61 +280,49 @@ def scalar_error(aperture: float, uneven: float = 0.0) -> float:
     return math.hypot(_difference(_scalar(aperture), _flux(aperture)), uneven**2 / 2)
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """light and lit: of :func:`with_model`. slanted: share of the change that light
-    from the side may change, as t of
-    a pillar does."""
-
-    light: tuple[Array, Array] | None
-    slanted: float
-    lit: float
-
-
 def _neighbours(
     aperture: float,
     known: NeighbourRows | tuple[complex, complex],
     polarisation: Polarisation,
-    seen: _Seen,
+    nodes: SpectralNodes,
+    slanted: float,
+    area: float,
 ) -> float:
     """Of pillars taken one by one; or of the factor of rows: another truncation, any
-    row left out, zones that get
-    shorter from one to the next, other light than the rows', and for the scalar that
-    fields along and across the slope
-    are told apart. And of the light that they scatter."""
+    row left out, zones that get shorter from one to the next, other light than the
+    rows', and for the scalar one mean of fields along and across the slope. And of the
+    light that they scatter.
+
+    slanted: share of the change that light from the side may change, as t of a pillar
+    does. area: of the lens in squared wavelengths.
+    """
     p, _, _ = _nodes(aperture)
     if isinstance(known, tuple):
         factor = 1 + known[0] * p + known[1] * p * p
         used = _scalar(aperture, factor)
-        return math.hypot(
-            _difference(used, _scalar(aperture)),
-            _scattered(aperture, factor, used, seen.lit),
-        )
+        changed = _difference(used, _scalar(aperture))
+        return math.hypot(changed, _scattered(aperture, factor, used, area))
     factor = known.mean(p)
     used = _scalar(aperture, factor)
-    less = [
-        _difference(_scalar(aperture, other.mean(p)), used) for other in known.others
-    ]
-    left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(
-        less, default=0.0
-    )
-    left += math.hypot(CURVED, seen.slanted) * _difference(_scalar(aperture), used)
-    for wave, weight in zip(*(seen.light or ((), ())), strict=True):
-        away = _difference(
-            _scalar(aperture, known.mean(p * (wave / known.wavelength_um))), used
-        )
+
+    def change(other: Array) -> float:
+        return _difference(_scalar(aperture, other), used)
+
+    left = change(known.coarser.mean(p))
+    left += max((change(other.mean(p)) for other in known.others), default=0.0)
+    left += math.hypot(CURVED, slanted) * _difference(_scalar(aperture), used)
+    for wave, weight in zip(nodes.wavelengths_um, nodes.weights, strict=True):
+        away = change(known.mean(p * (wave / known.wavelength_um)))
         left = math.hypot(left, math.sqrt(weight) * away)
-    left = math.hypot(left, _scattered(aperture, factor, used, seen.lit))
+    left = math.hypot(left, _scattered(aperture, factor, used, area))
+    if polarisation != "scalar":
+        return left
     along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
-    aside = _scalar(aperture, (along - across) / 2, order=2)
-    return (
-        left
-        if polarisation != "scalar"
-        else math.hypot(left, _difference(used + aside, used))
-    )
+    turned = _scalar(aperture, (along - across) / 2, order=2)
+    return math.hypot(left, _difference(used + turned, used))
 
 
-def _scattered(aperture: float, factor: Array, used: Array, lit: float) -> float:
+def _scattered(aperture: float, factor: Array, used: Array, area: float) -> float:
     """Of the light that neighbours take from the focus (1 - |C|²) and that meets it
     again with any phase, spread over
     the shadow of the lens, as the order that goes straight on:
@@ -359,16 +335,16 @@ def _scattered(aperture: float, factor: Array, used: Array, lit: float) -> float
     p, weight, _ = _nodes(aperture)
     power = weight / (1 - p * p) ** 2
     kept = float(power @ np.abs(factor) ** 2 / power.sum())
-    return math.sqrt(max(1 - kept, 0.0) / kept) * _crossed(aperture, used, lit)
+    return math.sqrt(max(1 - kept, 0.0) / kept) * _crossed(aperture, used, area)
 
 
-def _crossed(aperture: float, used: Array, lit: float) -> float:
+def _crossed(aperture: float, used: Array, area: float) -> float:
     """√(2 (∫|U|²)² / ∫|U|⁴ / area): what light of the same power, as broad as the lens, does to a PSF |U|²."""
     _, _, radius = _nodes(aperture)
     ring = np.arange(len(used)) * (
         2 * np.pi * (radius[1] / (2 * np.pi)) ** 2
     )  # in squared wavelengths
-    return math.sqrt(2 * float(used @ ring) ** 2 / float(used**2 @ ring) / lit)
+    return math.sqrt(2 * float(used @ ring) ** 2 / float(used**2 @ ring) / area)
 
 
 def _nodes(aperture: float) -> tuple[Array, Array, Array]:

@@ -13,11 +13,9 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import PropagationError
 from metalens.core.store import write_bytes
-from metalens.psf.record import PsfStack, save
+from metalens.psf.record import AXES, NUMBERS, PsfStack, save
 
 SUFFIXES = (".h5", ".tif", ".tiff", ".mat", ".fits")
-_NAMES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
-_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 
 
 def check_psf_format(path: str | Path) -> None:
@@ -75,7 +73,7 @@ def write_tiff(stack: PsfStack) -> bytes:
     import tifffile
 
     plain = stack.numpy()
-    about = {name: getattr(plain, name) for name in _NUMBERS} | {
+    about = {name: getattr(plain, name) for name in NUMBERS} | {
         n: v.tolist() for n, v in _arrays(plain).items()
     }
     about["depths_um"] = [
@@ -114,9 +112,9 @@ def write_matlab(stack: PsfStack) -> bytes:
     from scipy.io import savemat
 
     plain = stack.numpy()
-    values: dict[str, Any] = {
-        name: getattr(plain, name) for name in _NUMBERS
-    } | _arrays(plain)
+    values: dict[str, Any] = {name: getattr(plain, name) for name in NUMBERS} | _arrays(
+        plain
+    )
     values |= {"intensity": np.asarray(plain.intensity), "axes": _axes(plain)}
     file = io.BytesIO()
     savemat(file, values, oned_as="column")
@@ -163,7 +161,7 @@ def write_fits(stack: PsfStack) -> bytes:
 
 def _arrays(plain: PsfStack) -> dict[str, Array]:
     """Axes and energies by name."""
-    return {name: np.asarray(getattr(plain, name)) for name in (*_NAMES, "energy_um2")}
+    return {name: np.asarray(getattr(plain, name)) for name in (*AXES, "energy_um2")}
 
 
 def _axes(plain: PsfStack) -> str:

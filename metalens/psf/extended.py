@@ -243,11 +243,11 @@ def _filtered(
         filters.append(
             level if which == 0 else np.hypot(level, slope / SIGMA[extent.shape])
         )
-    seen = torch.as_tensor(np.array(filters)).to(light)
-    found: torch.Tensor = torch.fft.irfft2(
-        torch.fft.rfft2(light, s=shape) * seen, s=shape
+    response = torch.as_tensor(np.array(filters)).to(light)
+    filtered: torch.Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(light, s=shape) * response, s=shape
     )
-    return found[..., : light.shape[-2], : light.shape[-1]]
+    return filtered[..., : light.shape[-2], : light.shape[-1]]
 
 
 def shift_invariance_error(
@@ -265,7 +265,7 @@ def shift_invariance_error(
             source.
         probe: the same (1, y, x) for another case.
     """
-    found = []
+    errors = []
     inverse = case.inverse_depths_per_um
     for depth in {int(np.argmin(inverse)), int(np.argmax(inverse))}:
         one, middle = (
@@ -283,10 +283,10 @@ def shift_invariance_error(
             square += (
                 float(_filtered(other.detach() - middle, one, extent, 1).norm()) ** 2
             )
-        found.append(
+        errors.append(
             math.sqrt(square) / float(_filtered(middle, one, extent, 0).norm())
         )
-    return max(found)
+    return max(errors)
 
 
 def _moved(case: PropagationCase, turn: Array) -> PropagationCase:

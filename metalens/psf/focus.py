@@ -22,7 +22,7 @@ from metalens.psf.metrics import (
     half_maximum,
     mtf50,
 )
-from metalens.psf.of_lens import all_maps, passed_um2
+from metalens.psf.of_lens import all_maps, lens_stop_shadow, passed_um2
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import SpectralNodes
 
@@ -56,10 +56,10 @@ def focus_metrics(
     shape = len(plain.angles_rad), len(plain.depths_um), *plain.intensity.shape[-2:]
     light = plain.intensity.reshape(shape)
     energy = np.asarray(plain.energy_um2).reshape(shape[:2])
-    found = []
+    figures = []
     for i, (x, y) in enumerate(plain.angles_rad.tolist()):
         best = int((light[i].max((-1, -2)) * energy[i]).argmax())
-        found.append(
+        figures.append(
             _of_one(
                 plain,
                 lens,
@@ -68,7 +68,7 @@ def focus_metrics(
                 power_error,
             )
         )
-    return tuple(found)
+    return tuple(figures)
 
 
 def _of_one(
@@ -121,8 +121,6 @@ def _error_at(stack: PsfStack, angle_rad: Point) -> float:
     """Relative L2 error of the device at an angle: its budget, whose term of the angle
     grows with the square of the sine.
     """
-    if stack.budget is None:
-        return stack.error
     steep = (np.tan(stack.angles_rad) ** 2).sum(-1)
     squares = steep / (1 + steep)
     own = math.tan(angle_rad[0]) ** 2 + math.tan(angle_rad[1]) ** 2
@@ -142,23 +140,6 @@ def incident_um2(lens: Lens, angle_rad: Point, depth_um: float) -> float:
     there = np.asarray(d.diameter_um) > 0
     shadow = np.abs(lens_stop_shadow(lens, angle_rad, depth_um))
     return float(d.site_um2 * ((there * shadow) ** 2).sum())
-
-
-def lens_stop_shadow(lens: Lens, angle_rad: Point, depth_um: float) -> Array:
-    """(y, x) complex factor of the aperture stop at every pillar; 1 without one.
-
-    Args:
-        lens: the lens.
-        angle_rad: field angles along x and y, rad.
-        depth_um: source depth from the lens, um.
-    """
-    if lens.layers.stop is None:
-        return np.ones((1, 1))
-    d = lens.diameters
-    tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
-    places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
-    shade = lens.layers.shadow(tangents, depth_um, lens.wavelength_um, places, width)
-    return np.asarray(shade)
 
 
 def in_phase_irradiance(

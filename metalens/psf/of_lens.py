@@ -20,11 +20,12 @@ from metalens.psf import among
 from metalens.psf import spectrum as spectra
 from metalens.psf.among import NeighbourJonesFactors
 from metalens.psf.budget import (
+    NEIGHBOURS,
     RINGS,
     SPOKES,
-    Budget,
     LeftOut,
     Polarisation,
+    incidence_sine,
     obliquity_variation,
     scalar_error,
     sine_aperture,
@@ -42,11 +43,6 @@ ROWS, NEARBY = (
     1e-4,
 )  # rows of pillars whose delays are taken, and how far apart their wavelengths are
 TRIES = 3  # at a spectrum: the light of one tells the paths for the next
-PILOT, PILOT_ERROR = (
-    5,
-    1e-3,
-)  # wavelengths, and their tolerance, by which the light of a whole spectrum is foreseen
-SPARE = 0.7  # of the tolerance that is asked for by that light, so that one try does
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
@@ -129,9 +125,9 @@ def from_lens(
     how: dict[str, Any] = {
         "tolerance": tolerance,
         "polarisation": polarisation,
-        "own": left_out or _left_out_of(lens),
+        "own": left_out or LeftOut(lens.neighbours or NEIGHBOURS),
+        "provenance": provenance or Provenance(),
     }
-    how["provenance"] = provenance or Provenance()
     if isinstance(spectrum, Source | MeasuredSpectrum):
         return _over_spectrum(lens, view, spectrum, **how)
     return _at_wavelengths(
@@ -150,38 +146,19 @@ def _over_spectrum(
     tolerance: float,
     **how: Any,
 ) -> PsfStack:
-    """PSFs of a spectrum: wavelengths for the paths to where few of them say that its
-    light falls, in the window; more
-    where the light of all of them says so."""
+    """PSFs of a spectrum: as many wavelengths as paths to the middle of the window ask
+    for; more where the paths to the light that they show do.
+    """
     within = lens.proxy.wavelengths_um
-
-    def psfs(nodes: SpectralNodes, tolerance: float, **other: Any) -> PsfStack:
-        return _at_wavelengths(
-            lens,
-            view,
-            spectra.nodes_inside_library(nodes, source, within),
-            tolerance=tolerance,
-            **how | other,
-        )
-
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
     middle = max(
         float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans
     )
     nodes = spectra.spectral_nodes(source, path_um=middle, tolerance=tolerance / 2)
-    if len(nodes.weights) > 2 * PILOT:
-        few = SpectralNodes(
-            *spectra.gauss_rule(*spectra.spectrum_points(source), PILOT), 0.0
-        )
-        pilot = psfs(few, max(tolerance, PILOT_ERROR), polarisation="scalar")
-        nodes = _nodes_for(source, spans, pilot, tolerance / 2 * SPARE)
-    for last in range(TRIES):
-        stack = psfs(nodes, tolerance)
-        if (
-            last == TRIES - 1
-            or stack.budget is None
-            or stack.budget.spectrum <= tolerance / 2
-        ):
+    for _ in range(TRIES):
+        nodes = spectra.nodes_inside_library(nodes, source, within)
+        stack = _at_wavelengths(lens, view, nodes, tolerance=tolerance, **how)
+        if stack.budget.spectrum <= tolerance / 2:
             break
         nodes = _nodes_for(source, spans, stack, tolerance / 2)
     return dataclasses.replace(
@@ -275,7 +252,7 @@ def _delay_um(
         return 0.0
     um, share = spectra.spectrum_points(source)
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
-    there, tilt, found = (
+    there, tilt, delays = (
         np.asarray(lens.diameters.diameter_um[rows]) > 0,
         library_incidence(lens, angle_rad),
         [],
@@ -289,8 +266,8 @@ def _delay_um(
             lens.rows_phase_rad(rows, wave, tilt)[there] / (2 * np.pi) for wave in ends
         ]
         change = turns[0] - turns[1]
-        found.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
-    return float(max(found))
+        delays.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
+    return float(max(delays))
 
 
 def light_shares(light: Array, places: tuple[int, ...]) -> Array:
@@ -372,32 +349,23 @@ def _at_wavelengths(
         judged = dataclasses.replace(
             nodes, error=_quadrature_error(lens, view, angle, parts[-1], nodes)
         )
-        budgets.append(_budget(lens, angle, parts[-1], judged, counted, own))
-    held = (
+        budgets.append(with_model(parts[-1].budget, lens, angle, judged, counted, own))
+    budget, stack = worst_of_budgets(budgets), _concatenated(parts, provenance)
+    words = [
+        stack.reason,
+        ABOVE if budget.computed > tolerance and stack.converged else "",
         f"of {lens.one_light}: these pillars answer x and y apart"
         if lens.one_light
-        else ""
-    )
-    return _with_budget(
-        _concatenated(parts, provenance),
-        worst_of_budgets(budgets),
-        tolerance,
-        held,
-        own,
-    )
-
-
-def _with_budget(
-    stack: PsfStack, found: Budget, tolerance: float, held: str, own: LeftOut
-) -> PsfStack:
-    """With the budget of all directions, and in words what it is of; the stack's own
-    tolerance is that of the sums.
-    """
-    above = [ABOVE] if found.computed > tolerance and stack.converged else []
-    words = [stack.reason, *above, held, AT_NORMAL if found.angle else "", own.words]
-    reason = "; ".join(filter(None, words))
+        else "",
+        AT_NORMAL if budget.angle else "",
+        own.words,
+    ]
     return dataclasses.replace(
-        stack, tolerance=tolerance, error=found.computed, budget=found, reason=reason
+        stack,
+        tolerance=tolerance,
+        error=budget.computed,
+        budget=budget,
+        reason="; ".join(filter(None, words)),
     )
 
 
@@ -416,38 +384,6 @@ def mean_over_polarizations(x: PsfStack, y: PsfStack) -> PsfStack:
     worse = x if x.error >= y.error else y
     return dataclasses.replace(
         worse, intensity=intensity, energy_um2=energy.astype(x.energy_um2.dtype)
-    )
-
-
-def _left_out_of(lens: Lens) -> LeftOut:
-    """Rough terms, but for neighbours that the lens holds."""
-    return LeftOut() if lens.neighbours is None else LeftOut(lens.neighbours)
-
-
-def _budget(
-    lens: Lens,
-    angle: tuple[float, float],
-    stack: PsfStack,
-    nodes: SpectralNodes,
-    counted: Polarisation,
-    left_out: LeftOut,
-) -> Budget:
-    """Of one direction: what was computed, and what the model of a lens leaves out."""
-    made = stack.budget or Budget(stack.error)
-    return with_model(
-        dataclasses.replace(made, spectrum=nodes.error),
-        aperture=sine_aperture(lens, angle),
-        uneven=obliquity_variation(lens, angle),
-        polarisation=counted,
-        incidence_rad=float(np.arctan(np.hypot(*np.tan(angle)))),
-        has_angles=lens.proxy.max_angle_rad > 0,
-        ghost=lens.layers.ghost(lens.wavelength_um),
-        left_out=left_out,
-        light=(nodes.wavelengths_um, nodes.weights),
-        lit=lens.diameters.pillars * lens.diameters.site_um2 / lens.wavelength_um**2,
-        proxy=lens.proxy.error(lens.wavelength_um)
-        if lens.pairs is None
-        else lens.pairs.entry_error,
     )
 
 
@@ -488,11 +424,8 @@ def library_incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
         lens: the lens.
         angle_rad: field angles along x and y, rad.
     """
-    return (
-        float(np.arctan(np.hypot(*np.tan(angle_rad))))
-        if lens.proxy.max_angle_rad > 0
-        else 0.0
-    )
+    has_angles = lens.proxy.max_angle_rad > 0
+    return math.asin(incidence_sine(angle_rad)) if has_angles else 0.0
 
 
 def all_maps(
@@ -545,22 +478,33 @@ def passed_um2(
         depths_um: source depths from the lens, um.
     """
     nodes = SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
-    d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
-    level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][
-        0
-    ].numpy()
-    places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
-    shades = (
-        lens.layers.shadow(tangents, z, lens.wavelength_um, places, width)
+    level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0]
+    passed = [
+        (np.abs(level.numpy() * lens_stop_shadow(lens, angle_rad, z)) ** 2).sum()
         for z in depths_um
-    )
+    ]
     order = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).order
-    faces = media.passed_at(order, 1 - 1 / (1 + tangents[0] ** 2 + tangents[1] ** 2))
-    return np.asarray(
-        faces
-        * d.site_um2
-        * np.array([(np.abs(level * shade) ** 2).sum() for shade in shades])
-    )
+    faces = media.passed_at(order, incidence_sine(angle_rad) ** 2)
+    return np.asarray(faces * lens.diameters.site_um2 * np.array(passed))
+
+
+def lens_stop_shadow(
+    lens: Lens, angle_rad: tuple[float, float], depth_um: float
+) -> Array:
+    """(y, x) complex factor of the aperture stop at every pillar; 1 without one.
+
+    Args:
+        lens: the lens.
+        angle_rad: field angles along x and y, rad.
+        depth_um: source depth from the lens, um.
+    """
+    if lens.layers.stop is None:
+        return np.ones((1, 1))
+    d = lens.diameters
+    tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
+    places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
+    shade = lens.layers.shadow(tangents, depth_um, lens.wavelength_um, places, width)
+    return np.asarray(shade)
 
 
 def _concatenated(parts: list[PsfStack], provenance: Provenance) -> PsfStack:

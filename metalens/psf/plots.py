@@ -2,7 +2,7 @@
 encircled energy, I(z).
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,13 +10,10 @@ from metalens.core.arrays import Array
 from metalens.core.report import figure_png, make_figure
 from metalens.psf import metrics as psf_metrics
 from metalens.psf.metrics import DiffractionLimit
-from metalens.psf.pixels import on_pixels
 from metalens.psf.record import PsfStack
 
 if TYPE_CHECKING:
     from metalens.psf.z_scan import FocusScan
-
-PIXEL_UM = 3.0
 
 
 def psf_pictures(
@@ -25,8 +22,8 @@ def psf_pictures(
     limit: DiffractionLimit | None = None,
     scan: "FocusScan | None" = None,
 ) -> dict[str, bytes]:
-    """{name: PNG}: ``montage`` and ``mtf``; ``xz`` of two depths or more, and
-    ``information`` where neighbours of them differ; ``zscan`` of a scan.
+    """{name: PNG}: ``montage`` and ``mtf``; ``xz`` of two depths or more; ``zscan`` of a
+    scan.
 
     limit: of the aperture, for the ideal MTF and its cut-off.
 
@@ -34,18 +31,12 @@ def psf_pictures(
         stack: PSFs over angle, depth and wavelength.
     """
     plain = stack.numpy()
-    found = {"montage": plot_montage(plain), "mtf": plot_mtf(plain, limit=limit)}
+    pictures = {"montage": plot_montage(plain), "mtf": plot_mtf(plain, limit=limit)}
     if scan is not None:
-        found["zscan"] = along_z(scan)
+        pictures["zscan"] = along_z(scan)
     if len(plain.depths_um) > 1:
-        found["xz"] = plot_slices(plain)
-    if (
-        len(plain.depths_um) > 1
-        and np.isfinite(plain.depths_um).all()
-        and np.diff(plain.depths_um).all()
-    ):
-        found["information"] = plot_information(plain)
-    return found
+        pictures["xz"] = plot_slices(plain)
+    return pictures
 
 
 def _by_angle(stack: PsfStack) -> Array:
@@ -116,10 +107,10 @@ def plot_montage(stack: PsfStack, *, most: int = 7) -> bytes:
     for row, (psfs, angle) in enumerate(zip(light, stack.angles_rad, strict=True)):
         for column, i in enumerate(picks):
             panel = axes[row, column]
-            seen = np.sqrt(
+            shown = np.sqrt(
                 np.maximum(psfs[i], 0)
             )  # the flux of steep rays is below 0 at places
-            panel.imshow(seen, extent=(-across, across, down, -down), vmin=0)
+            panel.imshow(shown, extent=(-across, across, down, -down), vmin=0)
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
             if row == 0:
@@ -148,10 +139,9 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
         np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61),
     )
     curves = psf_metrics.mtf(stack, frequencies_per_um=frequency)
-    energy = psf_metrics.encircled_energy(stack, radii_um=radius)
     angles = sorted({0, len(stack.angles_rad) - 1})
     curves = curves.reshape(len(stack.angles_rad), -1, 2, len(frequency))
-    energy = energy.reshape(len(stack.angles_rad), -1, len(radius))
+    light = _by_angle(stack)
     figure, axes = make_figure(1, 2, size=(9.5, 3.4))
     for style, angle in zip(("-", "--"), angles, strict=False):
         for colour, i in enumerate(depths):
@@ -171,9 +161,8 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
                 lw=0.6,
                 alpha=0.7,
             )
-            axes[1].plot(
-                radius, energy[angle, i], style, color=f"C{colour}", label=name
-            )
+            energy = _encircled(stack, light[angle, i], radius)
+            axes[1].plot(radius, energy, style, color=f"C{colour}", label=name)
     if limit is not None:
         s = np.minimum(frequency / limit.cutoff_per_um, 1.0)
         ideal = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
@@ -192,6 +181,16 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
     )
     axes[1].legend(fontsize=7)
     return figure_png(figure)
+
+
+def _encircled(stack: PsfStack, light: Array, radius_um: Array) -> Array:
+    """(radius,) share of (y, x) light within circles about its centroid."""
+    x, y = stack.x_um, stack.y_um
+    cx, cy = light.sum(0) @ x / light.sum(), light.sum(1) @ y / light.sum()
+    away = np.hypot(x - cx, (y - cy)[:, None]).ravel()
+    order = np.argsort(away)
+    shares = np.cumsum(light.ravel()[order])
+    return np.asarray(np.interp(radius_um, away[order], shares))
 
 
 def along_z(scan: "FocusScan") -> bytes:
@@ -217,51 +216,3 @@ def along_z(scan: "FocusScan") -> bytes:
     )
     axes[1].legend(fontsize=7)
     return figure_png(figure)
-
-
-def plot_information(stack: PsfStack) -> bytes:
-    """I(z) of Eq. 11 on pixels of 3 µm, binned 1, 2 and 3 times, under each named
-    normalisation.
-
-    Args:
-        stack: PSFs over angle, depth and wavelength.
-    """
-    figure, axes = make_figure(1, 2, size=(9.5, 3.4))
-    for panel, name in zip(axes, ("sum", "l2"), strict=True):
-        for colour, bins in enumerate((1, 2, 3)):
-            depth, value = _averaged(stack, name, bins)
-            value = value.reshape(len(stack.angles_rad), -1)
-            for angle in sorted({0, len(value) - 1}):
-                label = f"{bins}×{bins}, {_angle_name(stack.angles_rad[angle])}"
-                panel.plot(
-                    depth * 1e-3,
-                    value[angle],
-                    "-" if angle == 0 else "--",
-                    color=f"C{colour}",
-                    label=label,
-                )
-        panel.set(
-            title=f"normalised by {'the sum' if name == 'sum' else 'the L2 norm'}",
-            xlabel="source depth / mm",
-        )
-        panel.set(ylabel="I(z) / mm⁻²", ylim=(0, None))
-    axes[1].legend(
-        fontsize=7, title=f"bins of {PIXEL_UM:g} µm pixels", title_fontsize=7
-    )
-    figure.suptitle(
-        "Axial information of Eq. 11, mean over 9 sub-pixel positions; the normalisation decides the ranking"
-    )
-    return figure_png(figure)
-
-
-def _averaged(stack: PsfStack, name: Any, bins: int) -> tuple[Array, Array]:
-    """I(z) averaged over 3 x 3 positions of the pixel grid."""
-    pitch = max(PIXEL_UM, stack.step_um)
-    moves = (np.arange(3) - 1) / 3 * pitch * bins
-    found = []
-    for y in moves:
-        for x in moves:
-            seen = on_pixels(stack, pitch_um=pitch, bins=bins, shift_um=(y, x))
-            depth, value = psf_metrics.axial_information(seen, normalisation=name)
-            found.append(value)
-    return depth, np.mean(found, axis=0)

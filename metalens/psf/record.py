@@ -16,6 +16,7 @@ from metalens.propagate import axis_positions
 from metalens.psf.budget import Budget
 
 SourceShape = Literal["disc", "square", "gaussian"]
+NO_BUDGET = Budget(math.nan)  # its error stands for it
 
 
 @functools.lru_cache(maxsize=1)
@@ -45,7 +46,8 @@ class PsfStack:
             lenses: of what is computed, and for a fitted lens of its posterior.
         reason: method, and why it stopped.
         provenance: settings and input files.
-        budget: the error by cause, with what the model leaves out.
+        budget: the error by cause, with what the model leaves out; where none is given,
+            the error is numerical.
     """
 
     intensity: Any
@@ -61,10 +63,10 @@ class PsfStack:
     error: float
     reason: str
     provenance: Provenance = field(default_factory=_made_here)
-    budget: Budget | None = None
+    budget: Budget = NO_BUDGET
 
     def __post_init__(self) -> None:
-        if self.budget is None:
+        if math.isnan(self.budget.numerical):
             object.__setattr__(self, "budget", Budget(self.error))
 
     @property
@@ -91,7 +93,7 @@ class PsfStack:
     @property
     def converged(self) -> bool:
         """Whether the error of what is computed is within the tolerance."""
-        fit = _budget(self).posterior
+        fit = self.budget.posterior
         return (
             math.sqrt(max(self.error**2 - np.nan_to_num(fit) ** 2, 0)) <= self.tolerance
         )
@@ -111,8 +113,8 @@ def _array(value: Any) -> Array:
     )
 
 
-_AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
-_NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
+AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
+NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 
 
 def save(path: str | Path, stack: PsfStack) -> None:
@@ -125,12 +127,12 @@ def save(path: str | Path, stack: PsfStack) -> None:
     plain = stack.numpy()
     arrays = {
         name: np.asarray(getattr(plain, name))
-        for name in ("intensity", "energy_um2", *_AXES)
+        for name in ("intensity", "energy_um2", *AXES)
     }
-    about = {name: getattr(plain, name) for name in _NUMBERS}
+    about = {name: getattr(plain, name) for name in NUMBERS}
     about |= {
         f"budget_{name}": value
-        for name, value in dataclasses.asdict(_budget(plain)).items()
+        for name, value in dataclasses.asdict(plain.budget).items()
     }
     store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
 
@@ -147,19 +149,11 @@ def load(path: str | Path) -> PsfStack:
     """
     stored = store.load(path, "psf")
     fields: dict[str, Any] = {
-        name: stored.attributes[name] for name in _NUMBERS
+        name: stored.attributes[name] for name in NUMBERS
     } | stored.arrays
     terms = {
         f.name: stored.attributes.get(f"budget_{f.name}")
         for f in dataclasses.fields(Budget)
     }
-    budget = (
-        Budget(**{n: float(v) for n, v in terms.items() if v is not None})
-        if terms["numerical"]
-        else None
-    )
+    budget = Budget(**{n: float(v) for n, v in terms.items() if v is not None})
     return PsfStack(**fields, provenance=stored.provenance, budget=budget)
-
-
-def _budget(stack: PsfStack) -> Budget:
-    return stack.budget or Budget(stack.error)

@@ -192,12 +192,12 @@ def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int,
     Raises:
         PropagationError: light beyond.
     """
-    lit = np.flatnonzero(value > 1e-4 * value.max())
+    bright = np.flatnonzero(value > 1e-4 * value.max())
     low, high = (edge * 1e3 for edge in within_um)
     if not high > low:
-        return int(lit[0]), int(lit[-1]) + 1
-    if not (low - 1e-3 <= nm[lit[0]] and nm[lit[-1]] <= high + 1e-3):
-        few = slice(int(lit[0]), int(lit[-1]) + 1)
+        return int(bright[0]), int(bright[-1]) + 1
+    if not (low - 1e-3 <= nm[bright[0]] and nm[bright[-1]] <= high + 1e-3):
+        few = slice(int(bright[0]), int(bright[-1]) + 1)
         raise _refusal(
             (nm[few], value[few] / value[few].sum()),
             within_um,
@@ -282,10 +282,11 @@ def spectral_nodes(
     """
     spans, light = np.atleast_1d(path_um), np.ones(1) if light is None else light
     um, share = spectrum_points(source)
-    judge = _Judge(source, float(spans.max()))
+    beside = getattr(source, "beside", 0.0)
     for count in range(1, MOST_NODES + 1):
         x, w = gauss_rule(um, share, count)
-        error = float(np.sqrt(light @ judge.missed(x, w, spans) ** 2))
+        errors = beside + _mean_errors((x, w), (um, share), spans)
+        error = float(np.sqrt(light @ errors**2))
         if error <= tolerance:
             return SpectralNodes(x, w, error, source)
     raise PropagationError(
@@ -303,9 +304,21 @@ def quadrature_error(nodes: SpectralNodes, span_um: Array) -> Array:
     """
     if nodes.source is None:
         return np.full(len(span_um), nodes.error)
-    return _Judge(nodes.source, float(span_um.max())).missed(
-        nodes.wavelengths_um, nodes.weights, span_um
-    )
+    rule = nodes.wavelengths_um, nodes.weights
+    beside = getattr(nodes.source, "beside", 0.0)
+    return beside + _mean_errors(rule, spectrum_points(nodes.source), span_um)
+
+
+def _mean_errors(
+    rule: tuple[Array, Array], points: tuple[Array, Array], span_um: Array
+) -> Array:
+    """(n,) largest difference of the means of exp(2πi·path/λ) by a rule and by points
+    (wavelengths, weights), for paths up to each span."""
+    paths = np.linspace(0, span_um.max(), PATHS)
+    means = [np.exp(2j * np.pi * paths[:, None] / um) @ w for um, w in (rule, points)]
+    largest = np.maximum.accumulate(np.abs(means[0] - means[1]))
+    place = np.searchsorted(paths, span_um * (1 - 1e-12)).clip(max=PATHS - 1)
+    return np.asarray(largest[place])
 
 
 def spectrum_points(source: Source | MeasuredSpectrum) -> tuple[Array, Array]:
@@ -386,14 +399,14 @@ def _refusal(
     known for, and of what serves.
     """
     (nm, share), (low, high) = light, (edge * 1e3 for edge in within_um)
-    told = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
+    known = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
     part = (
         float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum())
         if high > low
         else 1.0
     )
     return PropagationError(
-        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {told}, and {part:.2g} of it lies "
+        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {known}, and {part:.2g} of it lies "
         f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {library_sweep_hint(nm)})"
     )
 
@@ -425,26 +438,6 @@ def outside_library_text(
         f"; {share:.2g} of the light lies beyond {low * 1e3:g} to {high * 1e3:g} nm, where the pillars are not "
         "known, and is taken by the wavelengths within: sweep a library over the spectrum"
     )
-
-
-class _Judge:
-    """Means of exp(2πi·path/λ) over a spectrum, of paths from 0 to the largest."""
-
-    def __init__(self, source: Source | MeasuredSpectrum, longest_um: float) -> None:
-        um, share = spectrum_points(source)
-        self.paths = np.linspace(0, longest_um, PATHS)
-        self.want = np.array(
-            [np.exp(2j * np.pi * path / um) @ share for path in self.paths]
-        )
-        self.beside = source.beside if isinstance(source, MeasuredSpectrum) else 0.0
-
-    def missed(self, um: Array, weights: Array, span_um: Array) -> Array:
-        """(n,) of a rule, for paths up to each of these."""
-        error = np.abs(
-            np.exp(2j * np.pi * self.paths[:, None] / um) @ weights - self.want
-        )
-        place = np.searchsorted(self.paths, span_um * (1 - 1e-12)).clip(max=PATHS - 1)
-        return np.asarray(np.maximum.accumulate(error)[place] + self.beside)
 
 
 def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:

@@ -1,8 +1,7 @@
 """PSF stack of phase and transmission maps (paper Sec. 3.1, Eqs. 1-3)."""
 
-import dataclasses
-import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,18 @@ from metalens.optics import Layers
 from metalens.propagate import MovingGeometry, PropagationCase
 from metalens.psf import among
 from metalens.psf.among import NeighbourJonesFactors
-from metalens.psf.budget import Budget, Polarisation
-from metalens.psf.compute import ROUNDING, IntensityResult
-from metalens.psf.direction import DirectionRequest, compute_direction
+from metalens.psf.budget import Polarisation
 from metalens.psf.extended import Extent
+from metalens.psf.intensity import (
+    ROUNDING,
+    IntensityRequest,
+    IntensityResult,
+    Maps,
+    compute_intensity,
+)
 from metalens.psf.metrics import blur_um
 from metalens.psf.record import PsfStack
+from metalens.psf.vector import PolarizationMixing, apart_maps
 
 
 def psf_stack(
@@ -116,96 +121,107 @@ def psf_stack(
     >>> stack.intensity.shape, stack.converged
     ((1, 21, 21), True)
     """
+    if not 0 < tolerance < 1:
+        raise PropagationError(
+            f"tolerance is {tolerance}, need a relative error above 0 and below 1"
+        )
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
-    maps, wanted = _coupled(
-        maps,
-        neighbours,
-        pitch_um,
-        DirectionRequest(tolerance, polarisation, integrate, source),
-    )
+    shape = maps[0].shape
+    maps, mixing = _polarised(maps, polarisation, neighbours, pitch_um)
+    depths = np.atleast_1d(np.asarray(_value(depths_um), float))
     about: dict[str, Any] = {
         "pitch_um": pitch_um,
         "row_um": row_um,
         "site_um2": site_um2,
         "window_um": window_um,
-    }
-    about |= {
         "sensor_distance_um": _value(sensor_distance_um),
         "samples": samples,
         "layers": layers and layers.open,
-    }
-    about |= {
-        "depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)),
+        "depths_um": depths,
         "offset_um": _value(offset_um),
     }
     several, angles = _directions(angle_rad)
-    cases, found = [], []
+    lenses = [m.reshape(-1, *m.shape[-3:]) for m in maps]
+    cases: list[PropagationCase] = []
+    results: list[list[IntensityResult]] = []
     for angle in angles:
-        seen = [
+        each = [
             propagate.make_case(
-                maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about
+                shape, wavelength_um=wave, angle_rad=_value(angle), **about
             )
-            for w in waves
+            for wave in waves
         ]
-        cases.append(seen[int(share.argmax())])  # all wavelengths share its window
+        cases.append(each[int(share.argmax())])  # all wavelengths share its window
+        each = [replace(case, centre_um=cases[-1].centre_um) for case in each]
         moving = _geometry_with_gradients(
             angle, depths_um, sensor_distance_um, offset_um, cases[-1]
         )
-        found.append(
-            _one_direction(
-                maps,
-                (_with_window_of(seen, cases[-1]), share.tolist(), wanted, moving),
-                layers,
-            )
+        _check_moving(moving, source, layers)
+        results.append(
+            [
+                compute_intensity(
+                    IntensityRequest(
+                        (phase, level),
+                        each,
+                        share.tolist(),
+                        tolerance,
+                        mixing,
+                        layers,
+                        integrate,
+                        source,
+                        moving,
+                    )
+                )
+                for phase, level in zip(*lenses, strict=True)
+            ]
         )
-    light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
-    worst = max(
-        (result for row in found for result in row[1]), key=lambda result: result.whole
-    )
-    stack = _record(
-        light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance
-    )
-    power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
-    stack = _with_budget(stack, worst, power * cases[0].area_um2, cases, layers)
+    batch = (*shape[:-3], *[len(cases)] * several)
+    axes = depths, np.array(waves), share
+    stack = _record(results, batch, cases, axes, tolerance, layers)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
-_Given = tuple[
-    list[PropagationCase], list[float], DirectionRequest, MovingGeometry | None
-]  # cases and weights of the wavelengths of a direction
-_Found = tuple[torch.Tensor, list[IntensityResult], torch.Tensor]
-
-
-def _one_direction(
-    maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None
-) -> _Found:
-    """:func:`direction`, the sum of squares (…, depth), of 1 where it is that of all;
-    behind a stop each depth alone,
-    whose shadow on the pillars is another at every depth, if it lies before them."""
-    cases, weights, wanted, moving = given
-    inverse = cases[0].inverse_depths_per_um
-    shares = [inverse]
-    if layers is not None and layers.stop is not None:
-        if moving is not None:
+def _polarised(
+    maps: Maps,
+    polarisation: Polarisation,
+    neighbours: NeighbourRows | NeighbourJonesFactors | None,
+    pitch_um: float,
+) -> tuple[Maps, PolarizationMixing | None]:
+    """Maps with the coupling of neighbours, three of every wavelength where it turns
+    the polarisation; and the mixing of both polarisations, None for one scalar."""
+    if polarisation == "scalar":
+        if isinstance(neighbours, NeighbourJonesFactors):
             raise PropagationError(
-                "a stop has no derivatives in the geometry: give numbers"
+                "factors on both fields, but one scalar: give the rows, or polarisation = 'flux'"
             )
-        shares = (
-            [inverse] if layers.stop.distance_um == 0 else [(one,) for one in inverse]
+        if neighbours is not None:
+            maps = among.apply_scalar_coupling(*maps, neighbours, pitch_um)
+        return maps, None
+    if polarisation not in ("flux", "vector"):
+        raise PropagationError(
+            f"polarisation = {polarisation!r}: need one of scalar, flux, vector"
         )
-    found = []
-    for depths in shares:
-        seen = [
-            dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases
-        ]
-        found.append(compute_direction(maps, seen, weights, wanted, moving, layers))
-    light = (
-        found[0][0]
-        if len(found) == 1
-        else torch.cat([light for light, _, _ in found], -3)
-    )
-    results = [result for _, some, _ in found for result in some]
-    return light, results, torch.stack([power for _, _, power in found], -1)
+    if isinstance(neighbours, NeighbourRows):
+        neighbours = among.apply_jones_coupling(*maps, neighbours, pitch_um)
+    if neighbours is not None:
+        maps = apart_maps(maps, neighbours)
+    return maps, PolarizationMixing(polarisation == "flux", neighbours is not None)
+
+
+def _check_moving(
+    moving: MovingGeometry | None, source: Extent | None, layers: Layers | None
+) -> None:
+    """Refuse gradients in the geometry where there are none."""
+    if moving is None:
+        return
+    if source is not None:
+        raise PropagationError(
+            "a source of finite size has no derivatives in the geometry: give numbers, or a point"
+        )
+    if layers is not None and layers.stop is not None:
+        raise PropagationError(
+            "a stop has no derivatives in the geometry: give numbers"
+        )
 
 
 def _directions(angle_rad: Any) -> tuple[bool, Any]:
@@ -218,110 +234,38 @@ def _directions(angle_rad: Any) -> tuple[bool, Any]:
     return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
 
 
-def _with_window_of(
-    cases: list[PropagationCase], like: PropagationCase
-) -> list[PropagationCase]:
-    """The cases with the window of one of them."""
-    return [dataclasses.replace(one, centre_um=like.centre_um) for one in cases]
-
-
-def _coupled(
-    maps: tuple[torch.Tensor, torch.Tensor],
-    neighbours: NeighbourRows | NeighbourJonesFactors | None,
-    pitch_um: float,
-    wanted: DirectionRequest,
-) -> tuple[tuple[torch.Tensor, torch.Tensor], DirectionRequest]:
-    """The maps with the mean factor of unlike neighbours, or as they are and with it on
-    both fields.
-    """
-    if neighbours is None:
-        return maps, wanted
-    if isinstance(neighbours, NeighbourJonesFactors):
-        if wanted.polarisation == "scalar":
-            raise PropagationError(
-                "factors on both fields, but one scalar: give the rows, or polarisation = 'flux'"
-            )
-        return maps, dataclasses.replace(wanted, fields=neighbours)
-    if wanted.polarisation == "scalar":
-        return among.apply_scalar_coupling(*maps, neighbours, pitch_um), wanted
-    return maps, dataclasses.replace(
-        wanted, fields=among.apply_jones_coupling(*maps, neighbours, pitch_um)
-    )
-
-
-def _stop_error(
-    stack: PsfStack, share: Array, cases: list[PropagationCase], layers: Layers | None
-) -> float:
-    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan
-    without one.
-
-    share: (…, [angle,] depth) of the light that the windows hold.
-    """
-    if layers is None or layers.stop is None:
-        return math.nan
-    light = (
-        stack.intensity.detach()
-        .cpu()
-        .numpy()
-        .reshape(-1, len(cases), *stack.intensity.shape[-3:])
-    )
-    held = share.clip(1e-6, 1).reshape(light.shape[:-2])
-    blurs_um, found = blur_um(light, stack.step_um, held), []
-    for case, row, shares in zip(cases, blurs_um.max(0), held.min(0), strict=True):
-        rads = row / propagate.chief_path(case)
-        found += [
-            layers.shadow_error(case.tangents, z, w, rad, part)
-            for z, rad, part in zip(
-                stack.depths_um.tolist(), rads.tolist(), shares.tolist(), strict=True
-            )
-            for w in stack.wavelengths_um.tolist()
-        ]
-    return max(found)
-
-
-def _with_budget(
-    stack: PsfStack,
-    worst: IntensityResult,
-    whole: torch.Tensor,
-    cases: list[PropagationCase],
-    layers: Layers | None,
-) -> PsfStack:
-    """With its error by cause; whole: light that leaves the pillars towards the sensor
-    for unit irradiance, um².
-    """
-    share = (stack.energy_um2.detach().cpu().double() / whole).numpy()
-    outside, stop = (
-        max(0.0, 1 - float(share.min())),
-        _stop_error(stack, share, cases, layers),
-    )
-    parts = {
-        "sampling": worst.sampling,
-        "source": worst.source,
-        "polarisation": worst.rays,
-        "stop": stop,
-    }
-    return dataclasses.replace(
-        stack, budget=Budget(worst.error, outside=outside, **parts)
-    )
-
-
 def _record(
-    light: torch.Tensor,
+    by_direction: list[list[IntensityResult]],
+    batch: tuple[int, ...],
     cases: list[PropagationCase],
     axes: tuple[Array, Array, Array],
-    worst: IntensityResult,
     tolerance: float,
+    layers: Layers | None,
 ) -> PsfStack:
-    """The stack for intensities (…, depth, y, x), a case for each angle; axes are
+    """The stack of results by direction and lens; ``batch``: (…, [angle]); axes are
     depths, wavelengths, weights.
     """
+    rows = list(zip(*by_direction, strict=True))  # by lens, then by direction
+    results = [one for row in rows for one in row]
+    lights = [one.intensity for one in results]
+    light = lights[0][None] if len(lights) == 1 else torch.stack(lights)
+    light = light.view(*batch, *light.shape[1:])
     energy = light.sum((-1, -2))
-    error = worst.whole
-    divided = (
-        torch.div if light.requires_grad else torch.Tensor.div_
-    )  # in place where nothing else looks at it
+    power = np.reshape([one.power for one in results], energy.shape)
+    share = energy.detach().double().numpy() * cases[0].step_um ** 2
+    share = share / (power * cases[0].area_um2)
+    worst = max(results, key=lambda one: one.budget.computed)
+    error, dtype = worst.budget.computed, light.dtype
+    divide = torch.div if light.requires_grad else torch.Tensor.div_  # in place
+    reason = worst.reason
+    if error > tolerance:
+        reason += f"; {_above(worst, tolerance, dtype)}"
+    light = divide(light, energy[..., None, None])
+    budget = replace(worst.budget, outside=max(0.0, 1 - float(share.min())))
+    if layers is not None and layers.stop is not None:
+        budget = replace(budget, stop=_stop_error(light, share, cases, axes, layers))
     return PsfStack(
-        divided(light, energy[..., None, None]),
+        light,
         energy * cases[0].step_um ** 2,
         depths_um=axes[0],
         angles_rad=np.arctan([c.tangents for c in cases]),
@@ -332,9 +276,30 @@ def _record(
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
         error=error,
-        reason=worst.reason
-        if error <= tolerance
-        else f"{worst.reason}; {_above(worst, tolerance, light.dtype)}",
+        reason=reason,
+        budget=budget,
+    )
+
+
+def _stop_error(
+    psfs: torch.Tensor,
+    share: Array,
+    cases: list[PropagationCase],
+    axes: tuple[Array, Array, Array],
+    layers: Layers,
+) -> float:
+    """Error of the shadow of a stop, the worst over angles, depths and wavelengths;
+    share: of the light that the windows hold."""
+    light = psfs.detach().numpy().reshape(-1, len(cases), *psfs.shape[-3:])
+    share = share.clip(1e-6, 1).reshape(light.shape[:-2])
+    blurs_um = blur_um(light, cases[0].step_um, share)
+    return max(
+        layers.shadow_error(
+            case.tangents, z, wave, blur / propagate.chief_path(case), part
+        )
+        for case, blurs, parts in zip(cases, blurs_um.max(0), share.min(0), strict=True)
+        for z, blur, part in zip(axes[0].tolist(), blurs, parts, strict=True)
+        for wave in axes[1].tolist()
     )
 
 
@@ -345,9 +310,9 @@ def _above(worst: IntensityResult, tolerance: float, dtype: torch.dtype) -> str:
         more = ", give float64 maps" if dtype != torch.float64 else ""
         return f"above the tolerance: {str(dtype).removeprefix('torch.')} holds {least:.2g}{more}"
     terms = {
-        "sums": worst.error,
-        "integration over cells": worst.sampling,
-        "size of the source": worst.source,
+        "sums": worst.budget.numerical,
+        "integration over cells": worst.budget.sampling,
+        "size of the source": worst.budget.source,
     }
     return f"above the tolerance by its {max(terms, key=lambda name: terms[name])}"
 

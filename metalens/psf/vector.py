@@ -65,7 +65,7 @@ class PolarizationMixing:
         self, case: PropagationCase, at_um: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """(components,) signs and (components, map, y, x) factors."""
-        order = order_behind(case)
+        order = case.media.order
         first, b = rays_to(case, at_um, order[0]), rays_to(case, at_um)
         steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
         a = torch.tensor(
@@ -91,8 +91,8 @@ class PolarizationMixing:
         else:
             factors = factors * math.sqrt(0.5)
         size = np.abs(factors).max((1, 2, 3))
-        lit = size > NOTHING * size.max()
-        return signs[lit], factors[lit]
+        nonzero = size > NOTHING * size.max()
+        return signs[nonzero], factors[nonzero]
 
     def power(
         self, case: PropagationCase, powers: Sequence[float], levels: Tensor
@@ -135,23 +135,13 @@ class PolarizationMixing:
         return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
 
 
-def order_behind(case: PropagationCase) -> tuple[float, ...]:
-    """Indices of the media from the pillars to the sensor; 1 for one medium, whose
-    wavelength is its own.
-
-    Args:
-        case: maps, geometry and window of the propagation.
-    """
-    return (1.0,) if case.behind is None else case.behind.order
-
-
 def has_faces(case: PropagationCase) -> bool:
     """Whether light goes from one medium to another behind the lens.
 
     Args:
         case: maps, geometry and window of the propagation.
     """
-    return len(set(order_behind(case))) > 1
+    return len(set(case.media.order)) > 1
 
 
 def rays_to(
@@ -169,7 +159,7 @@ def rays_to(
         at_um[1][None, :] - case.centre_um[0],
         (at_um[0] - case.centre_um[1])[:, None],
     )
-    n = index or order_behind(case)[-1]
+    n = index or case.media.order[-1]
     p, q = (
         torch.as_tensor(-ray_cosines(case, *at) / n)
         for at in ((across, down), (down, across))
@@ -236,9 +226,9 @@ def apart_maps(
     and between, of (…, wavelength, y,
     x) maps of pillars with factors ``fields`` on the light that comes."""
     phase, level = (one.unsqueeze(-3) for one in maps)
-    answered = torch.stack([fields.xx, fields.yy, fields.xy], -3)
-    return (phase + torch.angle(answered)).flatten(-4, -3), (
-        level * answered.abs()
+    responses = torch.stack([fields.xx, fields.yy, fields.xy], -3)
+    return (phase + torch.angle(responses)).flatten(-4, -3), (
+        level * responses.abs()
     ).flatten(-4, -3)
 
 

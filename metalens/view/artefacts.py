@@ -288,9 +288,7 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
 
 def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> TablePanel:
     """The error of the PSFs by cause; what is not known of a cause is a dash."""
-    held = [
-        dataclasses.asdict(stack.budget or psf.Budget(stack.error)) for stack in stacks
-    ]
+    held = [dataclasses.asdict(stack.budget) for stack in stacks]
     rows = [
         (
             report.in_words(cause),

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from metalens import propagate, psf
-from metalens.core import store
 from metalens.core.errors import PropagationError
 from metalens.optics import Layers
 from metalens.psf import of_lens, spectrum
@@ -221,7 +220,7 @@ def test_light_beside_the_window_is_said():
     )
 
 
-def test_the_budget_is_kept_in_the_file_and_older_files_read_as_before(tmp_path):
+def test_the_budget_is_kept_in_the_file(tmp_path):
     stack = psf.psf_stack(*lens(90.0), **geometry(90.0))
     made = dataclasses.replace(
         stack.budget, spectrum=3e-3, polarisation=0.02, glass=0.001
@@ -236,18 +235,6 @@ def test_the_budget_is_kept_in_the_file_and_older_files_read_as_before(tmp_path)
     )
     assert math.isnan(back.neighbours)
     assert back.total == pytest.approx(math.hypot(back.numerical, 3e-3, 0.02, 0.001))
-    stored = store.load(tmp_path / "psf.h5", "psf")
-    about = {
-        name: value
-        for name, value in stored.attributes.items()
-        if not name.startswith("budget_")
-    }
-    kept = {
-        n: about[n]
-        for n in ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
-    }
-    store.save(tmp_path / "old.h5", "psf", stored.arrays, attributes=kept)
-    assert psf.load(tmp_path / "old.h5").budget.numerical == stack.error
 
 
 @pytest.mark.parametrize("tolerance", [0.0, -1e-4, math.nan])

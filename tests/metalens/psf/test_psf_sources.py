@@ -225,7 +225,7 @@ def test_depths_in_shares_are_the_same_psfs(monkeypatch):
     """A share has a plan of its own, which meets the tolerance of 1e-4 on its own; the
     estimates are of each share.
     """
-    from metalens.psf import direction
+    from metalens.psf import intensity
 
     given = dict(
         **GEOMETRY,
@@ -235,7 +235,7 @@ def test_depths_in_shares_are_the_same_psfs(monkeypatch):
         samples=10,
     )
     whole = psf.psf_stack(*lens(), **given)
-    monkeypatch.setattr(direction, "HELD_BYTES", 1.0)
+    monkeypatch.setattr(intensity, "HELD_BYTES", 1.0)
     parts = psf.psf_stack(*lens(), **given)
     assert "7 shares" in parts.reason
     assert "integrated" in parts.reason

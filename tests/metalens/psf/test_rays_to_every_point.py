@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from metalens import psf
-from metalens.propagate import estimate
 
 PITCH, WAVE, DISTANCE, DEPTH = 0.41, 0.87, 21.0, 170.0
 TANGENTS = np.array([0.21, -0.33])
@@ -118,15 +117,3 @@ def test_what_rays_to_the_middle_leave_out_is_in_the_budget(kind, method):
 
 def test_one_scalar_says_nothing_of_it():
     assert np.isnan(stack(*maps(), "scalar").budget.polarisation)
-
-
-@pytest.mark.parametrize("shape", [(37, 44), (9, 44)])
-def test_factors_on_few_nodes_are_those_of_every_node(shape, monkeypatch):
-    """Rays of up to 45 degrees: 12 nodes an axis leave 1e-4 of the difference; fewer
-    sites are taken as they are.
-    """
-    phase, level = maps(shape)
-    coarse = stack(phase, level, "flux", tolerance=1e-6).budget.polarisation
-    monkeypatch.setattr(estimate, "FACTORS", 10**6)
-    every = stack(phase, level, "flux", tolerance=1e-6).budget.polarisation
-    assert coarse == pytest.approx(every, rel=1e-4)

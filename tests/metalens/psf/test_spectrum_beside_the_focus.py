@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index
-from metalens.lens import DiameterMap, Lens, response
+from metalens.lens import DiameterMap, Lens
 from metalens.library import Proxy
 from metalens.psf import SpectralNodes, View, from_lens, spectrum
-from metalens.psf.of_lens import PILOT, light_shares, paths_um
+from metalens.psf.of_lens import paths_um
 
 PHASE = np.array(
     [[0.0, 1.15 * math.pi], [-0.4, -1.9]]
@@ -104,59 +104,6 @@ def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
         assert error <= found.budget.spectrum
         errors.append(found.budget.spectrum)
     assert errors[1] > 2 * errors[0]
-
-
-def test_light_is_shared_out_to_the_nearest_places():
-    light = np.zeros((2, 5, 9))
-    light[0, 0, 3], light[1, 3, 8], light[1, 2, 4] = 1.0, 2.0, 3.0
-    found = light_shares(light, (3, 5)) * 14
-    want = np.zeros((2, 3, 5))
-    want[0, 0, 2], want[1, 2, 4], want[1, 1, 2] = (
-        1.0,
-        4.0,
-        9.0,
-    )  # 3 lies half-way between 2 and 4
-    assert found == pytest.approx(want)
-    assert light_shares(light[:, :1, :1] + 1, (1, 1)).sum() == pytest.approx(1.0)
-
-
-def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light(
-    monkeypatch,
-):
-    """Paths of some 20 um ask for more wavelengths than twice the pilot's; no second
-    try of nearly as many.
-    """
-    made, waves = lens(241, 42.0), []
-    plain = response.fill_response
-    monkeypatch.setattr(
-        response,
-        "fill_response",
-        lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)),
-    )
-    um = np.linspace(0.805, 0.895, 25)
-    share = np.exp(-4 * np.log(2) * ((um - 0.849) / 0.031) ** 2)
-    source = spectrum.MeasuredSpectrum(um, share / share.sum())
-    found = from_lens(
-        made,
-        View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),
-        tolerance=1e-4,
-        spectrum=source,
-    )
-    assert len(found.wavelengths_um) > 2 * PILOT
-    assert found.budget.spectrum <= 5e-5
-    assert len(waves) == PILOT + len(found.wavelengths_um)
-    fine = SpectralNodes(um, source.share, 0.0)
-    want = from_lens(
-        made,
-        View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),
-        tolerance=1e-5,
-        spectrum=fine,
-    )
-    assert (
-        np.linalg.norm(found.intensity - want.intensity)
-        / np.linalg.norm(want.intensity)
-        <= found.error
-    )
 
 
 @pytest.mark.parametrize("offset", [(3.0, 21.0), (-17.0, 5.0)])

@@ -1,10 +1,8 @@
-"""The method for a case at a tolerance; plans of the last cases are kept."""
+"""The method for a case at a tolerance, and why."""
 
 import functools
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -12,14 +10,13 @@ from metalens.core.arrays import to_tensor
 from metalens.core.errors import PropagationError
 from metalens.core.threads import one_blas_thread
 from metalens.propagate.geometry import PropagationCase, make_case, split_window
-from metalens.propagate.wide import WidePlan, is_wide, wide_plan
+from metalens.propagate.wide import is_wide
 from metalens.propagate.window import (
     MOST_NODES,
     WindowLayout,
-    WindowPlan,
     field_windowed,
     plan_layout,
-    window_plan,
+    plan_window,
 )
 
 EXACT_WORK = 3e7  # pillars x samples x depths below which the exact sum is as quick
@@ -106,77 +103,6 @@ def _layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
         return None
 
 
-KEPT_BYTES = 400e6  # of plans that are kept
-
-
-Kept = TypeVar("Kept", WindowPlan, WidePlan)
-
-
-_kept: dict[tuple[Any, ...], Any] = {}  # used last at the end
-
-
-_lock = threading.Lock()
-
-
-def plan_window(
-    case: PropagationCase,
-    tolerance: float,
-    dtype: torch.dtype,
-    moving: bool = False,
-    *,
-    smooth: bool = False,
-) -> WindowPlan:
-    """Plan a windowed propagation; those used last are kept, as many as fit in
-    ``KEPT_BYTES``.
-
-    Args:
-        case, tolerance: geometry, and relative error of the field.
-        dtype: of the maps; sums over blocks of pillars are in float64.
-        moving: for use with :class:`MovingGeometry`.
-        smooth: with factors (``Pupils``) on the light of the nodes.
-
-    Raises:
-        PropagationError: the window is too large for the method.
-    """
-    make = functools.partial(
-        window_plan, case, tolerance, dtype, moving=moving, smooth=smooth
-    )
-    return _keep((case, tolerance, dtype, moving, smooth), make)
-
-
-def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> WidePlan:
-    """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
-
-    Args:
-        case, tolerance: geometry, and relative error of the field.
-        dtype: of the maps and of the transforms.
-
-    Raises:
-        PropagationError: rays too steep for the method.
-    """
-    made = functools.partial(wide_plan, case, tolerance, dtype)
-    return _keep((case, tolerance, dtype, "wide"), made)
-
-
-def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
-    """The plan that is kept under a key, or a new one."""
-    with _lock:
-        found = _kept.pop(key, None)
-        if found is not None:
-            _kept[key] = found
-            return found  # type: ignore[no-any-return]
-    with one_blas_thread():
-        found = made()
-    with _lock:
-        _kept[key] = found
-        room = KEPT_BYTES
-        for other in reversed(list(_kept)):
-            room -= _kept[other].bytes
-            if room < 0 and other != key:
-                del _kept[other]
-    return found
-
-
 def windowed(
     phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **geometry: Any
 ) -> Any:
@@ -206,7 +132,7 @@ def windowed(
         )
     phase = to_tensor(phase_rad)
     level = to_tensor(transmission).to(phase)
-    made = plan_window(make_case(phase.shape, **geometry), tolerance, torch.float64)
-    field = field_windowed(phase.double(), level.double(), made)
+    plan = plan_window(make_case(phase.shape, **geometry), tolerance, torch.float64)
+    field = field_windowed(phase.double(), level.double(), plan)
     field = field.to(torch.complex(phase.new_zeros(()), phase.new_zeros(())).dtype)
     return field if isinstance(phase_rad, torch.Tensor) else field.detach().numpy()

@@ -1,0 +1,508 @@
+"""Irradiance of one lens in one direction by the cheapest method, repeated at a tighter
+setting until its measured error is within the tolerance.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from metalens.core.arrays import Array
+from metalens.core.errors import PropagationError
+from metalens.optics import Layers, media
+from metalens.propagate import (
+    SHARE,
+    MethodChoice,
+    MovingGeometry,
+    NodeLight,
+    PropagationCase,
+    Pupils,
+    check_aperture,
+    chief_path,
+    choose_method,
+    field_exact,
+    light_wide,
+    light_windowed,
+    mix_components,
+    paths,
+    plan_wide,
+    plan_window,
+    pupil_error,
+    relative_error,
+)
+from metalens.psf import extended
+from metalens.psf.budget import Budget, worst_of_budgets
+from metalens.psf.cells import (
+    FINER,
+    MOST,
+    PixelCells,
+    integrate_cells,
+    plan_pixel_cells,
+)
+from metalens.psf.extended import Extent
+from metalens.psf.vector import PolarizationMixing, has_faces, s_and_p
+
+# standard deviation of a pillar's phasor and relative error of three transforms, by
+# rounding, several times the machine epsilon of the maps
+ROUNDING = {torch.float32: (8e-7, 1e-6), torch.float64: (1e-11, 5e-15)}
+EXACT = 4e-12  # rounding of exact sums in float64
+FEW = 64  # samples whose rounding has no mean: their pillars are added in float64
+TIGHTEST = 1e-12  # setting below which float64 has nothing left to give
+MOVING = 1000  # tighter setting: parts of a derivative in the geometry nearly cancel
+HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once
+SAMPLE_BYTES = 18  # for each sample and depth, per byte of a number of the maps
+CELLS = 0.5  # of the tolerance, for the integration over cells; the rest is the sums
+STRICTER = 4  # tolerance of point PSFs, whose differences judge a finite source
+
+Maps = tuple[torch.Tensor, torch.Tensor]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class IntensityRequest:
+    """Which PSFs of one lens are computed, in one direction.
+
+    maps: (wavelength · map, y, x) phase and transmission of the pillars.
+    cases, weights: of the wavelengths, alike in direction, depths and window.
+    tolerance: relative L2 error of the PSFs.
+    mixing: of both polarisations; None for |U|² of one scalar.
+    layers: whose stop lays its shadow on the maps.
+    integrate, source: as in :func:`metalens.psf.psf_stack`.
+    moving: geometry with gradients, or None.
+    """
+
+    maps: Maps
+    cases: list[PropagationCase]
+    weights: list[float]
+    tolerance: float
+    mixing: PolarizationMixing | None = None
+    layers: Layers | None = None
+    integrate: bool = True
+    source: Extent | None = None
+    moving: MovingGeometry | None = None
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether a gradient is wanted in the maps or in the geometry."""
+        return self.moving is not None or any(m.requires_grad for m in self.maps)
+
+    @property
+    def map_count(self) -> int:
+        """Maps of every wavelength."""
+        return 1 if self.mixing is None else self.mixing.maps
+
+    @property
+    def behind_stop(self) -> bool:
+        """Whether the light of each depth meets another shadow on the pillars."""
+        stop = None if self.layers is None else self.layers.stop
+        return stop is not None and stop.distance_um > 0
+
+    def at(self, like: PropagationCase, tolerance: float) -> "IntensityRequest":
+        """The same with the direction, depths and window of a case."""
+        names = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
+        cases = [replace(c, **{n: getattr(like, n) for n in names}) for c in self.cases]
+        return replace(self, cases=cases, tolerance=tolerance)
+
+    def shaded(self) -> "IntensityRequest":
+        """The same with the maps as the light of the first depth meets them."""
+        if self.layers is None or self.layers.stop is None:
+            return self
+        shadows = [_shadow(case, self.layers) for case in self.cases]
+        shadow = torch.from_numpy(np.repeat(shadows, self.map_count, 0))
+        phase, level = self.maps
+        maps = phase + shadow.angle().to(phase), level * shadow.abs().to(level)
+        return replace(self, maps=maps, layers=None)
+
+    def each(self) -> Iterator[tuple[Maps, PropagationCase, float, Pupils | None]]:
+        """(maps, case, weight, mixing) of every wavelength."""
+        count, (phase, level) = self.map_count, self.maps
+        for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
+            some = slice(i * count, (i + 1) * count)
+            pupils = None if self.mixing is None else self.mixing.pupils(case)
+            yield (phase[some], level[some]), case, weight, pupils
+
+    @property
+    def films_error(self) -> float:
+        """Relative L2 error of the kernel through films, the worst over wavelengths."""
+        return max(
+            paths.films_error(case, maps[1].detach()[0].numpy())
+            for maps, case, _, _ in self.each()
+        )
+
+    @property
+    def own_mixing(self) -> Callable[[PropagationCase], Pupils] | None:
+        """Mixing by the rays to a single point, with which the window's is compared; of
+        s and p where a scalar meets faces of films."""
+        if self.mixing is not None:
+            return self.mixing.pupils
+        return s_and_p if has_faces(self.cases[0]) else None
+
+    def power(
+        self, case: PropagationCase, powers: list[float], level: torch.Tensor
+    ) -> float:
+        """Power behind the pillars, from the sums of squares of the maps ``level``."""
+        if self.mixing is None:
+            return powers[0]
+        return self.mixing.power(case, powers, level)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class IntensityResult:
+    """Irradiance on a window and its error by cause.
+
+    intensity: (depth, y, x). reason: method, and why it stopped.
+    power: (depth,) sum of squares of what the pillars let through the faces behind
+    them, wavelengths weighted.
+    """
+
+    intensity: torch.Tensor
+    budget: Budget
+    reason: str
+    power: Array
+
+
+def _shadow(case: PropagationCase, layers: Layers) -> Array:
+    """(y, x) complex amplitude of the light of a case's first depth at each pillar,
+    over that without the stop.
+    """
+    y, x = case.pillars_um
+    inverse = case.inverse_depths_per_um[0]
+    depth = 1 / inverse if inverse else math.inf
+    width = math.sqrt(case.area_um2)
+    return layers.shadow(
+        case.tangents, depth, case.wavelength_um, (x, y[:, None]), width
+    )
+
+
+def compute_intensity(request: IntensityRequest) -> IntensityResult:
+    """Irradiance on the window, cells as fine as they must be, with its error by cause.
+
+    Cells wider than Nyquist's step are integrated over points inside them. Depths are
+    taken so many at a time as memory holds, and one by one behind a stop.
+
+    Args:
+        request: lens, direction, depths and window.
+
+    Raises:
+        PropagationError: no light in the window, empty or infinite maps, too many
+            samples.
+    """
+    shortest = min(request.cases, key=lambda case: case.wavelength_um)
+    wanted = request.tolerance
+    for finer in FINER:
+        fine = PixelCells(1, shortest)
+        if request.integrate:
+            fine = plan_pixel_cells(shortest, finer)
+        wide = fine.case
+        if request.source is not None:
+            wide = extended.widen_case(wide, request.source)[0]
+        if max(wide.samples) > MOST and fine.points > 1:
+            raise PropagationError(
+                f"cells of {fine.points} points in {wide.samples} samples: give a smaller window"
+            )
+        own = wanted if fine.points == 1 else wanted * math.sqrt(1 - CELLS**2)
+        shares = [
+            _on_cells(request.at(some, own), some, fine)
+            for some in _shares(wide, request)
+        ]
+        budget = worst_of_budgets([one.budget for one in shares])
+        if budget.sampling <= CELLS * wanted or max(fine.case.samples) > MOST / 2:
+            break
+    reason = max(shares, key=lambda one: one.budget.numerical).reason
+    if len(shares) > 1:
+        reason += f"; depths in {len(shares)} shares"
+    if fine.points > 1:
+        reason += (
+            f"; light integrated over cells of {fine.points} x {fine.points} points"
+        )
+    light = [one.intensity for one in shares]
+    power = np.concatenate([one.power for one in shares])
+    whole = light[0] if len(light) == 1 else torch.cat(light)
+    return IntensityResult(whole, budget, reason, power * _passed(request.cases[0]))
+
+
+def _passed(case: PropagationCase) -> float:
+    """Power that the faces behind the lens let through along the chief ray."""
+    steep = 1 + case.tangents[0] ** 2 + case.tangents[1] ** 2
+    return float(media.passed_at(case.media.order, 1 - 1 / steep))
+
+
+def _shares(
+    wide: PropagationCase, request: IntensityRequest
+) -> Iterator[PropagationCase]:
+    """The case with as many of its depths as fit in ``HELD_BYTES``, in even shares; all
+    where gradients hold them anyway; one by one behind a stop.
+    """
+    inverse, count = wide.inverse_depths_per_um, 1
+    if request.behind_stop:
+        count = len(inverse)
+    elif not request.differentiable:
+        itemsize = request.maps[0].element_size()
+        each = math.prod(wide.samples) * SAMPLE_BYTES * itemsize
+        count = -(-len(inverse) // max(1, int(HELD_BYTES / each)))
+    for i in range(count):
+        some = slice(len(inverse) * i // count, len(inverse) * (i + 1) // count)
+        yield replace(wide, inverse_depths_per_um=inverse[some])
+
+
+def _on_cells(
+    request: IntensityRequest, some: PropagationCase, fine: PixelCells
+) -> IntensityResult:
+    """Irradiance of some depths on the samples of the window, blurred by the source and
+    integrated over the cells."""
+    source = request.source
+    result = _blurred(request, some, fine, source) if source else _of_point(request)
+    if fine.points > 1:
+        light, sampling = integrate_cells(result.intensity, fine)
+        budget = replace(result.budget, sampling=sampling)
+        result = replace(result, intensity=light, budget=budget)
+    return result
+
+
+def _blurred(
+    request: IntensityRequest, some: PropagationCase, fine: PixelCells, source: Extent
+) -> IntensityResult:
+    """Of a source of finite size, on the samples of the cells."""
+
+    def point(case: PropagationCase) -> IntensityResult:
+        return _of_point(request.at(case, request.tolerance / STRICTER))
+
+    result = point(some)
+    down, across = (
+        (n - m) // 2 for n, m in zip(some.samples, fine.case.samples, strict=True)
+    )
+    light, edge = extended.blur_by_source(
+        result.intensity, some, source, (down, across)
+    )
+    with torch.no_grad():
+        varied = extended.shift_invariance_error(
+            result.intensity, some, source, lambda case: point(case).intensity
+        )
+    budget = replace(result.budget, source=math.hypot(edge, varied))
+    reason = f"{result.reason}; blurred by a {source.shape} source"
+    return replace(result, intensity=light, budget=budget, reason=reason)
+
+
+def _of_point(request: IntensityRequest) -> IntensityResult:
+    """|U|² on the samples of a point source, wavelengths added with their weights.
+
+    Pillars are added in the precision of their maps where that holds the tolerance, all
+    later sums in float64. The result of the last try is returned with its estimate in
+    any case.
+    """
+    request = request.shaded()
+    phase, case, tolerance = request.maps[0], request.cases[0], request.tolerance
+    moving = request.moving is not None
+    rest = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
+
+    def finish(result: IntensityResult) -> IntensityResult:
+        """In the precision of the maps, with what rounding and films add."""
+        error = math.hypot(result.budget.numerical, rest)
+        budget = replace(result.budget, numerical=error)
+        light = result.intensity.to(phase.dtype)
+        return replace(result, intensity=light, budget=budget)
+
+    if not request.differentiable:
+        setting = max(tolerance / 2, TIGHTEST)
+        choices = [choose_method(one, setting) for one in request.cases]
+        if all(choice.method == "exact" for choice in choices):
+            return finish(_exact(request, choices[0].reason))
+    first = phase.dtype if tolerance > 1e-6 else torch.float64
+    if math.prod(case.samples) < FEW or moving:
+        first = torch.float64
+    start = tolerance / 2
+    if moving:
+        start = tolerance / MOVING
+    elif request.differentiable:  # gradients hold the kernel's error pillar by pillar
+        start = max(tolerance / 32, min(tolerance / 8, 1e-6))
+    tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
+    for setting, dtype in tries:
+        result = finish(_windowed(request, dtype, max(setting, TIGHTEST)))
+        if result.budget.numerical <= tolerance:
+            break
+    return result
+
+
+def _exact(request: IntensityRequest, reason: str) -> IntensityResult:
+    """The exact sum over pillars, of every component of the light."""
+    total: Any = 0.0
+    power, noise, checked = 0.0, 0.0, []
+    for (phase, level), case, weight, pupils in request.each():
+        phase, level = phase.double(), level.double()
+        powers = (level**2).sum((-1, -2)).tolist()
+        power += weight * request.power(case, powers, level)
+        turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
+        turns += float((phase.abs() * (level != 0)).max())
+        rounding = np.finfo(float).eps / 2 * turns
+        noise = max(noise, rounding * _incoherent(sum(powers), case))
+        if request.own_mixing is not None:
+            checked.append(_pillar_light((phase, level), case, weight, pupils))
+        for sign, light in mix_components(
+            torch.polar(level, phase), pupils, case.pillars_um
+        ):
+            field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
+            total = total + weight * sign * np.abs(field) ** 2
+    error = math.hypot(EXACT, _noise_error(total, noise))
+    budget = _with_rays(error, request, [checked], [total])
+    return IntensityResult(
+        torch.as_tensor(total), budget, reason, np.full(len(total), power)
+    )
+
+
+def _noise_error(light: Array, noise: float) -> float:
+    """Twice the relative L2 error of PSFs by noise of this size on the field of
+    ``light`` (depth, y, x): its part along the field, 2 Re U* n."""
+    whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
+    share, square = light / whole[:, None, None], 2 * noise**2 / whole
+    return 2 * math.sqrt(float(square.sum() / (share**2).sum()))
+
+
+def _pillar_light(
+    maps: Maps, case: PropagationCase, weight: float, pupils: Pupils | None
+) -> NodeLight:
+    """Light of all pillars with its carrier taken off, to be checked."""
+    y, x = case.pillars_um
+    path = paths.from_source(
+        case, x, y[:, None], case.tangents, paths.reference_depth(case)
+    )
+    turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
+    light = torch.polar(maps[1], maps[0] + torch.as_tensor(turn)).numpy()
+    at = None if pupils is None else pupils(y, x)
+    return NodeLight(case, weight, light, (y, x), 0.0, pupils=at)
+
+
+def _with_rays(
+    error: float,
+    request: IntensityRequest,
+    checked: list[list[NodeLight]],
+    light: list[Any],
+) -> Budget:
+    """Error of the sums, and of one polarisation mixing for the whole window."""
+    own = request.own_mixing
+    rays = math.nan if own is None else pupil_error(checked, light, own)
+    return Budget(error, polarisation=rays)
+
+
+def _windowed(
+    request: IntensityRequest, dtype: torch.dtype, tolerance: float
+) -> IntensityResult:
+    """One try: every wavelength and part of the window, then the measured error.
+
+    Raises:
+        PropagationError: no light in the window.
+    """
+    moving = request.moving
+    choice = choose_method(
+        request.cases[0], tolerance, differentiable=True, moving=moving is not None
+    )
+    is_wide = choice.method == "wide"
+    checked: list[list[NodeLight]] = [[] for row in choice.tiles for _ in row]
+    parts: list[Any] = [0] * len(checked)
+    whole_power = 0.0
+    for maps, case, weight, pupils in request.each():
+        for i, window in enumerate(_windows(case, choice, tolerance)):
+            plan: Any
+            if is_wide:
+                plan = plan_wide(window, tolerance, dtype)
+                light, nodes, powers = light_wide(maps, plan, pupils)
+            else:
+                smooth = pupils is not None
+                plan = plan_window(
+                    window, tolerance, dtype, moving is not None, smooth=smooth
+                )
+                shifted = _shifted(moving, case, window)
+                light, nodes, powers = light_windowed(maps, plan, shifted, pupils)
+            _check(maps, case, sum(powers), nodes)
+            at_um = plan.judged_um
+            at = None if pupils is None else pupils(*at_um)
+            rounding = plan.moments.carrier.rounding_rad
+            noise = math.hypot(ROUNDING[dtype][0], tolerance / SHARE, rounding)
+            noise *= _incoherent(_noisy_power(powers, at), case)
+            cut = 1 if is_wide else plan.layout.parts
+            checked[i].append(NodeLight(window, weight, nodes, at_um, noise, cut, at))
+            light = light if weight == 1 else weight * light
+            parts[i] = light if isinstance(parts[i], int) else parts[i] + light
+        whole_power += weight * request.power(case, powers, maps[1])
+    light_of_parts = [part.detach().numpy() for part in parts]
+    rows, first = [], 0
+    for row in choice.tiles:
+        rows.append(_joined(parts[first : first + len(row)], -1))
+        first += len(row)
+    total = _joined(rows, -2)
+    if not bool((total.detach().sum((-1, -2)) > 0).all()):
+        raise PropagationError(
+            "no light reaches the window at some depth; move or widen the window"
+        )
+    error = relative_error(checked, light_of_parts)
+    if is_wide:
+        error = math.hypot(error, ROUNDING[dtype][1])
+    budget = _with_rays(error, request, checked, light_of_parts)
+    return IntensityResult(
+        total, budget, choice.reason, np.full(len(total), whole_power)
+    )
+
+
+def _joined(parts: list[torch.Tensor], axis: int) -> torch.Tensor:
+    """Parts in a row, without a copy of a single one."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, axis)
+
+
+def _noisy_power(powers: list[float], at: tuple[Array, Array] | None) -> float:
+    """Sum of squares of the transmission of all components, each factor at its largest:
+    what rounds."""
+    if at is None:
+        return powers[0]
+    return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
+
+
+def _windows(
+    case: PropagationCase, choice: MethodChoice, tolerance: float
+) -> list[PropagationCase]:
+    """Parts of the window of a wavelength, cut as at the first wavelength."""
+    if choice.method == "wide":
+        return [case]
+    tiles = choose_method(case, tolerance, differentiable=True, moving=True).tiles
+    if [len(row) for row in tiles] != [len(row) for row in choice.tiles]:
+        tiles = choice.tiles
+    return [
+        replace(case, centre_um=part.centre_um, samples=part.samples)
+        for row in tiles
+        for part in row
+    ]
+
+
+def _check(maps: Maps, case: PropagationCase, power: float, nodes: Array) -> None:
+    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars
+    tell.
+
+    Raises:
+        PropagationError: naming row and column.
+    """
+    finite = math.isfinite(power) and bool(np.isfinite(nodes).all())
+    if finite and power > 0:
+        return
+    check_aperture(maps[0][0].detach().numpy(), maps[1][0].detach().numpy(), case)
+    if not finite:
+        raise PropagationError(
+            "phase or transmission is too large for its dtype; use float64, or wrap the phase"
+        )
+
+
+def _shifted(
+    moving: MovingGeometry | None, case: PropagationCase, tile: PropagationCase
+) -> MovingGeometry | None:
+    """Moving geometry as a tile of the window has it."""
+    if moving is None or tile.centre_um == case.centre_um:
+        return moving
+    shift = np.subtract(tile.centre_um, case.centre_um)
+    return replace(moving, centre=moving.centre + torch.from_numpy(shift))
+
+
+def _incoherent(power: float, case: PropagationCase) -> float:
+    """Magnitude of the field at the window centre if all pillars added with random
+    phases.
+    """
+    near = case.sensor_distance_um * case.wavenumber / (2 * math.pi)
+    return math.sqrt(power) * case.area_um2 * near / chief_path(case) ** 2
