@@ -228,11 +228,15 @@ def interpolate_table(
         tolerance: of t; sets the residual of the rational fits.
     """
     (x, y), (at_x, at_y) = nodes, places
-    first = _both(x, y, values, at_x, at_y, tolerance)
-    second = _both(y, x, values.swapaxes(0, 1), at_y, at_x, tolerance).swapaxes(0, 1)
+    first = _interpolate_in_turn(x, y, values, at_x, at_y, tolerance)
+    second = _interpolate_in_turn(
+        y, x, values.swapaxes(0, 1), at_y, at_x, tolerance
+    ).swapaxes(0, 1)
     difference = np.abs(first - second).max(axis=-1)
-    row, column = _fewer(len(x)), _fewer(len(y))
-    rival = _both(x[row], y[column], values[np.ix_(row, column)], at_x, at_y, tolerance)
+    row, column = _rival_nodes(len(x)), _rival_nodes(len(y))
+    rival = _interpolate_in_turn(
+        x[row], y[column], values[np.ix_(row, column)], at_x, at_y, tolerance
+    )
     difference = np.maximum(
         difference, np.abs(rival - (first + second) / 2).max(axis=-1)
     )
@@ -245,7 +249,7 @@ def interpolate_table(
     )
 
 
-def _fewer(count: int) -> Array:
+def _rival_nodes(count: int) -> Array:
     """Places of the nodes of the rival: one in four inner ones is left out."""
     place = np.arange(count)
     return np.asarray(place[(place % 4 != 2) | (place == count - 1)])
@@ -260,7 +264,7 @@ def _half_gap(nodes: Array, places: Array) -> int:
     )
 
 
-def _both(
+def _interpolate_in_turn(
     x: Array, y: Array, values: Array, at_x: Array, at_y: Array, tolerance: float
 ) -> Array:
     """Along x on every line of nodes, then along y: (p, q, components)."""
@@ -390,20 +394,20 @@ def sweep_two_sizes(
     console = console or Console(quiet=True)
     journal = SweepJournal(checkpoint, cell, settings)
     places = size_entries(settings)
-    reach = _reach(cell, settings)
+    reach = _choose_truncation(cell, settings)
     t, error, held, solves = [], [], [], 0
     for index, wavelength in enumerate(settings.wavelengths_um):
         nodes = _Nodes(cell, settings, wavelength, reach, journal)
-        x, y = _lines(nodes, settings, console)
+        x, y = _choose_lines(nodes, settings, console)
         values, bars = nodes.grid(x, y, console, "pillars")
         made = interpolate_table((x, y), values, places, tolerance=settings.bar)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
         # half of the pairs held out scale the bars, the other half judges them
         wide = max(0.5, 2 * float((judged[::2, 2] / judged[::2, 3]).max()))
         bar = np.minimum(
-            wide * made.doubt + _carried((x, y), bars, places, made.value), 2.0
+            wide * made.doubt + _solver_error((x, y), bars, places, made.value), 2.0
         )
-        row, column = _spread(places)
+        row, column = _held_out_places(places)
         judged[:, 3] = bar[row, column]
         t.append(made.value.reshape(*made.doubt.shape, 2, 2))
         error.append(bar)
@@ -437,7 +441,7 @@ def size_entries(sweep: Sweep) -> tuple[Array, Array]:
     )  # the last one, to rounding
 
 
-def _reach(cell: Cell, sweep: Sweep) -> int:
+def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
     """The least truncation whose bars meet the solver's share at four probes, or the
     largest there is.
     """
@@ -459,7 +463,7 @@ def _reach(cell: Cell, sweep: Sweep) -> int:
     return most
 
 
-def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
+def _choose_lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
     """Nodes along x and y: Chebyshev's, and lines between them where the interpolations
     disagree most.
     """
@@ -481,10 +485,10 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
         profiles = [some.mean(axis=1), some.mean(axis=0)]
         if nodes.swaps:
             profiles = [profiles[0] + profiles[1]] * 2
-        lines = [_more(*pair) for pair in zip(lines, look, profiles, strict=True)]
+        lines = [_add_lines(*pair) for pair in zip(lines, look, profiles, strict=True)]
 
 
-def _more(lines: Array, look: Array, profile: Array) -> Array:
+def _add_lines(lines: Array, look: Array, profile: Array) -> Array:
     """Nodes with some more, in the gaps over which the doubt adds up to most."""
     for _ in range(2):
         gaps = [
@@ -506,7 +510,7 @@ def _held_out(
     """(k, 4) x, y, error and doubt of the interpolation at the entries that are held
     out.
     """
-    row, column = _spread(places)
+    row, column = _held_out_places(places)
     pairs = [
         (float(places[0][i]), float(places[1][j]))
         for i, j in zip(row, column, strict=True)
@@ -516,7 +520,7 @@ def _held_out(
     return np.column_stack([np.array(pairs), missed, doubt[row, column]])
 
 
-def _spread(places: tuple[Array, Array]) -> tuple[Array, Array]:
+def _held_out_places(places: tuple[Array, Array]) -> tuple[Array, Array]:
     """Entries that spread over the plane (Roberts's sequence)."""
     growth = 1.324717957244746  # its cube is itself plus one
     steps = np.outer(np.arange(1, 25), [1 / growth, 1 / growth**2])
@@ -528,7 +532,7 @@ def _spread(places: tuple[Array, Array]) -> tuple[Array, Array]:
     return row, column
 
 
-def _carried(
+def _solver_error(
     nodes: tuple[Array, Array], bars: Array, places: tuple[Array, Array], value: Array
 ) -> Array:
     """(p, q) error of the solver between the nodes: a small shift of the sizes, so it

@@ -302,17 +302,17 @@ def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyF
     wanted = wanted or ProxyTolerances()
     if library.sweep.light == "circular":
         return _fit_converted(library, wanted)
-    found = _fitted(library, wanted, across_resonances=False)
+    found = _fit_branch(library, wanted, across_resonances=False)
     if any(width < wanted.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
-            across = _fitted(library, wanted, across_resonances=True)
+            across = _fit_branch(library, wanted, across_resonances=True)
             crosses = bool(across.proxy.gaps_um) and not across.shortfall
             if crosses and across.turns > found.turns:
                 return across
     return found
 
 
-def _fitted(
+def _fit_branch(
     library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool
 ) -> ProxyFit:
     """The proxy on one side of all narrow resonances, or across them."""
@@ -320,7 +320,7 @@ def _fitted(
         library, wanted, across_resonances=across_resonances
     )
     wanted = wanted.with_defaults(entry_error(library, data.diameter_um))
-    kept, proxy, terms = _followed(data, wanted)
+    kept, proxy, terms = _choose_coefficients(data, wanted)
     low, high = proxy.domain_um
     proxy = dataclasses.replace(
         proxy,
@@ -368,7 +368,7 @@ def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
     )
 
 
-def _followed(
+def _choose_coefficients(
     data: MonotonicBranch, wanted: ProxyTolerances
 ) -> tuple[MonotonicBranch, Proxy, int]:
     """The domain that a proxy follows, and its number of coefficients: those wanted;
@@ -376,26 +376,28 @@ def _followed(
     between them.
     """
     terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter_um) // 3)
-    kept, proxy = _longest(data, wanted, terms)
+    kept, proxy = _longest_domain(data, wanted, terms)
     while more < 24 and kept.turns < 1 <= data.turns:
         more += 2
         with contextlib.suppress(
             DomainError
         ):  # more coefficients than so few entries bear: those before stand
-            longer, better = _longest(data, wanted, more)
+            longer, better = _longest_domain(data, wanted, more)
             if _cost(better, wanted) <= 1 and len(longer.diameter_um) > len(
                 kept.diameter_um
             ):
                 kept, proxy, terms = longer, better, more
     for fewer in range(terms - 1, 1, -1) if _cost(proxy, wanted) > 1 else ():
-        other = _best(kept, wanted, fewer)
+        other = _best_power(kept, wanted, fewer)
         if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
             proxy, terms = other, fewer
-    shorter = _shorter(kept, wanted, terms) if _cost(proxy, wanted) > 1 else None
+    shorter = (
+        _cut_last_diameters(kept, wanted, terms) if _cost(proxy, wanted) > 1 else None
+    )
     return shorter or (kept, proxy, terms)
 
 
-def _shorter(
+def _cut_last_diameters(
     data: MonotonicBranch, wanted: ProxyTolerances, terms: int
 ) -> tuple[MonotonicBranch, Proxy, int] | None:
     """Without the last diameters, next to what bounds the domain, where the tolerances
@@ -407,7 +409,7 @@ def _shorter(
         if some.turns < 0.9 * data.turns:
             return None
         fewer = min(terms, count // 3)
-        other = _best(some, wanted, fewer)
+        other = _best_power(some, wanted, fewer)
         if other is not None and _cost(other, wanted) <= 1:
             return some, other, fewer
     return None
@@ -432,14 +434,14 @@ def proxy_of(library: PillarLibrary) -> Proxy:
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
-def _longest(
+def _longest_domain(
     data: MonotonicBranch, wanted: ProxyTolerances, terms: int
 ) -> tuple[MonotonicBranch, Proxy]:
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
     tolerances.
     """
     good, bad = min(len(data.diameter_um), 3 * terms), len(data.diameter_um) + 1
-    best = _best(data.part(slice(good)), wanted, terms)
+    best = _best_power(data.part(slice(good)), wanted, terms)
     if best is None:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
@@ -449,7 +451,7 @@ def _longest(
         middle = (
             (good + bad + 1) // 2 if bad > len(data.diameter_um) else (good + bad) // 2
         )
-        trial = _best(data.part(slice(middle)), wanted, terms)
+        trial = _best_power(data.part(slice(middle)), wanted, terms)
         if trial is not None and _cost(trial, wanted) <= 1:
             good, best = middle, trial
         else:
@@ -485,7 +487,9 @@ def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
     return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 
-def _best(data: MonotonicBranch, wanted: ProxyTolerances, terms: int) -> Proxy | None:
+def _best_power(
+    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+) -> Proxy | None:
     """Of the powers of the diameter, the one with the least error in units of the
     tolerances; None where each takes |T| below 0 between the entries.
     """
@@ -651,7 +655,7 @@ def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
         library.angle_rad,
     )
     wanted = wanted.with_defaults(entry_error(library, kept.diameter_um))
-    proxy = _widest(kept, middle - run.start, wanted)
+    proxy = _widest_domain(kept, middle - run.start, wanted)
     inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
     notes = (
@@ -671,7 +675,9 @@ def _sharp(library: PillarLibrary, least_half_width_um: float) -> Array:
     return near
 
 
-def _widest(data: MonotonicBranch, middle: int, wanted: ProxyTolerances) -> Proxy:
+def _widest_domain(
+    data: MonotonicBranch, middle: int, wanted: ProxyTolerances
+) -> Proxy:
     """The widest run about ``middle`` on which as many coefficients as are wanted meet
     the tolerances.
     """

@@ -79,7 +79,7 @@ def _solve(
                 f"they cover {cover / TURN:.3f} of a turn ({int(missing.sum())} sites); "
                 "widen the diameters, change the cell, or take the nearest with gap='nearest'"
             )
-    table = _table(p, within)
+    table = _tabulate_inverse(p, within)
 
     def work(chunk: Array) -> Array:
         target = (chunk.astype(np.float64) - start) % TURN
@@ -89,12 +89,12 @@ def _solve(
                 target[beyond] - cover <= TURN - target[beyond], cover, 0.0
             )
         found = _newton(p, target, start, cover, table)
-        return _moved(found, excluded, within).astype(chunk.dtype)
+        return _move_out_of(found, excluded, within).astype(chunk.dtype)
 
     return polynomial.over_chunks(work, phase)
 
 
-def _moved(d: Array, excluded: Intervals, within: tuple[float, float]) -> Array:
+def _move_out_of(d: Array, excluded: Intervals, within: tuple[float, float]) -> Array:
     """Diameters out of the excluded intervals, to the nearer end inside ``within``."""
     for low, high in excluded:
         ends = [end for end in (low, high) if within[0] <= end <= within[1]]
@@ -134,7 +134,7 @@ def _newton(
     return d
 
 
-def _table(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
+def _tabulate_inverse(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
     """(TABLE,) diameters at even steps of the phase, from the end of least phase."""
     d = np.linspace(*within, DENSE * TABLE)
     phase = polynomial.evaluate_curve(p, d)

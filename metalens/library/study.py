@@ -160,7 +160,7 @@ def run_study(
         (study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes
     ]
     journal = journal or SweepJournal(None)
-    verdicts = _judged(study, cases, journal, console or Console(quiet=True))
+    verdicts = _judge_cells(study, cases, journal, console or Console(quiet=True))
     best = best_cell(study, verdicts)
     if best is None:
         return verdicts
@@ -168,7 +168,7 @@ def run_study(
     again = [
         (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
     ]
-    return verdicts + _judged(study, again, journal, Console(quiet=True))
+    return verdicts + _judge_cells(study, again, journal, Console(quiet=True))
 
 
 def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -190,7 +190,7 @@ def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]
     return tried, tuple(name for name in named_else if name not in tried)
 
 
-def _judged(
+def _judge_cells(
     study: CellStudy,
     cases: list[tuple[Cell, float]],
     journal: SweepJournal,

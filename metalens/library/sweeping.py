@@ -292,12 +292,12 @@ def _interpolate_family(
                 sharp.get(have[float(nodes[i])], np.empty((0, 2)))
                 for i in (right - 1, right)
             )
-            passed = _passed(first, second, diameters)
+            passed = _crossed_by_resonances(first, second, diameters)
             row[2] = np.where(passed, 1.0, row[2])
             rows[wave] = row
 
 
-def _passed(first: Array, second: Array, diameters: Array) -> Array:
+def _crossed_by_resonances(first: Array, second: Array, diameters: Array) -> Array:
     """Mask of the diameters that narrow resonances may pass between two neighbouring
     nodes.
     """
