@@ -220,7 +220,14 @@ class WantedDoses:
         of width, less is allowed.
         """
         table, tolerance = self.table, settings.tolerance
-        found = []
+        least, largest, finest = np.inf, 0.0, 0.0
+
+        def take(dose: Array, share: Array) -> None:
+            nonlocal least, largest, finest
+            least = min(least, float(dose.min(initial=np.inf)))
+            largest = max(largest, float(dose.max(initial=0.0)))
+            finest = max(finest, float(share.max(initial=0.0)))
+
         for number, lattice in enumerate(self.lattices):
             for first, block in lattice.blocks():
                 kind = block[block > 0]
@@ -228,18 +235,14 @@ class WantedDoses:
                 goal = THRESHOLD * table.goal[kind]
                 steep = _SOFTEST_UM * table.slope[kind] / 2 / goal
                 share = dose * table.own[kind] / goal
-                found.append((dose, share / np.minimum(tolerance, steep * dose)))
+                take(dose, share / np.minimum(tolerance, steep * dose))
         near = (
             self.ranges.near if len(self.ranges.near.widths_um) else self.ranges.middle
         )
         dose = self.marks.doses(self.far)
         allowed = np.minimum(tolerance, straight_edge_error(near) * dose)
-        found.append((dose, dose * self.marks.own / THRESHOLD / allowed))
-        return (
-            min(float(dose.min(initial=np.inf)) for dose, _ in found),
-            max(float(dose.max(initial=0.0)) for dose, _ in found),
-            max(float(share.max(initial=0.0)) for _, share in found),
-        )
+        take(dose, dose * self.marks.own / THRESHOLD / allowed)
+        return least, largest, finest
 
 
 def straight_edge_error(point: PointExposure) -> float:
