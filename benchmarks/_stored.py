@@ -69,10 +69,8 @@ def compared(path: Path, rows: list[Row]) -> str:
             lines.append(f"{row.case}, {row.method}: not stored")
             continue
         old = stored.pop(at)
-        times, errors = (
-            _ratio(row.seconds, old["seconds"]),
-            _ratio(row.error, old["error"]),
-        )
+        times = _ratio(row.seconds, old["seconds"])
+        errors = _ratio(row.error, old["error"])
         lines.append(f"{row.case}, {row.method}: time {times}, error {errors}")
     return "\n".join(
         [*lines, *(f"{old['case']}, {old['method']}: stored only" for old in stored)]

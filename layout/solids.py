@@ -101,7 +101,8 @@ def cut_tile(
     grid = lens.diameters
     x, y = abs(grid.x_um - centre_um[0]), abs(grid.y_um - centre_um[1])
     reach = np.inf if side_um is None else side_um / 2 + 1e-9
-    columns, rows = np.flatnonzero(x <= reach), np.flatnonzero(y <= reach)
+    columns = np.flatnonzero(x <= reach)
+    rows = np.flatnonzero(y <= reach)
     part = np.zeros((0, 0))
     if len(rows) and len(columns):
         part = grid.diameter_um[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
@@ -141,7 +142,8 @@ def _discs(
     made_nm = process.made_diameter_nm(sizes * step)
     top, foot = process.top_foot_nm(made_nm, height / nm)
     pitch_nm = lens.diameters.pitch_um / nm
-    smallest, largest = min(top.min(), foot.min()), max(top.max(), foot.max())
+    smallest = min(top.min(), foot.min())
+    largest = max(top.max(), foot.max())
     if smallest <= 0 or largest >= pitch_nm:
         raise ProcessError(
             f"walls of {process.etch.sidewall_deg} degrees over {height} um make "

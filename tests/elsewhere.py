@@ -54,10 +54,8 @@ def elsewhere():
     that move there stay the same
     objects, as a GPU's do.
     """
-    threads, swapped = (
-        torch.get_num_threads(),
-        torch.__future__.get_swap_module_params_on_conversion(),
-    )
+    threads = torch.get_num_threads()
+    swapped = torch.__future__.get_swap_module_params_on_conversion()
     optimiser = importlib.import_module("torch.optim.optimizer")
     fused = optimiser._get_fused_kernels_supported_devices
     torch.set_num_threads(1)

@@ -95,7 +95,8 @@ def measure(folders: tuple[str, ...]) -> dict[str, float]:
             else:
                 functions[node.name] += 1
                 absent, every = undocumented_parameters(node)
-                missing, parameters = missing + absent, parameters + every
+                missing = missing + absent
+                parameters = parameters + every
     twice = [n for n, count in classes.items() if count > 1 and n != "Options"]
     figures["classes_twice"] = len(twice)
     twice = [n for n, c in functions.items() if c > 1 and n not in REPEATABLE]

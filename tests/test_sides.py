@@ -113,12 +113,10 @@ def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, ch
     truth = anew(
         lens, **{name: 1e-3 * change.get(row, 0.0) for name, row in amounts.items()}
     )
-    got, before = (
-        seen(
-            lens, made.as_built_transmission(lens, response, parameter_vector(change))
-        ),
-        seen(lens, anew(lens)),
+    got = seen(
+        lens, made.as_built_transmission(lens, response, parameter_vector(change))
     )
+    before = seen(lens, anew(lens))
     want = seen(lens, truth)
     assert np.abs(want - before).max() > 0.1 * np.abs(before).max()
     assert np.abs(got - want).max() < 0.02 * np.abs(before).max()
@@ -188,10 +186,8 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
     """Mean over both polarisations, of first order: a pillar wider along x by a is one
     wider all round by a / 2.
     """
-    wide, all_round = (
-        LensError({"width_nm": 6.0}).state(),
-        LensError({"bias_nm": 3.0}).state(),
-    )
+    wide = LensError({"width_nm": 6.0}).state()
+    all_round = LensError({"bias_nm": 3.0}).state()
     rates = OpticsConfig().phase_rates
     # the slope of the guide is that of the proxy, smoothed
     assert variance_rad2(wide, rates) == pytest.approx(

@@ -103,7 +103,8 @@ def _uses(module):
             ]
         elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
             for alias in node.names:
-                full, table = f"{node.module}.{alias.name}", _face(node.module)
+                full = f"{node.module}.{alias.name}"
+                table = _face(node.module)
                 home = full if full in MODULES else table.get(alias.name, node.module)
                 found.append((node.module, home, alias.name))
     return found
@@ -368,10 +369,8 @@ def test_test_files_have_unique_names():
 
 
 def test_the_demo_and_the_examples_show_the_same_process():
-    example, shipped = (
-        ROOT / "examples" / "process.toml",
-        ROOT / "metalens" / "data" / "demo" / "process.toml",
-    )
+    example = ROOT / "examples" / "process.toml"
+    shipped = ROOT / "metalens" / "data" / "demo" / "process.toml"
     assert example.read_bytes() == shipped.read_bytes()
 
 

@@ -54,7 +54,8 @@ def klayout_layout(mask: MaskPlan) -> Any:
         )
         cells.append(cell.cell_index())
     rows, columns = np.nonzero(grid)
-    x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
+    x = ((columns - 1250) * PITCH).tolist()
+    y = ((1250 - rows) * PITCH).tolist()
     for k, px, py in zip(grid[rows, columns].tolist(), x, y, strict=True):
         top.insert(db.CellInstArray(cells[k - 1], db.Vector(px, py)))
     return made

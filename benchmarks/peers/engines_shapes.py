@@ -49,11 +49,9 @@ TERMS = (49, 97)  # of fmmax
 FACTOR = 3.0
 STEPS = (3, 6)  # of a tilted wall
 PIXELS, FINE, RASTER = 72, (55, 34), 1e-3  # and what the raster may leave
-HEXAGONAL, WIDE, FLAT = (
-    Lattice("hexagonal"),
-    Lattice("rectangular", 1.3),
-    Lattice("rectangular", 0.8),
-)
+HEXAGONAL = Lattice("hexagonal")
+WIDE = Lattice("rectangular", 1.3)
+FLAT = Lattice("rectangular", 0.8)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.55)))
 
 
@@ -176,10 +174,8 @@ def _one_of(shapes: tuple[Shaped, ...], *, hole: bool = False) -> Shaped:
     return draw
 
 
-ANY, GROWING = (
-    _one_of(tuple(SHAPES.values())),
-    _one_of(tuple(SHAPES[n] for n in SHAPES if n != "polygons")),
-)
+ANY = _one_of(tuple(SHAPES.values()))
+GROWING = _one_of(tuple(SHAPES[n] for n in SHAPES if n != "polygons"))
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     **{name: _kind(shape) for name, shape in SHAPES.items() if name != "circles"},
     "holes": _kind(_one_of(HOLES, hole=True)),
@@ -352,7 +348,8 @@ def fmmax_both(one: Drawn, terms: int, steps: int) -> Array:
         ends[1],
     ]
     thick = [0.0, *(h for _, h in films[0]), *heights, *(h for _, h in films[1]), 0.0]
-    wavelength, sine = one.wavelength_um / pitch, math.sin(one.angle_rad)
+    wavelength = one.wavelength_um / pitch
+    sine = math.sin(one.angle_rad)
     along = np.array([math.cos(one.azimuth_rad), math.sin(one.azimuth_rad)])
     t, r = _compiled(cell.lattice, terms)(
         jnp.asarray(wavelength),

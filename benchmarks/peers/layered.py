@@ -44,7 +44,8 @@ def published(layers: scene.Layers, psfs: Tensor, *, epsilon: float = 1e-3) -> T
     is lost: up to 26 % at edges.
     """
     behind = _blurred(layers.coverage.flip(1).cumsum(1).flip(1), psfs) + epsilon
-    light, cover = _blurred(layers.radiance, psfs), _blurred(layers.coverage, psfs)
+    light = _blurred(layers.radiance, psfs)
+    cover = _blurred(layers.coverage, psfs)
     light, cover = light / behind, cover / behind
     passed = torch.cumprod(1 - cover, 1)
     passed = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], 1)

@@ -149,10 +149,8 @@ def _bessel(
     radius: float, band: float, counts: tuple[int, int], rho: tuple[float, int]
 ) -> tuple[Array, Array]:
     """J0 of both transforms, (r, f) and (f, ρ); the last few are kept."""
-    r, f = (
-        (legendre.gauss_legendre_nodes(counts[0])[0] + 1) / 2 * radius,
-        (legendre.gauss_legendre_nodes(counts[1])[0] + 1) / 2 * band,
-    )
+    r = (legendre.gauss_legendre_nodes(counts[0])[0] + 1) / 2 * radius
+    f = (legendre.gauss_legendre_nodes(counts[1])[0] + 1) / 2 * band
     return j0(2 * np.pi * r[:, None] * f), j0(
         2 * np.pi * f[:, None] * np.linspace(0, *rho)
     )

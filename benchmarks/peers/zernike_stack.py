@@ -15,16 +15,14 @@ from characterize.inference.leastsquares import FitImages, GaussianPrior, Solver
 from characterize.pupil import zernike
 from characterize.pupil.model import PupilModel, PupilSpec
 
-WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = (
-    0.85,
-    0.02,
-    2.0,
-    48,
-    24,
-    7,
-    2e5,
-    5,
-)
+WAVE_UM = 0.85
+NA = 0.02
+SAMPLING = 2.0
+SIDE = 48
+MIDDLE = 24
+ORDER = 7
+PHOTONS = 2e5
+SEEDS = 5
 DEFOCUS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0)  # rms of the defocus term
 
 
@@ -191,10 +189,8 @@ def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, 
     for sign in (1, -1):  # their axes and sign of time may differ from ours
         for turn in (1, -1):
             for swap in (False, True):
-                a, b = (
-                    (turn * (v if swap else u))[keep],
-                    (turn * (u if swap else v))[keep],
-                )
+                a = (turn * (v if swap else u))[keep]
+                b = (turn * (u if swap else v))[keep]
                 truth = case["phase"] @ zernike.zernike_basis(
                     _model().phase_indices, a, b
                 )

@@ -13,7 +13,10 @@ from metalens.cell.record import Cell
 from metalens.lens.record import Lens
 from tests.characterize import bench_lens
 
-RESPONSE, PIXEL_UM, PIXELS, PEAK_E = bench_lens.RESPONSE, 3.0, 32, 8000.0
+RESPONSE = bench_lens.RESPONSE
+PIXEL_UM = 3.0
+PIXELS = 32
+PEAK_E = 8000.0
 DEPTHS = tuple((1 / np.linspace(1 / 15e3, 1 / 28e3, 11)).tolist())
 HIDDEN = bench_lens.VALUES | {
     "stage_zero_um": 120.0,

@@ -40,11 +40,9 @@ def lens(kind: str, n: int = 2500) -> tuple[torch.Tensor, torch.Tensor]:
     level = (r2 <= (n * PITCH / 2) ** 2).astype("f4")
     if kind == "free-form":
         for _ in range(40):
-            turn, length, start = (
-                random.uniform(0, 2 * np.pi),
-                random.uniform(60, 500),
-                random.uniform(0, 2 * np.pi),
-            )
+            turn = random.uniform(0, 2 * np.pi)
+            length = random.uniform(60, 500)
+            start = random.uniform(0, 2 * np.pi)
             along = np.cos(turn) * x + np.sin(turn) * x[:, None]
             phase += 0.6 * random.normal() * np.cos(2 * np.pi / length * along + start)
     if kind == "noisy":
@@ -139,7 +137,8 @@ def peak_mb(work: Callable[[], object]) -> float:
     """Highest memory of the process during ``work`` above what it held before (Linux;
     nan elsewhere).
     """
-    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    status = Path("/proc/self/status")
+    reset = Path("/proc/self/clear_refs")
     if not reset.exists():
         return math.nan
     ctypes.CDLL(None).malloc_trim(

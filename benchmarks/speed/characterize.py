@@ -121,10 +121,8 @@ def _millimetre() -> list[Row]:
     worst = max(
         np.abs(f - w).max() / w.max() for f, w in zip(found, light, strict=True)
     )
-    case, threads = (
-        f"1 mm lens, 11 depths of {millimetre.PIXELS} x {millimetre.PIXELS} pixels",
-        torch.get_num_threads(),
-    )
+    case = f"1 mm lens, 11 depths of {millimetre.PIXELS} x {millimetre.PIXELS} pixels"
+    threads = torch.get_num_threads()
     times = f"<= 1e-3; {spent / quick:.0f} times faster, {built:.1f} s to gather the pillars once"
     about = "sum over every pillar, share of the peak"
     return [
@@ -153,15 +151,12 @@ def _fit() -> list[Row]:
     referee.prepared("whole")
     solved = time.perf_counter() - start
     run = referee.study("whole", 0)
-    case, threads = (
-        "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts",
-        torch.get_num_threads(),
-    )
-    seconds, goal = (
-        run["wall_seconds"],
-        f"<= 8 s; {run['seconds']:.1f} s of processor time",
-    )
-    z, inside = np.array(list(run["z"].values())), list(run["inside"].values())
+    case = "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts"
+    threads = torch.get_num_threads()
+    seconds = run["wall_seconds"]
+    goal = f"<= 8 s; {run['seconds']:.1f} s of processor time"
+    z = np.array(list(run["z"].values()))
+    inside = list(run["inside"].values())
     return [
         Row(
             case,

@@ -69,7 +69,9 @@ def _member(width: float, depth: int) -> Architecture:
 
 
 def _counts() -> list[Row]:
-    generator, space, worst = np.random.default_rng(0), SearchSpace(), 0.0
+    generator = np.random.default_rng(0)
+    space = SearchSpace()
+    worst = 0.0
     net = Supernet(space).eval()
     for _ in range(40):
         member = architecture.sample_architecture(space, generator)
@@ -183,7 +185,9 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
     """The same light from the finely sampled intensity, integrated over samples and
     low-passed by plain sums.
     """
-    fine, size, step = OPTICS.fine, OPTICS.window_samples, OPTICS.sample_um
+    fine = OPTICS.fine
+    size = OPTICS.window_samples
+    step = OPTICS.sample_um
     bright = psf(
         optics.added_phase(OPTICS, phase), OPTICS.pupil, depths_um=OPTICS.depths_um,
         focus_um=OPTICS.focus_mm * 1e3, sample_um=step / fine, samples=size * fine,
@@ -195,7 +199,8 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
     number = torch.arange(
         -math.floor(edge + 0.5), math.floor(edge + 0.5) + 1, dtype=torch.float64
     )
-    frequency, share = number / period, (edge + 0.5 - number.abs()).clamp(0, 1)
+    frequency = number / period
+    share = (edge + 0.5 - number.abs()).clamp(0, 1)
     from_x = (
         (torch.arange(size * fine, dtype=torch.float64) - (size * fine - 1) / 2)
         * step
@@ -211,20 +216,17 @@ def _stages(threads: int, made: pool.FramePool) -> list[Row]:
     lens = optics.stack_imager(
         OPTICS, optics.lens_psf_stack(OPTICS, torch.zeros(35)), 160, margin=16
     )
-    sheets, scale = SCENES.rendered(0, 8).frames, SCENES.states(0, 8).scale
-    exact, quick = (
-        sensor_irradiance(sheets, lens),
-        sensor_irradiance(flatten_layers(sheets, scale), lens),
-    )
+    sheets = SCENES.rendered(0, 8).frames
+    scale = SCENES.states(0, 8).scale
+    exact = sensor_irradiance(sheets, lens)
+    quick = sensor_irradiance(flatten_layers(sheets, scale), lens)
     error = float(
         (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
     )
     batch = PoolScenes(made, 16, 0.2, 0).batch(0, BATCH)
     light = sensor_irradiance(batch.frames, lens)
-    pitch, noise = (
-        torch.tensor(9.0, dtype=torch.float64),
-        torch.Generator().manual_seed(0),
-    )
+    pitch = torch.tensor(9.0, dtype=torch.float64)
+    noise = torch.Generator().manual_seed(0)
 
     def sensor(exact: bool) -> torch.Tensor:
         return read_out(light, 9.0, pitch, SENSOR, generator=noise, exact=exact)
@@ -345,10 +347,8 @@ def _training(threads: int, made: pool.FramePool, of: OpticsConfig) -> list[Row]
             for steps in (frozen, moving)
         )
         joint += anew
-        case, goal = (
-            f"{macs:.1f} MMACs, {of.image} image",
-            f"{_rate(fixed)}; data {data / fixed:.0%} of a step",
-        )
+        case = f"{macs:.1f} MMACs, {of.image} image"
+        goal = f"{_rate(fixed)}; data {data / fixed:.0%} of a step"
         if of.image == "uniform":
             forward = _forward(member)
             out.append(
@@ -389,11 +389,9 @@ def _data(made: pool.FramePool, of: OpticsConfig) -> float:
     """Seconds a frame of what a network is trained on: drawn from the pool, imaged,
     read out, with its depths.
     """
-    scenes, pitch, noise = (
-        PoolScenes(made, 16, 0.2, 0),
-        torch.tensor(9.0, dtype=torch.float64),
-        torch.Generator(),
-    )
+    scenes = PoolScenes(made, 16, 0.2, 0)
+    pitch = torch.tensor(9.0, dtype=torch.float64)
+    noise = torch.Generator()
     lens = formed.make_imager(of, torch.zeros(35, dtype=torch.float64), 160, margin=16)
 
     @torch.no_grad()

@@ -48,7 +48,8 @@ def rows() -> Iterator[Row]:
             goal=f"{goal} frames/s at {tolerance:g}: {1 / seconds:.0f}",
         )
         nodes = len(made.plan.y_um) * len(made.plan.x_um)
-        depth, waves = len(made.plan.depths_um), len(made.plan.waves.weights)
+        depth = len(made.plan.depths_um)
+        waves = len(made.plan.waves.weights)
         method = f"{nodes} field points x {depth} depths x {waves} wavelengths"
         yield Row(
             "its preparation",
@@ -73,7 +74,8 @@ def points_row(wave: SmoothWave) -> Row:
     waves = SpectralNodes(
         *spectrum.gauss_rule(*spectrum.spectral_weight(Source(850.0, 30.0)), 9), 0.0
     )
-    optics, window = Optics(wave, Layers(), 2e3), Window(GRID.window, GRID.step_um)
+    optics = Optics(wave, Layers(), 2e3)
+    window = Window(GRID.window, GRID.step_um)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     seconds = fastest(
         lambda: sum_over_spectrum(optics, at.flatten(0, 1), depths, waves, window),
@@ -164,7 +166,8 @@ def pillar_lens(focus: Focus, radius_um: float) -> Lens:
         1e-6,
     )
     cell = Cell(pitch_um=pitch, pillar=Index(3.6), substrate=Index(1.45))
-    distance, source = focus.sensor_distance_um, focus.source_distance_um
+    distance = focus.sensor_distance_um
+    source = focus.source_distance_um
     return Lens(
         DiameterMap(diameter, pitch),
         cell,

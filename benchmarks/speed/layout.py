@@ -106,7 +106,8 @@ def large(diameter_mm: float) -> MaskPlan:
 def peak_mb() -> Iterator[list[float]]:
     """Growth of the resident memory above what it is now, as the kernel keeps it."""
     grown = [NAN]
-    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    status = Path("/proc/self/status")
+    reset = Path("/proc/self/clear_refs")
     with contextlib.suppress(OSError):
         reset.write_text("5")
     before = _resident(status, "VmRSS")
@@ -293,10 +294,8 @@ def _certificate_rows(target: Path) -> list[Row]:
     plan = layout.correct(bare, process.exposure)
     layout.write_gdsii(plan, target / "c.gds")
     handover.write_dose_table(plan, process, target / "c.csv")
-    content, table = (
-        layout.read_gdsii(target / "c.gds"),
-        handover.read_dose_table(target / "c.csv"),
-    )
+    content = layout.read_gdsii(target / "c.gds")
+    table = handover.read_dose_table(target / "c.csv")
     found = verify_exposure(content, plan, table, process)
     seconds, peak = measured(
         lambda: verify_exposure(content, plan, table, process), repeats=1
@@ -324,13 +323,12 @@ def _lens(diameter_mm: float, pitch_um: float, *, cubic_rad: float = 3.0) -> "Le
     from metalens.lens import DiameterMap, Lens
     from metalens.library import Proxy
 
-    count, reach = round(diameter_mm * 1e3 / pitch_um), 500 * diameter_mm
+    count = round(diameter_mm * 1e3 / pitch_um)
+    reach = 500 * diameter_mm
     x = ((np.arange(count) - (count - 1) / 2) * pitch_um).astype(np.float32)
-    d, focus, widest = (
-        np.zeros((count, count), np.float32),
-        2000 * diameter_mm,
-        0.7 * pitch_um,
-    )
+    d = np.zeros((count, count), np.float32)
+    focus = 2000 * diameter_mm
+    widest = 0.7 * pitch_um
     for row in range(count):
         r2 = x**2 + x[row] ** 2
         phase = (np.sqrt(r2 + focus**2) - focus) / 0.94 + cubic_rad * (x / reach) ** 3

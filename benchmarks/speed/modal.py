@@ -158,11 +158,9 @@ def oblique(tolerance: float) -> Row:
 
 def sweep() -> Row:
     """A piece of a library; every entry with its own error bar."""
-    diameters, wavelengths, angles = (
-        (0.11, 0.23),
-        (0.84, 0.85, 0.86),
-        np.radians([0.0, 10.0]),
-    )
+    diameters = (0.11, 0.23)
+    wavelengths = (0.84, 0.85, 0.86)
+    angles = np.radians([0.0, 10.0])
     start = time.perf_counter()
     found = [
         solve(
@@ -172,10 +170,8 @@ def sweep() -> Row:
             diameters, angles, wavelengths, ("s", "p")
         )
     ]
-    seconds, error = (
-        (time.perf_counter() - start) / len(found),
-        max(each.t_error for each in found),
-    )
+    seconds = (time.perf_counter() - start) / len(found)
+    error = max(each.t_error for each in found)
     return Row(
         "piece of a library, per entry", "solve 1e-3", seconds, error, "own estimate"
     )

@@ -101,15 +101,14 @@ def _main_rows() -> list[Row]:
     ]
     size = maps[0].numel() * 4 / 2**20
     case_name = "1 mm free-form, 21 depths"
-    wrong, about = error(stack, maps), f"exact sum (estimate {stack.error:.1e})"
+    wrong = error(stack, maps)
+    about = f"exact sum (estimate {stack.error:.1e})"
     goals = (
         f"{slow[0] / once:.0f}x textbook (300x, goal 600x), 1e-4, 150 MB",
         f"{slow[1] / both:.0f}x textbook (250x, goal 800x), 2e-4, 250 MB",
     )
-    judged, planned = (
-        "gradient in float64 at 1e-9",
-        f"{slow[0] / first:.0f}x textbook (300x), with the plan",
-    )
+    judged = "gradient in float64 at 1e-9"
+    planned = f"{slow[0] / first:.0f}x textbook (300x), with the plan"
     return [
         Row(
             case_name, "windowed 1e-4", once, wrong, about, threads, memory[0], goals[0]
@@ -304,10 +303,8 @@ def polarised_rows() -> list[Row]:
             fastest(lambda k=kind: forward(maps, polarisation=k)),
         )
         base = seconds if kind == "scalar" else base
-        about, goal = (
-            f"sums of E and H (estimate {stack.error:.1e})",
-            f"{seconds / base:.1f}x of the scalar",
-        )
+        about = f"sums of E and H (estimate {stack.error:.1e})"
+        goal = f"{seconds / base:.1f}x of the scalar"
         name = f"1 mm, 21 depths, {kind}"
         found.append(
             Row(
@@ -465,7 +462,8 @@ def peer_rows() -> list[Row]:
     ours = fastest(lambda: forward(maps), repeats=5)
     stack = forward(maps, depths_um=DEPTHS[10:11])
     points = np.arange(64 * 64).reshape(64, 64)[2::6, 2::6].ravel()
-    want, got = exact(maps, stack, (0, 0), points), power.ravel()[points]
+    want = exact(maps, stack, (0, 0), points)
+    got = power.ravel()[points]
     wrong = float(
         np.linalg.norm(got / got.sum() - want / want.sum())
         / np.linalg.norm(want / want.sum())

@@ -61,10 +61,8 @@ def rows() -> Iterator[Row]:
         start = time.perf_counter()
         stack = forward(maps, **about)
         first = time.perf_counter() - start
-        wrong, name = (
-            error(stack, maps),
-            f"1 mm free-form, 21 depths, {width:g} um window",
-        )
+        wrong = error(stack, maps)
+        name = f"1 mm free-form, 21 depths, {width:g} um window"
         against = f"exact sum (estimate {stack.error:.1e})"
         del stack
         yield Row(

@@ -43,10 +43,8 @@ def _twin_error(states: object, camera: PinholeCamera) -> float:
 def _rendering(threads: int) -> list[Row]:
     out = []
     for pixels, pitch, goal in ((160, 9.0, 800), (400, 3.6, 100)):
-        camera, states = (
-            PinholeCamera(pixels, pitch),
-            dataset.states_at(torch.arange(32), 1),
-        )
+        camera = PinholeCamera(pixels, pitch)
+        states = dataset.states_at(torch.arange(32), 1)
         seconds = fastest(
             lambda c=camera, s=states: renderer.render(s, camera=c), repeats=12
         ) / len(states)

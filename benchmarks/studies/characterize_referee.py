@@ -106,10 +106,8 @@ def study(
     kind, drawn, absent = (
         hidden_lens.unstated(seed) if "unstated" in about else ("", faults or {}, ())
     )
-    session, known = (
-        pillar_bench.with_faults(session, **drawn),
-        tuple(KnownValue(name, 0.0) for name in absent),
-    )
+    session = pillar_bench.with_faults(session, **drawn)
+    known = tuple(KnownValue(name, 0.0) for name in absent)
     seen = pillar_bench.shoot(lens, session)
     start, clock = time.process_time(), time.perf_counter()
     try:
@@ -122,7 +120,8 @@ def study(
             "refused": str(refusal),
             "seconds": time.process_time() - start,
         }
-    seconds, wall = time.process_time() - start, time.perf_counter() - clock
+    seconds = time.process_time() - start
+    wall = time.perf_counter() - clock
     inside, outer, error = {}, {}, {}
     for i, name in enumerate(found.names):
         if name in hidden_lens.TRUTHS:

@@ -36,11 +36,9 @@ from metalens.core import store
 
 FOLDER = Path(__file__).parents[1] / "results" / "characterize_study"
 SEEDS, PEAKS, GOALS = 100, (8000, 200), {8000: 1.10, 200: 1.25}
-DEPTHS, NEW_DEPTHS, NEW_ANGLE_DEG = (
-    (380.0, 480.0, 600.0, 800.0, 1150.0),
-    (430.0, 680.0, 950.0),
-    3.0,
-)
+DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)
+NEW_DEPTHS = (430.0, 680.0, 950.0)
+NEW_ANGLE_DEG = 3.0
 SPREAD = {
     "bias_nm": 4.0,
     "bias_x_nm": 2.0,

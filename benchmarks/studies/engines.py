@@ -31,7 +31,8 @@ def _ordinary(oblique: bool) -> Callable[[np.random.Generator], Drawn]:
     """Cells as lenses have them, nothing looked for."""
 
     def draw(rng: np.random.Generator) -> Drawn:
-        pitch, wavelength = rng.uniform(0.25, 0.5), rng.uniform(0.5, 1.2)
+        pitch = rng.uniform(0.25, 0.5)
+        wavelength = rng.uniform(0.5, 1.2)
         about = [
             Index(rng.uniform(*ends))
             for ends in ((1.9, 3.7), (1.35, 1.8), (1.0, 1.3), (1.0, 1.3))
@@ -81,10 +82,8 @@ def _any(
             about = [about[3], *about[1:3], about[0]]
         height = pitch * float(np.exp(rng.uniform(*np.log(heights))))
         where = rng.uniform(*angle), str(rng.choice(["s", "p"]))
-        cell, wavelength = (
-            Cell(pitch, height, *about),
-            pitch * dense / rng.uniform(*waves),
-        )
+        cell = Cell(pitch, height, *about)
+        wavelength = pitch * dense / rng.uniform(*waves)
         return (
             cell,
             pitch * rng.uniform(0.04, 0.97),

@@ -53,10 +53,8 @@ def _cutoff(rng: np.random.Generator) -> Drawn:
     about = _any(rng)
     n = about[str(rng.choice(["substrate", "cover"]))].n
     angle = float(rng.choice([0.0, rng.uniform(0.05, 0.4)]))
-    pitch, offset = (
-        rng.uniform(0.3, 0.6),
-        rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2),
-    )
+    pitch = rng.uniform(0.3, 0.6)
+    offset = rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2)
     wavelength = pitch * (n + math.sin(angle)) * (1 + offset)
     return (
         Cell(pitch, rng.uniform(0.2, 1.0), **about),

@@ -33,7 +33,9 @@ CONTACT = MeshPlan(
     4, 5, 4, (0.7, 1.3), core=0.5, sectors=(0.03, 0.12, 0.4, 1.0)
 )  # graded towards the point of contact
 CONTACT_OTHER = MeshPlan(4, 4, 4, (0.7, 1.3), core=0.5, sectors=(0.1, 0.4, 1.0))
-NORMAL, OBLIQUE, TOUCHING = (FINEST, FINE), (BOTH, OTHER), (CONTACT, CONTACT_OTHER)
+NORMAL = (FINEST, FINE)
+OBLIQUE = (BOTH, OTHER)
+TOUCHING = (CONTACT, CONTACT_OTHER)
 NOT_ENOUGH = (
     (0.272, 5.0),
     (0.272, 10.0),

@@ -101,7 +101,8 @@ def referee(
         lens.transmission() * np.exp(1j * lens.phase_rad()) if light is None else light
     )
     half = len(sites) // 2
-    whole, first = np.zeros((count, count), complex), count // 2 - half * points
+    whole = np.zeros((count, count), complex)
+    first = count // 2 - half * points
     whole[
         first : first + 2 * half * points + 1 : points,
         first : first + 2 * half * points + 1 : points,
@@ -189,7 +190,8 @@ def field_rows() -> Iterator[Row]:
         wanted = judge.flux(
             (lens.sensor_distance_um * math.tan(angle), 0.0), DEPTH, WAVELENGTH
         )
-        before, after = (seconds, off(axis, wanted)), (took, off(true, wanted))
+        before = (seconds, off(axis, wanted))
+        after = (took, off(true, wanted))
         yield from pair(
             f"field angle of {degrees} deg",
             "plane waves, both polarisations",
@@ -211,7 +213,8 @@ def spectrum_rows() -> Iterator[Row]:
         for c, w in zip(some, weights / weights.sum(), strict=True)
     )
     (one, seconds), (all_, took) = seen(lens), seen(lens, spectrum=LED)
-    before, after = (seconds, off(one, wanted)), (took, off(all_, wanted))
+    before = (seconds, off(one, wanted))
+    after = (took, off(all_, wanted))
     yield from pair(
         "spectrum of 30 nm",
         f"plane waves of {LINES} wavelengths",
@@ -228,10 +231,8 @@ def medium_rows() -> Iterator[Row]:
     from referees.films import Stack
 
     lens, n = millimetre(), 1.51
-    distance, judge = (
-        lens.sensor_distance_um,
-        "plane waves of both polarisations through the films",
-    )
+    distance = lens.sensor_distance_um
+    judge = "plane waves of both polarisations through the films"
     glass = replace(lens, layers=Layers(behind=(Film(Index(n), 500.0),)))
     cast = replace(lens, cell=replace(lens.cell, cover=Index(1.5)), layers=Layers())
     for name, real, films in (
@@ -242,7 +243,8 @@ def medium_rows() -> Iterator[Row]:
             films, wavelength=WAVELENGTH, step=PITCH, count=COUNT + 1, near=NEAR
         ).flux(turned_light(lens, films[0][0]))
         (bare, seconds), (true, took) = seen(lens), seen(real)
-        before, after = (seconds, off(bare, wanted)), (took, off(true, wanted))
+        before = (seconds, off(bare, wanted))
+        after = (took, off(true, wanted))
         yield from pair(name, judge, before, after, stated(true))
 
 
@@ -268,7 +270,8 @@ def polarised_rows() -> Iterator[Row]:
         (0.24, millimetre(), DEPTH, COUNT, 1),
         (0.8, fast, 50.0, 3200, 2),
     ):
-        part, judge = f"polarisation, NA {na}", referee(lens, count, points=points)
+        part = f"polarisation, NA {na}"
+        judge = referee(lens, count, points=points)
         wanted = judge.flux((0.0, 0.0), depth, WAVELENGTH)
         view = View((depth,), window_um=NARROW * PITCH / points, samples=NARROW)
         middle = slice(count // 2 - 40, count // 2 + 41)
@@ -309,10 +312,8 @@ def pillar_rows() -> Iterator[Row]:
         )  # type: ignore[misc]
     (plain, seconds), (proxy, took) = proxies[(0.0,)], proxies[(0.0, 10.0, 20.0)]
     thickest = min(plain.domain_um[1], proxy.domain_um[1])  # that both know
-    focus, limits = (
-        Focus(WAVELENGTH, 240.0, DEPTH),
-        design.Limits(90, max(80, 1e3 * (cell.pitch_um - thickest))),
-    )
+    focus = Focus(WAVELENGTH, 240.0, DEPTH)
+    limits = design.Limits(90, max(80, 1e3 * (cell.pitch_um - thickest)))
     phase = design.phase_of(None, focus, radius_um=60.0)
     about = {
         "aperture_um": 120.3,
@@ -324,7 +325,8 @@ def pillar_rows() -> Iterator[Row]:
         seen(each, angle) for each in (lens, replace(lens, proxy=plain))
     )
     wanted = _met(lens, cell, angle)
-    before, after = (seconds, off(bare, wanted)), (took, off(true, wanted))
+    before = (seconds, off(bare, wanted))
+    after = (took, off(true, wanted))
     yield from pair(
         "angle at the pillars, 20 deg",
         "pillars by RCWA, plane waves",
@@ -371,10 +373,8 @@ def neighbour_rows() -> Iterator[Row]:
     _, after, before = rows_of_unlike.judged(
         lens, cut, rows_of_unlike.factor(lens, found, 0)
     )
-    part, judge = (
-        f"unlike neighbours, NA {na}",
-        "share of the power; 62 pillars solved whole",
-    )
+    part = f"unlike neighbours, NA {na}"
+    judge = "share of the power; 62 pillars solved whole"
     yield Row(part, LEFT, float("nan"), before, judge)
     yield Row(
         part, f"{TAKEN} by rows of {', '.join(map(str, counts))}", seconds, after, judge
@@ -480,7 +480,8 @@ def scene(edge: int) -> tuple[Array, Array]:
     draw = np.random.default_rng(5)
     f = np.hypot(np.fft.fftfreq(edge)[:, None], np.fft.fftfreq(edge)) + 0.5 / edge
     rough = np.fft.ifft2(np.fft.fft2(draw.standard_normal((edge, edge))) / f).real
-    down, across = np.linspace(0, 1, edge)[:, None], np.linspace(0, 1, edge)
+    down = np.linspace(0, 1, edge)[:, None]
+    across = np.linspace(0, 1, edge)
     depth = 1 / (1 / 3000 + (1 / 9000 - 1 / 3000) * (0.1 + 0.5 * down + 0.3 * across))
     return np.clip(1 + 0.4 * (rough - rough.mean()) / rough.std(), 0.05, None), depth
 

@@ -72,11 +72,10 @@ def lens_at(distance_um: float) -> Lens:
     """The lens of the example, from its cell file, for this sensor distance."""
     file = config.load(FILE, CellFile)
     proxy = library.proxy_of(library.sweep(file.cell, file.sweep))
-    focus, limits = design.Focus(WAVELENGTH_UM, distance_um), design.Limits(84, 80)
-    phase, about = (
-        design.phase_of(None, focus, radius_um=APERTURE_UM / 2),
-        {"limits": limits},
-    )
+    focus = design.Focus(WAVELENGTH_UM, distance_um)
+    limits = design.Limits(84, 80)
+    phase = design.phase_of(None, focus, radius_um=APERTURE_UM / 2)
+    about = {"limits": limits}
     cell: Cell = file.cell
     return design.make(
         phase,

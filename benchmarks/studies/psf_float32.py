@@ -74,7 +74,8 @@ def drawn(rng: np.random.Generator) -> Drawn:
     pitch, wavelength = rng.uniform(0.2, 0.7), rng.uniform(0.45, 1.6)
     shape = tuple(int(n) for n in rng.integers(*_pillars(kind), 2))
     half = max(max(shape) - 1, 1) / 2 * pitch
-    distance, source = half * rng.uniform(2, 12), half * 10 ** rng.uniform(1, 3)
+    distance = half * rng.uniform(2, 12)
+    source = half * 10 ** rng.uniform(1, 3)
     if kind == "large aperture":
         distance = half * rng.uniform(0.3, 2)
     if kind.startswith("wide"):
@@ -137,18 +138,19 @@ def _window(
     rng: np.random.Generator, kind: str, half: float, wavelength: float
 ) -> dict[str, Any]:
     """Where it lies and how large it is."""
-    samples, width = int(rng.integers(2, 25)), half * 10 ** rng.uniform(-2, 0)
+    samples = int(rng.integers(2, 25))
+    width = half * 10 ** rng.uniform(-2, 0)
     away = 0.5 * width * rng.uniform(-1, 1, 2)
     if kind == "tiny windows":
-        samples, width = (
-            int(rng.integers(2, 5)),
-            wavelength * 10 ** rng.uniform(-2, 0.3),
-        )
+        samples = int(rng.integers(2, 5))
+        width = wavelength * 10 ** rng.uniform(-2, 0.3)
         away = rng.uniform(-1, 1, 2) * half * rng.choice([0.05, 1.0])
     if kind == "window wider than the lens":
-        width, samples = 2 * half * rng.uniform(1, 4), int(rng.integers(8, 64))
+        width = 2 * half * rng.uniform(1, 4)
+        samples = int(rng.integers(8, 64))
     if kind.startswith("lens"):
-        width, samples = half * rng.uniform(0.1, 1), int(rng.integers(24, 80))
+        width = half * rng.uniform(0.1, 1)
+        samples = int(rng.integers(24, 80))
     if kind.startswith("wide"):
         width = wavelength * rng.uniform(200, 300)
         samples = int(width / (wavelength * rng.uniform(1, 2)))
@@ -230,7 +232,8 @@ def _plain(case: Drawn, stack: psf.PsfStack, points: Array) -> Array:
 
 def study(count: int, seed: int) -> list[Row]:
     """Both precisions on the same cases."""
-    rng, dtypes = np.random.default_rng(seed), (torch.float32, torch.float64)
+    rng = np.random.default_rng(seed)
+    dtypes = (torch.float32, torch.float64)
     found: list[tuple[str, list[tuple[float, float, str, bool]]]] = []
     refused, start = 0, time.perf_counter()
     while len(found) < count:

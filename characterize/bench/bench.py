@@ -218,10 +218,8 @@ def _alike(
     """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold;
     through glass one by one.
     """
-    distance, films = (
-        lens.sensor_distance_um + x[PLACE["distance_um"]],
-        FilmStack.of(lens.layers, lens.wavelength_um),
-    )
+    distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
+    films = FilmStack.of(lens.layers, lens.wavelength_um)
     ways: dict[_Way, list[int]] = {}
     for i, (z, angle) in enumerate(
         zip(depth_um.tolist(), angles_rad.tolist(), strict=True)
@@ -257,7 +255,8 @@ def _frames(
     lens: Lens, truth: HiddenLens, x: Array, t: Array, way: _Way, depth_um: Array
 ) -> Array:
     """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
-    camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
+    camera = truth.camera
+    distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
     wavelength_um = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
     across, down = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
     uneven = x[[PLACE[name] for name in LIGHT]]

@@ -301,7 +301,8 @@ def _short(
             )
             continue
         i = names.index(one.name)
-        own, untold = REACH * float(sigma[i]), REACH * float(unstated.sigma[i])
+        own = REACH * float(sigma[i])
+        untold = REACH * float(unstated.sigma[i])
         expected = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
         if untold >= one.within:
             most = [

@@ -23,7 +23,9 @@ from metalens.core import reading, store, transaction
 from metalens.core.arrays import Array
 from metalens.core.errors import CaptureError, MetalensError
 
-TIFF, PNG, HDF5 = (".tif", ".tiff", ".tf8", ".btf"), (".png",), (".h5", ".hdf5")
+TIFF = (".tif", ".tiff", ".tf8", ".btf")
+PNG = (".png",)
+HDF5 = (".h5", ".hdf5")
 LOSSY = (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = ColourChannels()
 Stack = tuple[Array, str]
@@ -256,7 +258,8 @@ def _load_folder(at: Path) -> Capture:
     files = folder.list_images(at, TIFF + PNG + HDF5 + LOSSY)
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
-    colours, order = ColourChannels.of(about, str(at)), axes.stated_axes(about, str(at))
+    colours = ColourChannels.of(about, str(at))
+    order = axes.stated_axes(about, str(at))
     said = [
         *(stage.left_out(files, rows) if rows else ()),
         *stage.unread_keys_text(about),

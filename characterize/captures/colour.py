@@ -39,7 +39,8 @@ class ColourChannels:
         Raises:
             CaptureError: an unknown channel or mosaic, a mosaic without a channel.
         """
-        channel, mosaic = about.pop("channel", None), about.pop("mosaic", "")
+        channel = about.pop("channel", None)
+        mosaic = about.pop("mosaic", "")
         if channel is not None and channel not in CHANNELS:
             raise CaptureError(
                 f"{where}: channel = {channel!r} in the capture's description; need one of {CHANNELS}"

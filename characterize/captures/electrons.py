@@ -179,10 +179,8 @@ def to_electrons(capture: Capture) -> ElectronFrames:
         raise CaptureError(
             "no usable pixel: all are saturated, hot or dead; lower the exposure"
         )
-    once, dark_e2 = (
-        gain.read_noise_e**2 + gain.gain_e**2 / 12,
-        (gain.gain_e * dark_error) ** 2,
-    )
+    once = gain.read_noise_e**2 + gain.gain_e**2 / 12
+    dark_e2 = (gain.gain_e * dark_error) ** 2
     return ElectronFrames(
         (raw - dark) / flat * gain.gain_e,
         np.broadcast_to(~bad, raw.shape).copy(),
@@ -354,7 +352,9 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
         notes.append(f"gain {gain:g} e/count as stated")
     elif capture.flat is not None and flats > 1:
         measured = photon_transfer(capture.flat, dark)
-        gain, sigma, known = measured.gain_e, measured.gain_sigma_e, True
+        gain = measured.gain_e
+        sigma = measured.gain_sigma_e
+        known = True
         notes.append(
             f"gain {gain:.3g} +- {sigma:.1g} e/count, measured in {flats} flat frames"
         )
@@ -371,7 +371,8 @@ def _gain(capture: Capture, notes: list[str]) -> SensorNoise:
         read = gain * math.sqrt(max(_floor(dark) - 1 / 12, 0.0))
         origin = f"measured in {len(dark)} dark frames"
     elif measured is not None:
-        read, origin = measured.read_noise_e, "from the flats' photon-transfer line"
+        read = measured.read_noise_e
+        origin = "from the flats' photon-transfer line"
         read_known = False
     else:
         read, origin, read_known = 2.0, "assumed", False  # electrons, of a usual sensor
@@ -394,11 +395,10 @@ def _dark_level(
             "fit's background and weigh as light; add dark.tif or state offset"
         )
         return 0.0, 0.0
-    level, error = (
-        np.mean(capture.dark, axis=0),
-        math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5),
-    )
-    offset, errors = level, np.full_like(level, error / math.sqrt(len(capture.dark)))
+    level = np.mean(capture.dark, axis=0)
+    error = math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5)
+    offset = level
+    errors = np.full_like(level, error / math.sqrt(len(capture.dark)))
     if gain.coarse:
         rounded = DarkStatistics.of(capture.dark)
         offset, errors = rounded.level, rounded.error

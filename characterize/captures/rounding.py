@@ -35,10 +35,8 @@ def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
             rounding, in counts, above 0.
     """
     off, noise = np.broadcast_arrays(np.asarray(off, float), np.asarray(noise, float))
-    score, information = (
-        np.asarray(off / (noise**2 + 1 / 12)),
-        np.asarray(1 / (noise**2 + 1 / 12)),
-    )
+    score = np.asarray(off / (noise**2 + 1 / 12))
+    information = np.asarray(1 / (noise**2 + 1 / 12))
     some = noise < _SMOOTH
     if some.any():
         x, s = off[some], noise[some]
@@ -60,7 +58,8 @@ def _score(off: Array, noise: Array) -> tuple[Array, Array]:
         (far - 0.5) / noise,
         (far + 0.5) / noise,
     )  # sigma to both edges of the count
-    log_near, log_beyond = special.log_ndtr(-near), special.log_ndtr(-beyond)
+    log_near = special.log_ndtr(-near)
+    log_beyond = special.log_ndtr(-beyond)
     log_chance = log_near + np.log1p(-np.exp(log_beyond - log_near))
     log_edge = -(near**2) / 2 - math.log(2 * math.pi) / 2
     edges = np.exp(log_edge - log_chance) * -np.expm1(-far / noise**2)
@@ -120,10 +119,8 @@ class DarkStatistics:
         share = special.softmax(weight, axis=1)
         mean = share @ place
         spread = np.sqrt(np.maximum(share @ place**2 - mean**2, 0.0))
-        level, error = (
-            counts.mean(0).ravel(),
-            np.full(near.shape, counts.std() / math.sqrt(len(counts))),
-        )
+        level = counts.mean(0).ravel()
+        error = np.full(near.shape, counts.std() / math.sqrt(len(counts)))
         level[near], error[near] = middle + mean[kind.ravel()], spread[kind.ravel()]
         return cls(
             level.reshape(counts.shape[1:]),

@@ -80,15 +80,14 @@ def _ome(path: Path, xml: str, pages: int) -> TiffTags:
         )
     samples = next(stage.ome_entries(xml, "Channel"), {}).get("SamplesPerPixel", "1")
     _one_channel(path, int(pixels.get("SizeC", 1)) // int(samples))
-    pixel, step, position = (
-        _ome_size(pixels, "X"),
-        _ome_size(pixels, "Z"),
-        stage.ome_positions(xml),
-    )
+    pixel = _ome_size(pixels, "X")
+    step = _ome_size(pixels, "Z")
+    position = stage.ome_positions(xml)
     planes, times = (max(int(pixels.get(f"Size{axis}", 1)), 1) for axis in "ZT")
     if len(position) or not math.isfinite(step) or step == 0 or planes == 1 < pages:
         return TiffTags(position, pixel, _words(pixel))
-    order, page = pixels.get("DimensionOrder", "XYZCT"), np.arange(pages)
+    order = pixels.get("DimensionOrder", "XYZCT")
+    page = np.arange(pages)
     place = page % planes if order.index("Z") < order.index("T") else page // times
     note = f"stage step of {step:.4g} um from the OME tags"
     return TiffTags(place * step, pixel, (note, *_words(pixel)))

@@ -44,11 +44,9 @@ def _plan(options: Options, path: Path) -> int:
         raise ConfigError(
             "--workers shares out the frames of --truth; a plan takes none"
         )
-    target, wanted, design = (
-        options.output,
-        config.load(path, BenchProtocol),
-        lenses.load(options.lens),
-    )
+    target = options.output
+    wanted = config.load(path, BenchProtocol)
+    design = lenses.load(options.lens)
     with options.claim(target) as draft:
         found = protocol.plan_captures(design, wanted, log_response_slopes(design))
         store.write_text(draft.path, _listed(found))

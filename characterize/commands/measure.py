@@ -137,10 +137,8 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[
     """Measure the modulation across an edge into the folder: numbers, text, and no
     failure.
     """
-    image, pixel = (
-        _cropped(picture.read_picture(options.source), options.crop),
-        float(options.edge_um or 0),
-    )
+    image = _cropped(picture.read_picture(options.source), options.crop)
+    pixel = float(options.edge_um or 0)
     found = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([found.frequency_per_um, found.modulation], 1)
     keep = found.frequency_per_um <= 1 / pixel
@@ -179,10 +177,8 @@ def _micrograph(
     scale = 1.0
     if options.design is not None:
         design = _drawn_round(options.design)
-        laid, scale = (
-            overlay.overlay_design(found, design),
-            overlay.lattice_scale(found, pixel, design),
-        )
+        laid = overlay.overlay_design(found, design)
+        scale = overlay.lattice_scale(found, pixel, design)
         sure = (
             laid.clearly and abs(scale - 1) < overlay.SCALE
         )  # elsewhere, other diameters were drawn

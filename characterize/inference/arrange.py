@@ -385,7 +385,8 @@ def _order(
                 unlike[i, j] = _distance(bright[j], bright[i]) / noise[j] ** 2
     finite = np.where(np.isfinite(apart), apart, 1e12)
     rows, columns = optimize.linear_sum_assignment(finite)
-    stated, best = float(np.trace(apart)), float(finite[rows, columns].sum())
+    stated = float(np.trace(apart))
+    best = float(finite[rows, columns].sum())
     neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
     distinct = bool(n > 1 and np.median(neighbours) > 0.2)
     return (

@@ -258,7 +258,8 @@ def _of_stop(task: SearchTask, x: Array, image: Array) -> Iterator[ImageChange]:
             model,
             dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1]))),
         ).images(x)[0]
-        amount_text, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
+        amount_text = "{:.3g} um"
+        sigma = _size(task, "stop_um") / _STOP_UM
         yield ImageChange(
             f"an aperture stop off along {'xy'[along]}",
             (moved - image)[None],
@@ -359,11 +360,9 @@ def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
     """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus
     there.
     """
-    k, radius, d = (
-        2 * math.pi / lens.wavelength_um,
-        lens.diameters.radius_um,
-        lens.reduced_um,
-    )
+    k = 2 * math.pi / lens.wavelength_um
+    radius = lens.diameters.radius_um
+    d = lens.reduced_um
     r = radius * np.hypot(u, v)
     sine = 1 / np.hypot(r, d) + (
         1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0
@@ -484,7 +483,8 @@ def _turn(turn_deg: float) -> Array:
     """(2, 2) of :func:`seen_at` for a camera turned from +x to +y about its window's
     middle.
     """
-    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    cosine = math.cos(math.radians(turn_deg))
+    sine = math.sin(math.radians(turn_deg))
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
@@ -492,7 +492,9 @@ def _sampled(model: ForwardModel, dense: int) -> ForwardModel:
     """The model of frames whose pixels lie ``dense`` times as close and stay as wide."""
     part = copy.copy(model)
     s, over = model.setting, math.ceil(model.grid.oversample / dense)
-    rows, columns, margin = dense * s.rows, dense * s.columns, dense * s.margin
+    rows = dense * s.rows
+    columns = dense * s.columns
+    margin = dense * s.margin
     now: dict[str, Any] = {"rows": rows, "columns": columns, "margin": margin}
     now |= {"pixel_um": s.pixel_um / dense, "fill": dense * s.fill}
     part.setting = dataclasses.replace(s, **now)

@@ -221,11 +221,9 @@ def _unrounded(
         task = dataclasses.replace(
             task, data=correct_quantization(counts, ends[0].image)
         )
-        before, ends = (
-            ends[0],
-            multistart.distinct_modes(
-                [multistart.refine_fit(task, end.value) for end in ends]
-            ),
+        before = ends[0]
+        ends = multistart.distinct_modes(
+            [multistart.refine_fit(task, end.value) for end in ends]
         )
         off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
         if np.abs(off).max() < _STAYS:
@@ -244,7 +242,8 @@ def _with_what_is_there(
     """
     if not gain.known:
         return task, ends, None
-    looked, doubts = missing.run_score_tests(task, ends[0]), list[ResidualFinding]()
+    looked = missing.run_score_tests(task, ends[0])
+    doubts = list[ResidualFinding]()
     for _ in range(4):  # causes, one after the other
         if not ends[0].converged:
             break
@@ -344,11 +343,12 @@ def _result(
     seen: Looked,
 ) -> AsBuilt:
     _, looked, doubts = seen
-    model, data, solution, names = task.model, task.data, found.best, task.names
-    fitted, unseen = (
-        dict(zip(names, solution.value.tolist(), strict=True)),
-        verdict.left_out(task, solution),
-    )
+    model = task.model
+    data = task.data
+    solution = found.best
+    names = task.names
+    fitted = dict(zip(names, solution.value.tolist(), strict=True))
+    unseen = verdict.left_out(task, solution)
     covariance = _with_gain(names, found, gain)
     unstated = looked.shifts()
     within = _within(found, covariance, names)
@@ -412,10 +412,8 @@ def _within(
     """The posterior with the error of the gain in what is counted in electrons."""
     value = found.best.value
     counted = uncertainty.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
-    low, high = (
-        np.minimum(found.low, value - counted),
-        np.maximum(found.high, value + counted),
-    )
+    low = np.minimum(found.low, value - counted)
+    high = np.maximum(found.high, value + counted)
     return WithinModel(covariance, low, high, found.draws)
 
 
@@ -460,7 +458,8 @@ def _findings(
     Residuals are taken over the noise that they have where more than the noise model
     gives is left, and where no gain says how much that is.
     """
-    data, r = task.data, solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
+    data = task.data
+    r = solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
     noise = np.sqrt(data.variance(solution.image))
     shared = data.shared(solution.image) / noise
     structure = verdict.correlated_residuals_text(

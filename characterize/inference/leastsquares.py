@@ -231,16 +231,16 @@ def fit_levenberg_marquardt(
     Raises:
         FitError: the model is not finite at the start, or no pixel is usable.
     """
-    settings, prior = settings or SolverSettings(), prior or GaussianPrior.none(start)
+    settings = settings or SolverSettings()
+    prior = prior or GaussianPrior.none(start)
     x = np.clip(np.asarray(start, float), prior.low, prior.high)
     if not data.usable.any():
         raise FitError("no usable pixel in the fit window; check masks and crop")
-    damping, converged, reason = (
-        1e-3,
-        False,
-        f"stopped after {settings.iterations} iterations",
-    )
-    state, iteration = _linearise(model, data, x, prior, settings, slopes), 0
+    damping = 1e-3
+    converged = False
+    reason = f"stopped after {settings.iterations} iterations"
+    state = _linearise(model, data, x, prior, settings, slopes)
+    iteration = 0
     while iteration < settings.iterations:
         iteration += 1
         step, image, damping, accepted = _step(
@@ -251,7 +251,8 @@ def fit_levenberg_marquardt(
         fresh = state.travel <= settings.near if accepted else state.travel == 0
         if not fresh and (done or moved < settings.near):
             x = state.x + step if accepted else state.x
-            state, damping = _linearise(model, data, x, prior, settings), 1e-3
+            state = _linearise(model, data, x, prior, settings)
+            damping = 1e-3
             continue
         if accepted and not done and _missed(state, step, image) > settings.miss:
             state = _linearise(model, data, state.x + step, prior, settings)

@@ -237,7 +237,8 @@ def expected_score_tests(task: SearchTask) -> UnmodelledShifts:
     that are as expected there.
     """
     image, slopes = task.model.images(task.start, task.names)
-    p, value = len(task.names), task.start[[PLACE[name] for name in task.names]]
+    p = len(task.names)
+    value = task.start[[PLACE[name] for name in task.names]]
     none = np.zeros_like(image)
     mode = FitSolution(
         value,

@@ -260,7 +260,8 @@ def lit_part(
         x: all parameters, of ``image`` (n, y, x).
     """
     light = np.maximum(image - background_planes(x, model.setting), 0.0)
-    information, out = (light**2 / data.variance(image) * data.usable).sum(0), []
+    information = (light**2 / data.variance(image) * data.usable).sum(0)
+    out = []
     for axis in (1, 0):
         share = np.cumsum(information.sum(axis)) / max(float(information.sum()), 1e-300)
         first, last = np.searchsorted(share, (_DARK / 4, 1 - _DARK / 4)).tolist()
@@ -284,7 +285,8 @@ def check_enough(data: FitImages, names: Sequence[str]) -> None:
         for name in names
         if not name.startswith(("log_gain", "background", "crosstalk", "decentre"))
     ]
-    frames, pixels = len(data.electrons), int((data.usable & ~data.saturated).sum())
+    frames = len(data.electrons)
+    pixels = int((data.usable & ~data.saturated).sum())
     if frames < 2 and len(lens) > MOST_OF_ONE_FRAME:
         raise CaptureError(
             f"one frame for {len(names)} parameters: defocus, wave front and bias look alike in one image; need frames "
@@ -328,10 +330,8 @@ def stated_priors(capture: Capture, lens: Lens) -> list[KnownValue]:
     Args:
         lens: the design.
     """
-    offset, usual_nm = (
-        (capture.wavelength_um - lens.wavelength_um) * 1e3,
-        usual_parameters(["wavelength_nm"], lens)[0].sigma,
-    )
+    offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
+    usual_nm = usual_parameters(["wavelength_nm"], lens)[0].sigma
     known = [
         KnownValue(
             "wavelength_nm",
@@ -387,10 +387,8 @@ def _beyond_table(lens: Lens) -> list[str]:
     """
     if lens.pairs is None:
         return []
-    kinds, reach_um = (
-        Kinds.of(lens.diameters),
-        usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3,
-    )
+    kinds = Kinds.of(lens.diameters)
+    reach_um = usual_parameters(("bias_nm",), lens)[0].sigma * 1e-3
     near = np.zeros(len(kinds.count), bool)
     for size, axis in (
         (kinds.width_um, lens.pairs.x_um),

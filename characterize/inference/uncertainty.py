@@ -138,7 +138,8 @@ def profile_parameters(
 def _profile(
     problem: FitProblem, mode: FitSolution, i: int, level: float
 ) -> ProfileLikelihood:
-    sigma, goal = math.sqrt(float(mode.covariance[i, i])), math.sqrt(level)
+    sigma = math.sqrt(float(mode.covariance[i, i]))
+    goal = math.sqrt(level)
     middle, along = float(mode.value[i]), mode.covariance[:, i] / sigma
     low, high = _PARABOLIC[0] ** 2 * level, _PARABOLIC[1] ** 2 * level
     places = [mode.value + sign * goal * along for sign in (-1, 1)]
@@ -196,7 +197,8 @@ def _profile_side(
         nearest = int(np.argmin(np.abs(np.array(places) - far)))
         here = [mode, *stops][nearest]
     order = np.argsort(places)
-    place, root = np.array(places)[order], np.maximum.accumulate(np.array(roots)[order])
+    place = np.array(places)[order]
+    root = np.maximum.accumulate(np.array(roots)[order])
     reached = bool(root[-1] > (1 - _CLOSE) * goal)
     if reached:
         k = min(int(np.searchsorted(root, goal)), len(root) - 1)
@@ -305,7 +307,8 @@ def _joined(
     """The posterior over all modes, with the errors of dark and flat."""
     best, names, prior = modes[0], task.names, task.prior
     spread = max(1.0, best.chi2_per_dof)
-    level, sigma = REACH**2 * spread, np.sqrt(spread * np.diag(best.covariance))
+    level = REACH**2 * spread
+    sigma = np.sqrt(spread * np.diag(best.covariance))
     low, high = best.value - REACH * sigma, best.value + REACH * sigma
     parabolic = np.ones(len(names), bool)
     for i, one in found.items():

@@ -404,10 +404,8 @@ def largest_angle_gap(angle_rad: Array) -> tuple[Array, Array] | None:
     apart = np.hypot(*(angles[:, None] - angles).T)
     np.fill_diagonal(apart, np.inf)
     nearest = angles[apart.argmin(1)]
-    wide, outer = (
-        int(apart.min(1).argmax()),
-        int(np.hypot(*(angles - angles.mean(0)).T).argmax()),
-    )
+    wide = int(apart.min(1).argmax())
+    outer = int(np.hypot(*(angles - angles.mean(0)).T).argmax())
     return (angles[wide] + nearest[wide]) / 2, angles[outer] + (
         angles[outer] - nearest[outer]
     ) / 2

@@ -35,7 +35,8 @@ class ImageLattice:
     @property
     def kind(self) -> str:
         """Square, hexagonal, rectangular or oblique, to 2 % and 1.5 degrees."""
-        one, other = float(np.linalg.norm(self.a)), float(np.linalg.norm(self.b))
+        one = float(np.linalg.norm(self.a))
+        other = float(np.linalg.norm(self.b))
         angle = math.degrees(
             math.acos(np.clip(float(self.a @ self.b) / one / other, -1, 1))
         )
@@ -57,10 +58,8 @@ class ImageLattice:
             - self.origin
         )
         index = corners @ np.linalg.inv(np.stack([self.b, self.a]))
-        low, high = (
-            np.floor(index.min(0)).astype(int),
-            np.ceil(index.max(0)).astype(int),
-        )
+        low = np.floor(index.min(0)).astype(int)
+        high = np.ceil(index.max(0)).astype(int)
         j, i = (
             g.ravel()
             for g in np.meshgrid(

@@ -234,10 +234,8 @@ def _second_moments(
         )
         w = light * mask
         total = w.sum()
-        cx, cy = (
-            float((w * x[None]).sum() / total),
-            float((w * y[:, None]).sum() / total),
-        )
+        cx = float((w * x[None]).sum() / total)
+        cy = float((w * y[:, None]).sum() / total)
         dx, dy = x[None] - cx, y[:, None] - cy
         xx, yy, xy = ((w * m).sum() / total for m in (dx * dx, dy * dy, dx * dy))
         root = math.hypot(xx - yy, 2 * xy)
@@ -279,10 +277,8 @@ def _within(light: Array, x: Array, y: Array, radius: float) -> float:
     row, column = np.nonzero(np.abs(distance - radius) < math.sqrt(0.5))
     lines = y[row, None] + (np.arange(16) - 7.5) / 16
     chord = np.sqrt(np.maximum(radius**2 - lines**2, 0))
-    low, high = (
-        np.maximum(x[column, None] - 0.5, -chord),
-        np.minimum(x[column, None] + 0.5, chord),
-    )
+    low = np.maximum(x[column, None] - 0.5, -chord)
+    high = np.minimum(x[column, None] + 0.5, chord)
     return whole + float((light[row, column] * np.maximum(high - low, 0).mean(1)).sum())
 
 

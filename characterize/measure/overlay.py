@@ -115,10 +115,8 @@ def _steps(lattice: ImageLattice, design: DiameterMap) -> Array:
         raise CaptureError(
             f"the picture shows a {lattice.kind} lattice, the design is {kind}"
         )
-    vectors, steps_um = (
-        np.stack([lattice.b, lattice.a]),
-        np.array(design.steps_um[::-1]),
-    )
+    vectors = np.stack([lattice.b, lattice.a])
+    steps_um = np.array(design.steps_um[::-1])
     vectors = vectors * np.sqrt(design.site_um2 / abs(np.linalg.det(vectors)))
     steps = np.rint(vectors / steps_um)
     long, expected = (np.linalg.norm(v, axis=1) for v in (vectors, steps * steps_um))
@@ -172,7 +170,8 @@ def bias_table(laid: MaskOverlay, *, knots: int = 7) -> Table:
             f"{int(good.sum())} pillars on the design; need {_LEAST} or more for a bias table"
         )
     order = np.argsort(laid.designed_nm[good], kind="stable")
-    drawn, error = laid.designed_nm[good][order], laid.error_nm[good][order]
+    drawn = laid.designed_nm[good][order]
+    error = laid.error_nm[good][order]
     rows = []
     for part in np.array_split(
         np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))
@@ -206,7 +205,9 @@ def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
     Least squares of made = a + b drawn under the mask, b within a third of 1; inf too
     where a pillar has no design.
     """
-    turned, weight, count = (patch * mask)[::-1, ::-1], mask[::-1, ::-1], mask.sum()
+    turned = (patch * mask)[::-1, ::-1]
+    weight = mask[::-1, ::-1]
+    count = mask.sum()
 
     def mean_of(one: Array, other: Array) -> Array:
         return np.asarray(signal.fftconvolve(one, other, mode="valid") / count)

@@ -249,7 +249,8 @@ def instrument_pixel_nm(path: Path) -> float | None:
 
     try:
         with tifffile.TiffFile(path) as file:
-            zeiss, fei = file.sem_metadata or {}, file.fei_metadata or {}
+            zeiss = file.sem_metadata or {}
+            fei = file.fei_metadata or {}
     except DAMAGE:
         return None
     sizes: list[float] = []
@@ -326,7 +327,9 @@ def _sharper(
     wider than a few blurs tells its
     own, whose noise offsets that of the levels of its rim and gap.
     """
-    radius, sigma, smooth = radius.copy(), sigma.copy(), radial.ray_smoothing(pitch)
+    radius = radius.copy()
+    sigma = sigma.copy()
+    smooth = radial.ray_smoothing(pitch)
 
     def own_blur(k: int) -> float:
         reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
@@ -370,7 +373,11 @@ def _pillar(
             (ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08
         )  # it lies elsewhere in its cell
         return row, column, math.nan, math.nan, not fallen, fallen
-    y, x, radius, sigma, scatter = row, column, math.nan, math.nan, math.inf
+    y = row
+    x = column
+    radius = math.nan
+    sigma = math.nan
+    scatter = math.inf
     for _ in range(4):
         edges = _edges(flat, y, x, pitch)
         if edges is None:
@@ -421,8 +428,10 @@ def _edges(
     shared = 0.25 / _independent(float(reach[rim])) + 0.25 / _independent(
         0.5 * (mean + 0.5 * pitch)
     )
-    edge, radius = terms @ np.array([mean, dy, dx, *oval]), math.sqrt(mean**2 + wide)
-    smooth, noise = radial.ray_smoothing(pitch), math.sqrt(noise * (own + shared))
+    edge = terms @ np.array([mean, dy, dx, *oval])
+    radius = math.sqrt(mean**2 + wide)
+    smooth = radial.ray_smoothing(pitch)
+    noise = math.sqrt(noise * (own + shared))
     taken = radial.drawn_in(reach, rays, edge, radius, smooth)
     true, unsure = radius + taken, _UNSURE * taken
     if blur is not None and not radial.is_wide_disc(radius, blur, smooth):
@@ -430,10 +439,8 @@ def _edges(
             radial.deblur_radius(reach, radius, blur, smooth),
             blur / (2 * radius),
         )
-        noise, unsure = (
-            noise * gain * _LEVELS,
-            _UNSURE * (plain + abs(true - radius - plain)),
-        )
+        noise = noise * gain * _LEVELS
+        unsure = _UNSURE * (plain + abs(true - radius - plain))
     error = math.hypot(noise, unsure)
     scatter = math.sqrt(rest.var() + wide) if good.mean() > _ROUND else math.inf
     return float(dy), float(dx), true, error, scatter

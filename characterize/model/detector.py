@@ -194,7 +194,8 @@ def detector_transfers(
     fy, fx = grid.frequencies()
     smooth, by_sigma = gaussian_transfer(fy, fx, crosstalk_px * wide_um)
     square = pixel_transfer(fy, fx, wide_um)
-    shared, image = square * smooth, [disc_transfer(fy, fx, size) for size in sizes_um]
+    shared = square * smooth
+    image = [disc_transfer(fy, fx, size) for size in sizes_um]
     some = np.maximum(sizes_um, _LEAST_DISC * wide_um)
     seen = (
         np.stack([disc_transfer(fy, fx, size)[1] for size in some])

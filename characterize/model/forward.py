@@ -178,11 +178,9 @@ class ForwardModel:
         Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5
         sin² / d is missed at X off it.
         """
-        part, reach = (
-            copy.copy(self),
-            max(
-                _NEAR_UM, *(abs(v) + self.setting.pixel_um for v in self.grid.middle_um)
-            ),
+        part = copy.copy(self)
+        reach = max(
+            _NEAR_UM, *(abs(v) + self.setting.pixel_um for v in self.grid.middle_um)
         )
         part.grid = dataclasses.replace(
             self.grid, middle_um=(float(middle_um[0]), float(middle_um[1]))
@@ -283,7 +281,9 @@ class ForwardModel:
         if x[_PITCH]:
             return self._off_pitch(x, wanted)
         light, slopes = self._light(x, wanted)
-        s, films, about = self.setting, self.films, {"centre_um": self.stage_centre_um}
+        s = self.setting
+        films = self.films
+        about = {"centre_um": self.stage_centre_um}
         scale = (
             pixel_brightness(
                 x, s, reference_um=self.reference_um, films=films, **about
@@ -336,11 +336,9 @@ class ForwardModel:
         self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None
     ) -> Light:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
-        s, wanted, wide_nm = (
-            self.setting,
-            list(wanted or ()),
-            float(x[PLACE["bandwidth_nm"]]),
-        )
+        s = self.setting
+        wanted = list(wanted or ())
+        wide_nm = float(x[PLACE["bandwidth_nm"]])
         names = list(
             dict.fromkeys(
                 "stage_zero_um" if name == "stage_scale" else name for name in wanted
@@ -477,13 +475,16 @@ class ForwardModel:
         """(frames, q, p) smooth phase on the nodes: bench geometry less what was taken
         off, aberrations; light.
         """
-        reduced, index, nominal = group.reduced, group.index, group.reduced.bench
+        reduced = group.reduced
+        index = group.index
+        nominal = group.reduced.bench
         here = reduced.x_um, reduced.y_um
         wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
         k = 2 * math.pi / wavelength_um
         d = nominal.distance_um + x[PLACE["distance_um"]]
         lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
-        tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
+        tx = nominal.tangents[0] + lean[0]
+        ty = nominal.tangents[1] + lean[1]
         held = self.grid.middle_um
         chief = reduced.films.chief_um(d, (tx, ty))
         centre = (
@@ -565,11 +566,9 @@ class ForwardModel:
         """
         near, far = self._reduced(x, group)
         shrink = near / far
-        blur, sizes, kind = (
-            x[PLACE["crosstalk_px"]],
-            x[PLACE["pinhole_um"]] * shrink,
-            real_of(group.reduced.kind),
-        )
+        blur = x[PLACE["crosstalk_px"]]
+        sizes = x[PLACE["pinhole_um"]] * shrink
+        kind = real_of(group.reduced.kind)
         return detector.detector_transfers(
             grid or self.grid,
             blur,

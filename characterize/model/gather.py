@@ -127,12 +127,10 @@ def _lit(real: Array, imaginary: Array, place: Array, turns: Array, out: Array) 
     r = real.shape[1]
     for j in range(place.shape[1]):
         for i in range(place.shape[0]):
-            a, b, c, s = (
-                real[place[i, j]],
-                imaginary[place[i, j]],
-                turns[i, j].real,
-                turns[i, j].imag,
-            )
+            a = real[place[i, j]]
+            b = imaginary[place[i, j]]
+            c = turns[i, j].real
+            s = turns[i, j].imag
             for k in range(r):
                 out[j, i, k] = a[k] * c - b[k] * s
                 out[j, i, r + k] = a[k] * s + b[k] * c

@@ -192,15 +192,11 @@ class RaySeries:
 
 @functools.lru_cache(maxsize=256)
 def _rays(films: FilmStack, distance_um: float, most_um2: float) -> RaySeries:
-    pairs, order = (
-        films.pairs(distance_um),
-        (films.filling, *(n for n, _ in films.behind)),
-    )
+    pairs = films.pairs(distance_um)
+    order = (films.filling, *(n for n, _ in films.behind))
     node, to_series = _nodes()
-    w, along_um = (
-        media.solve_direction_square(pairs, most_um2 / 2 * (1 + node)),
-        sum(n * t for n, t in pairs),
-    )
+    w = media.solve_direction_square(pairs, most_um2 / 2 * (1 + node))
+    along_um = sum(n * t for n, t in pairs)
     level = np.sqrt(
         media.passed_at(order, w) / media.area_spreading_of_square(pairs, w)
     )
@@ -310,7 +306,8 @@ def extra_path(
         across = np.sqrt(np.maximum(r2 - along**2, 0.0))
         s = across / np.sqrt(r2)
         for _ in range(3):
-            outside, inside = np.sqrt(1 - s * s), np.sqrt(INDEX**2 - s * s)
+            outside = np.sqrt(1 - s * s)
+            inside = np.sqrt(INDEX**2 - s * s)
             missed = across - (along - t) * s / outside - t * s / inside
             s = s + missed / ((along - t) / outside**3 + t * INDEX**2 / inside**3)
         outside, inside = np.sqrt(1 - s * s), np.sqrt(INDEX**2 - s * s)

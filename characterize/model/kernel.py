@@ -277,12 +277,11 @@ def low_rank_factors(table: Array, tolerance: float) -> tuple[Array, Array, Arra
         raise FitError(
             f"{table.dtype} tables of {table.shape} hold {least:.1g} of their norm, not {tolerance:g}"
         )
-    rng, total = np.random.default_rng(0), float(np.linalg.norm(table)) ** 2
-    found, most, missing = (
-        np.empty((len(table), 0), table.dtype),
-        min(table.shape),
-        total,
-    )
+    rng = np.random.default_rng(0)
+    total = float(np.linalg.norm(table)) ** 2
+    found = np.empty((len(table), 0), table.dtype)
+    most = min(table.shape)
+    missing = total
     while found.shape[1] < most:
         count = min(_BLOCK, most - found.shape[1])
         block = table @ rng.standard_normal((table.shape[1], count)).astype(

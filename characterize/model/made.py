@@ -77,7 +77,9 @@ def _of_two_sizes(
     lens: Lens, response: Sensitivity, bias_um: Array, answers: Array
 ) -> Array:
     """(y, x) t by the table of the lens; what is no pillar is that of some."""
-    d, kinds, pairs = lens.diameters, Kinds.of(lens.diameters), response.pairs
+    d = lens.diameters
+    kinds = Kinds.of(lens.diameters)
+    pairs = response.pairs
     if pairs is None:
         raise FitError("pillars of two sizes: slopes of such pillars are needed")
     index = np.minimum(kinds.index(d), len(kinds.count) - 1)

@@ -151,7 +151,8 @@ def _source_digest() -> str:
 
 def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
     """All that the slopes of a lens come from, as text."""
-    d, cell = lens.diameters.diameter_um[lens.diameters.diameter_um > 0], lens.cell
+    d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
+    cell = lens.cell
     films = [film.material for film in (*cell.under, *cell.over)]
     sections = [
         one

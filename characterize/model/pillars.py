@@ -73,10 +73,8 @@ class ChangeRange:
         """Of lenses for a wavelength: lengths are larger where it is longer
         (``made.coarser``).
         """
-        more, rows = (
-            wavelength_scale(wavelength_um),
-            zip(_ROWS, cls().answers, strict=True),
-        )
+        more = wavelength_scale(wavelength_um)
+        rows = zip(_ROWS, cls().answers, strict=True)
         answers = tuple(
             amount * prior_scale(row.name, wavelength_um) for row, amount in rows
         )
@@ -293,7 +291,8 @@ class PillarResponse:
         """(b, *shape) derivatives of :meth:`weights` by the bias, from their values
         there.
         """
-        x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
+        x = np.asarray(bias_um) / self.span.bias_um
+        reach = self.span.bias_um
         slope = np.empty_like(weights)
         slope[0], slope[1] = 0.0, 1.0
         for n in range(2, len(weights)):
@@ -322,10 +321,8 @@ class PillarResponse:
         random = np.random.default_rng(99)
         worst = 0.0
         for _ in range(40):
-            change, bias = (
-                _draw(random, self.span, self._waves()),
-                random.uniform(-0.7, 0.7) * self.span.bias_um,
-            )
+            change = _draw(random, self.span, self._waves())
+            bias = random.uniform(-0.7, 0.7) * self.span.bias_um
             c = self.weights(np.array(bias)) @ self.coefficients(change)
             worst = max(
                 worst,

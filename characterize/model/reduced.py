@@ -352,10 +352,8 @@ class CompressedLens:
     def _operators_of(
         self, wavelength_um: float, distance_um: float, axes_um: Axes, edge_um: float
     ) -> WindowOperators:
-        usual_um, films = (
-            self.bench.distance_um,
-            FilmStack.of(self._layers, wavelength_um),
-        )
+        usual_um = self.bench.distance_um
+        films = FilmStack.of(self._layers, wavelength_um)
         nominal = CompressedKernel(
             self.k,
             self._p,
@@ -443,11 +441,10 @@ class CompressedLens:
         y, x = axes_um
         wy, wx = float(np.abs(y).max()), float(np.abs(x).max())
         w, m = kernel.counts(wy, wx, self.tolerance)
-        Y, X = legendre.mapped_nodes(w, -wy, wy), legendre.mapped_nodes(w, -wx, wx)
-        P, Q = (
-            legendre.mapped_nodes(m, *self._p),
-            legendre.mapped_nodes(m, *self._q)[:, None],
-        )
+        Y = legendre.mapped_nodes(w, -wy, wy)
+        X = legendre.mapped_nodes(w, -wx, wx)
+        P = legendre.mapped_nodes(m, *self._p)
+        Q = legendre.mapped_nodes(m, *self._q)[:, None]
         weight = np.where(
             np.hypot(*self._on_lens(P, Q)) < 1.03 * self.radius_um, 1.0, _BESIDE
         )
@@ -456,10 +453,8 @@ class CompressedLens:
             1.0,
             _BESIDE,
         )
-        table, kind = (
-            np.empty((w, w, m, m), self.kind),
-            self.kind if len(rests) == 1 else complex,
-        )
+        table = np.empty((w, w, m, m), self.kind)
+        kind = self.kind if len(rests) == 1 else complex
         for layer, height, share in zip(table, Y, seen, strict=True):
             parts = [
                 s * of.rest(P, Q, X[:, None, None], height, kind)

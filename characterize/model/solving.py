@@ -61,7 +61,9 @@ def solved_transmission(lens: Lens) -> Solved | None:
         CellError, MaterialError: cells that the solver does not take.
     """
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-    least, most, pitch = float(d.min()), float(d.max()), lens.cell.pitch_um
+    least = float(d.min())
+    most = float(d.max())
+    pitch = lens.cell.pitch_um
     some = np.clip(np.linspace(least, most, _JUDGED), *lens.proxy.domain_um)
     exact = [
         modal.solve(lens.cell, one, lens.wavelength_um, tolerance=TOLERANCE).t
@@ -73,7 +75,8 @@ def solved_transmission(lens: Lens) -> Solved | None:
     if np.abs(ratio * np.exp(-1j * np.angle(ratio.mean())) - 1).max() > _SAME:
         return None
     reach = REACH_UM * wavelength_scale(lens.wavelength_um)
-    low, high = max(least - reach, 0.03 * pitch), min(most + reach, 0.985 * pitch)
+    low = max(least - reach, 0.03 * pitch)
+    high = min(most + reach, 0.985 * pitch)
     return _solved(lens.cell, lens.wavelength_um, round(low, 6), round(high, 6))
 
 

@@ -77,10 +77,8 @@ def _modes() -> tuple[Array, Array, Array]:
     t = np.linspace(-1, 1, _GRID)
     u, v = np.meshgrid(t, t)
     inside = np.hypot(u, v) <= 1
-    splines, known = (
-        _splines(u, v).reshape(KNOTS**2, -1),
-        _known(u, v).reshape(-1, _GRID**2),
-    )
+    splines = _splines(u, v).reshape(KNOTS**2, -1)
+    known = _known(u, v).reshape(-1, _GRID**2)
     disc = inside.ravel()
     taken = np.linalg.lstsq(known[:, disc].T, splines[:, disc].T, rcond=None)[0].T
     rest = (splines - taken @ known).reshape(-1, _GRID, _GRID)

@@ -158,10 +158,8 @@ class WindowOperators:
             )
         light = light.astype(kind, copy=False)
         out = np.zeros((*light.shape[:-2], ny, nx), kind)
-        flat, result = (
-            light.reshape(-1, *light.shape[-2:]),
-            out.reshape(-1, *out.shape[-2:]),
-        )
+        flat = light.reshape(-1, *light.shape[-2:])
+        result = out.reshape(-1, *out.shape[-2:])
 
         def some(first: int, last: int) -> None:
             frames = flat[first:last].reshape(-1, flat.shape[-1])
@@ -222,7 +220,8 @@ def axis_operators(
         float(at_um[0]), float(at_um[-1]), len(at_um), band, tolerance, rim_um
     )
     middle = (nodes[0] + nodes[-1]) / 2
-    turn, carrier = k * by(nodes, coarse[:, None]), k * by(middle, coarse[:, None])
+    turn = k * by(nodes, coarse[:, None])
+    carrier = k * by(middle, coarse[:, None])
     value = np.exp(1j * (turn - carrier))
 
     def moved(name: str) -> Array:

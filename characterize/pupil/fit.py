@@ -312,9 +312,11 @@ def fit_optics(
     spec = model.spec
     if not spec.free:
         return model, ()
-    low, planes = _lower(spec, 6, 2), np.arange(0, len(model.position_um), every)
+    low = _lower(spec, 6, 2)
+    planes = np.arange(0, len(model.position_um), every)
     part = PupilModel(low, model.position_um[planes])
-    part_mean, some = transfer_parameters(mean, model, part), data.planes(planes)
+    part_mean = transfer_parameters(mean, model, part)
+    some = data.planes(planes)
     start = fit_low_orders(part, some, part_mean)
     found = maximize_likelihood(part, some, start, part_mean, iterations=40, step=0.1)
     optics, position_um = part.optics_at(found.value)
@@ -354,12 +356,14 @@ def score_held_out(
     fitted = np.union1d(planes[::every], planes[-1])
     hidden = np.setdiff1d(planes, fitted)
     exact = replace(model.spec, stage_sigma_um=0.0)
-    part, some = PupilModel(exact, model.position_um[fitted]), data.planes(fitted)
+    part = PupilModel(exact, model.position_um[fitted])
+    some = data.planes(fitted)
     part_mean = transfer_parameters(mean, model, part)
     start = fit_low_orders(part, some, part_mean)
     solution = maximize_likelihood(part, some, start, part_mean)
     value = transfer_parameters(solution.value, part, model)
-    background, rest = model.background(value)[hidden], data.planes(hidden)
+    background = model.background(value)[hidden]
+    rest = data.planes(hidden)
     spline = predict_by_splines(model.position_um, data, fitted, hidden)
     pupil = model.images(value, False)[0][hidden]
     return (
@@ -439,7 +443,8 @@ def maximize_likelihood(
         step: standard errors of a step at which it stops.
     """
     width, spec = np.full(len(start), np.inf), model.spec
-    low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
+    low = np.full(len(start), -np.inf)
+    high = np.full(len(start), np.inf)
     sigma, least, most = (model.unpack(one) for one in (width, low, high))
     sigma["phase"][:] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
     sigma["amplitude"][:] = [0.5 / n for n, _ in model.amplitude_indices]

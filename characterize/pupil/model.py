@@ -188,7 +188,8 @@ class PupilModel:
         """Names of the parameters with their units, by group, in the order of the
         parameter vector.
         """
-        planes, degrees = range(len(self.position_um)), range(self.spec.drift_order + 1)
+        planes = range(len(self.position_um))
+        degrees = range(self.spec.drift_order + 1)
         name = zernike.zernike_name
         return {
             "phase": [f"phase {name(i)} / rad" for i in self.phase_indices],
@@ -250,7 +251,8 @@ class PupilModel:
         dipoles = self.covered * dipole_components(
             along_x, along_y, vectorial=spec.vectorial
         )
-        grid, blur_um = replace(self.grid, pixel_um=spec.pixel_um), parts["blur"][0]
+        grid = replace(self.grid, pixel_um=spec.pixel_um)
+        blur_um = parts["blur"][0]
         plain = grid.oversample == 1 and not spec.bead_um
         sharp = bool(plain and blur_um <= _SHARP * spec.pixel_um)
         cut = slice(grid.margin, -grid.margin) if sharp else slice(None)
@@ -298,7 +300,8 @@ class PupilModel:
             slopes[first : first + block] = (
                 slope if sharp else grid.sample(slope, transfer)
             )
-        count, drift = len(self._columns), self.drift_basis[:, :, None, None] * scale
+        count = len(self._columns)
+        drift = self.drift_basis[:, :, None, None] * scale
         np.multiply(slopes[:count], scale, out=out[:count])
         np.multiply(drift, slopes[count], out=into["drift_x"])
         np.multiply(drift, slopes[count + 1], out=into["drift_y"])

@@ -102,7 +102,8 @@ def load_retrained(path: Path) -> FinishedRun:
         return load_finished_run(path)
     job = "retrained" if path == folder else path.stem
     transaction.check_manifest(folder)
-    recipe, places = config.load(folder / RECIPE, RetrainingRecipe), _places(folder)
+    recipe = config.load(folder / RECIPE, RetrainingRecipe)
+    places = _places(folder)
     for name, sha in (
         ("run", recipe.weights),
         ("asbuilt", recipe.asbuilt),

@@ -382,7 +382,8 @@ def retraining_outcome(
         source: finished run: its network, lens and sensor. config: of the retraining.
         found: PSFs of the lenses in question. trained: trainings by name of the job.
     """
-    nominal, frames = (found.nominal,), render_test_frames(source, config)
+    nominal = (found.nominal,)
+    frames = render_test_frames(source, config)
     untouched = make_trainer(source, config, nominal)
 
     def of(going: Trainer, stacks: Sequence[PixelPsfStack]) -> NetworkAccuracy:

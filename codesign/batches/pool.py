@@ -139,10 +139,8 @@ class PoolScenes:
             rows: numbers of the frames.
         """
         pool = self.held
-        here, place = (
-            torch.from_numpy(pool.here_um),
-            torch.from_numpy(pool.place_um[rows]),
-        )
+        here = torch.from_numpy(pool.here_um)
+        place = torch.from_numpy(pool.place_um[rows])
         low, high = pool.depths_um
         scale = draw_depth_scales(
             place[:, 2], (float(low), float(high)), self.spread, generator

@@ -39,7 +39,9 @@ from metalens import lens
 from metalens.core import config, report, store, transaction
 from metalens.core.errors import ConfigError
 
-CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
+CHECKPOINT = "checkpoint.safetensors"
+LOG = "log.jsonl"
+SETTINGS = "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
 SHOWN = 8  # test frames that are kept with the answers
 

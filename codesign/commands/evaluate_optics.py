@@ -188,10 +188,8 @@ def tuned_like(lens: Lens, setting: MeasurementSettings) -> list[tuple[str, Lens
     Args:
         setting: how lenses are measured.
     """
-    radius, measured = (
-        lens.diameters.radius_um + lens.diameters.pitch_um / 2,
-        setting.about(lens),
-    )
+    radius = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    measured = setting.about(lens)
     focus = Focus(
         lens.wavelength_um,
         lens.sensor_distance_um,

@@ -193,10 +193,8 @@ def _beyond(result: RunResult) -> dict[str, Any]:
     within = result.within
     if within.all():
         return {}
-    axial, slips = (
-        result.slip_error_mm[:, 2],
-        np.unique(result.trial.slip_mm[~within], axis=0),
-    )
+    axial = result.slip_error_mm[:, 2]
+    slips = np.unique(result.trial.slip_mm[~within], axis=0)
     return {
         "trained_to_mm": list(result.reach_mm), "beyond_training_mm": slips.tolist(),
         "slip_axial_within_mm": float(axial[within].mean()), "slip_axial_beyond_mm": float(axial[~within].mean()),

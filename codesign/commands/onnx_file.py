@@ -13,7 +13,8 @@ from metalens.psf import pixel_count
 
 def scale_of(run: CodesignRun) -> exported.OutputScale:
     """What a run's networks answer in."""
-    inner, pitch = run.settings.inner, float(run.trainer.model.pitch_um.detach())
+    inner = run.settings.inner
+    pitch = float(run.trainer.model.pitch_um.detach())
     return exported.OutputScale(
         frame_mm=pixels_of(run) * pitch * 1e-3,
         slip_mm=inner.slip_scale_mm,
@@ -25,7 +26,8 @@ def scale_of(run: CodesignRun) -> exported.OutputScale:
 
 def pixels_of(run: CodesignRun) -> int:
     """Pixels along a side of the run's sensor."""
-    settings, pitch = run.settings, float(run.trainer.model.pitch_um.detach())
+    settings = run.settings
+    pitch = float(run.trainer.model.pitch_um.detach())
     return pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
 
 

@@ -94,7 +94,8 @@ def _story(
             )
         )[-1]
     )
-    proposals, frames = [], retraining.render_test_frames(source, options.settings)
+    proposals = []
+    frames = retraining.render_test_frames(source, options.settings)
     states = correction.next_lenses(made, plan, result.parameters(), true)
     for state in console.track(states, total=len(states), label="next lens"):
         error = retraining.judge_network(

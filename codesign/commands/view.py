@@ -26,7 +26,10 @@ from metalens.view import (
     lens_panels,
 )
 
-LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
+LOG = "log.jsonl"
+RESULT = "result.json"
+LENS = "lens.h5"
+ANSWERS = "answers.h5"
 
 
 def run_panels(path: Path) -> list[Panel]:
@@ -189,7 +192,8 @@ def _bound(result: dict[str, Any]) -> list[Panel]:
     held = result.get("bound")
     if not held:
         return []
-    x, least = np.array(held["depth_mm"]), np.array(held["window_depth_mm"])
+    x = np.array(held["depth_mm"])
+    least = np.array(held["window_depth_mm"])
     words = (
         "Least standard deviation of any reader of the blur of one window, on axis: 1/f texture as wide as the PSFs, "
         "noise a thousandth of its power. Readers of real frames collect less."
@@ -314,10 +318,8 @@ def scene_panels(path: Path) -> list[Panel]:
     """
     held = store.load(path, "scene").arrays
     count = len(held["radiance"])
-    frames, full = (
-        [SliderAxis("frame", list(range(count)))],
-        float(np.iinfo(held["radiance"].dtype).max),
-    )
+    frames = [SliderAxis("frame", list(range(count)))]
+    full = float(np.iinfo(held["radiance"].dtype).max)
     far = (
         held["coverage"] > full / 2
     )  # the far sheet shows where it covers most of the pixel
@@ -419,7 +421,8 @@ def image_panels(path: Path) -> list[Panel]:
         SliderAxis("field, down", held["y_deg"].tolist(), "deg"),
         SliderAxis("field, across", held["x_deg"].tolist(), "deg"),
     ]
-    psf, step = held["psf"] / held["psf"].max(), float(about["pitch_um"])
+    psf = held["psf"] / held["psf"].max()
+    step = float(about["pitch_um"])
     parts = [
         (report.in_words(k.removeprefix("error_")), v)
         for k, v in sorted(about.items())

@@ -271,7 +271,8 @@ class NetworkReading:
             link: name of the row. base: image before the change.
             method: how the entry is determined. phase_rad: phase error of the pillars.
         """
-        gaze, psf = self.turn_rad(optics, base), image_difference(optics, base)
+        gaze = self.turn_rad(optics, base)
+        psf = image_difference(optics, base)
         return BudgetEntry(link, phase_rad, psf, gaze, method)
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
@@ -326,7 +327,8 @@ class NetworkReading:
         self, device: ImagingDevice, settings: OpticsConfig
     ) -> Iterator[BudgetEntry]:
         """What the network was trained with, switched off; not in the sum."""
-        believed, method = self.source.run.trainer.optics, "trained with, switched off"
+        believed = self.source.run.trainer.optics
+        method = "trained with, switched off"
         cases: list[tuple[str, Imager]] = []
         if believed.image == "true":
             cases += [("field", device.one_psf()), ("radiometry", device.evenly_lit())]
@@ -368,7 +370,8 @@ class NetworkReading:
         """What the network reads of frames through these optics; noise of the
         experiment's seeds.
         """
-        net, inner = self.source.run.trainer.model.net, self.source.settings.inner
+        net = self.source.run.trainer.model.net
+        inner = self.source.settings.inner
         read = []
         for subject, made in enumerate(subjects):
             frames = experiment.image_frames(
@@ -410,7 +413,8 @@ class ErrorBudget:
         if given.run is None:
             self.settings, frame, margin = settings_of(lens, given.fwhm_nm), 80, 8
         else:
-            trainer, scenes = given.run.run.trainer, given.run.settings.scenes
+            trainer = given.run.run.trainer
+            scenes = given.run.settings.scenes
             refuse_other_lens(lens, given.run.settings.optics)
             width = given.fwhm_nm or trainer.optics.fwhm_nm
             self.settings = replace(trainer.optics, image="true", fwhm_nm=width)
@@ -511,7 +515,8 @@ class ErrorBudget:
 
     def _image_tolerance(self) -> Iterator[BudgetEntry]:
         """The image of training against one formed at a quarter of its tolerance."""
-        link, fine = "image tolerance", assess.finer_image(self.settings)
+        link = "image tolerance"
+        fine = assess.finer_image(self.settings)
         if self.reading is None or self.smooth is None or fine is None:
             return
         asked = fine.image_tolerance, self.settings.image_tolerance

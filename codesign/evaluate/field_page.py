@@ -111,10 +111,8 @@ def field_tables(seen: Mapping[str, OverField]) -> list[Table]:
             bent, lost = (
                 _format_value(100 * v[k], 2) for v in (one.distortion, one.vignetting)
             )
-            chief, light = (
-                _format_value(one.chief_um[k, 0], 2),
-                _format_value(one.illumination[k], 3),
-            )
+            chief = _format_value(one.chief_um[k, 0], 2)
+            light = _format_value(one.illumination[k], 3)
             rows.append((label, f"{angle:g}", chief, bent, *focus, lost, light))
             mtf = [_format_value(v, 3) for pair in one.mtf[k].T for v in pair]
             curves.append((label, f"{angle:g}", *mtf))

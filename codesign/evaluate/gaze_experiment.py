@@ -131,7 +131,8 @@ class RunResult:
         no slippage: a device is zeroed
         where its wearer calibrates.
         """
-        error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
+        error = self.slip_mm - self.trial.slip_mm
+        judged = np.isfinite(self.gaze_deg)
         out = np.full_like(error, math.nan)
         for subject in np.unique(self.trial.subject):
             mine = self.trial.subject == subject
@@ -432,10 +433,8 @@ def _check(sources: Sequence[FinishedRun], config: ExperimentConfig) -> None:
         )
     slips = config.slips_mm[:, 2]
     for source in sources:
-        eye_mm, held = (
-            1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um,
-            source.settings.optics.depths_mm,
-        )
+        eye_mm = 1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um
+        held = source.settings.optics.depths_mm
         if not held[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= held[1]:
             raise ConfigError(
                 f"axial_mm {config.axial_mm}: eyes {eye_mm + slips.min():g} to {eye_mm + slips.max():g} mm before the "
@@ -588,7 +587,8 @@ def _result(
         np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
         for p in (predicted, exact)
     )
-    mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
+    mmacs = float(source.row["mmacs"])
+    reach = source.settings.scenes.slip_mm
     centre, iou = (
         torch.cat([getattr(a, f) for a in kept]).double().numpy()
         for f in ("centre", "iou")

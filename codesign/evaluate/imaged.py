@@ -140,14 +140,16 @@ def image_first_frames(
     reach = 0.98 * float(seen.min()), 1.02 * float(seen.max())
     optics = lens_imager(lens, camera, reach, fwhm_nm=fwhm_nm)
     inside = slice(margin, margin + camera.pixels)
-    plain, light = made.pinhole()[:, inside, inside], optics(made.frames)
+    plain = made.pinhole()[:, inside, inside]
+    light = optics(made.frames)
     if not float(light.sum()) > 0:
         raise SceneError("no light of these frames reaches the sensor")
     rows, columns, depths = (
         np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3]
     )
     psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
-    y_um, x_um = optics.plan.y_um.numpy()[rows], optics.plan.x_um.numpy()[columns]
+    y_um = optics.plan.y_um.numpy()[rows]
+    x_um = optics.plan.x_um.numpy()[columns]
     return ImagedFrames(
         plain.numpy().astype(np.float32),
         (light * (plain.sum() / light.sum())).numpy().astype(np.float32),

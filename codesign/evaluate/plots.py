@@ -156,8 +156,10 @@ def plot_samples(
         source: finished run: its network, lens and sensor.
         config: subjects, stimuli, slippage and calibration.
     """
-    scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
-    prepared, slips = prepare_run(source, image=config.image), config.slips_mm
+    scenes = source.run.scenes(EXPERIMENT)
+    net = source.run.trainer.model.net
+    prepared = prepare_run(source, image=config.image)
+    slips = config.slips_mm
     sensor = experiment_sensors([source], config)[0]
     points = len(config.stimuli_deg)
     count = min(subjects, config.subjects)
@@ -246,7 +248,8 @@ def plot_gaze_errors(results: Sequence[RunResult]) -> bytes:
     figure, axes = make_figure(1, 2, size=(10.5, 3.8))
     for ax, kind in zip(axes, (AXIAL, LATERAL), strict=True):
         for i, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
-            trial, shift = result.trial, (i - (len(results) - 1) / 2) * 1.1
+            trial = result.trial
+            shift = (i - (len(results) - 1) / 2) * 1.1
             keep = trial.group(kind) & np.isfinite(result.gaze_deg)
             for point in np.unique(trial.stimulus[keep]):
                 mine = keep & (trial.stimulus == point)

@@ -298,7 +298,8 @@ def _learn_slip(
     truth = learn.slip_mm / SLIP_SCALE_MM
     for rows in _steps(made.slip, len(features), passes, batch, rate=2e-3, decay=0.03):
         found = made.slip(features[rows])
-        miss, spread = found[:, :3] - truth[rows], found[:, 3:].clamp(-4, 2)
+        miss = found[:, :3] - truth[rows]
+        spread = found[:, 3:].clamp(-4, 2)
         uncertainty = (
             0.5 * miss.detach() ** 2 * torch.exp(-2 * spread) + spread
         ).mean()
@@ -401,7 +402,8 @@ def reader_table(found: dict[str, ReaderResult], config: ReaderConfig) -> Table:
         axial = (
             f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
         )
-        wide, covered = f"±{v['interval_mm']:.2f} mm", f"{100 * v['covered']:.0f} %"
+        wide = f"±{v['interval_mm']:.2f} mm"
+        covered = f"{100 * v['covered']:.0f} %"
         windows = f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})"
         rows.append(
             (

@@ -88,11 +88,9 @@ def ambiguity_pairs(
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
     """
-    rig, camera, motion = (
-        rig or CameraRig(),
-        camera or PinholeCamera(),
-        motion or MotionRanges(),
-    )
+    rig = rig or CameraRig()
+    camera = camera or PinholeCamera()
+    motion = motion or MotionRanges()
     kept: list[EyeStates] = []
     found = tried = 0
     while found < count:

@@ -32,11 +32,9 @@ def draw_lashes(opening: Tensor, draws: Array) -> Tensor:
     if len(columns) < 4:
         return torch.from_numpy(canvas).float()
     margins = seen.argmax(0), size - 1 - seen[::-1].argmax(0)
-    length, sink, rise = (
-        (0.12 + 0.2 * draws[1]) * len(columns),
-        0.8 * draws[2],
-        1.4 * draws[3],
-    )
+    length = (0.12 + 0.2 * draws[1]) * len(columns)
+    sink = 0.8 * draws[2]
+    rise = 1.4 * draws[3]
     for margin, down, share in ((margins[0], -1.0, 1.0), (margins[1], 1.0, 0.5)):
         roots = rng.choice(columns, 20 + int(80 * draws[4]))
         long = share * length * rng.uniform(0.4, 1.2, len(roots))
@@ -73,14 +71,10 @@ def soft_patches(size: int, draws: Array) -> Tensor:
     x = ((torch.arange(size) + 0.5) / size - 0.5)[None]
     y, out = x.T, torch.zeros(size, size)
     for k in range(1 + int(3 * draws[5])):
-        at_x, at_y = (
-            1.1 * ((draws[6] + 0.38 * k) % 1 - 0.5),
-            1.1 * ((draws[7] + 0.71 * k) % 1 - 0.5),
-        )
-        half_x, half_y = (
-            0.05 + 0.2 * ((draws[8] + 0.57 * k) % 1),
-            0.05 + 0.2 * ((draws[9] + 0.23 * k) % 1),
-        )
+        at_x = 1.1 * ((draws[6] + 0.38 * k) % 1 - 0.5)
+        at_y = 1.1 * ((draws[7] + 0.71 * k) % 1 - 0.5)
+        half_x = 0.05 + 0.2 * ((draws[8] + 0.57 * k) % 1)
+        half_y = 0.05 + 0.2 * ((draws[9] + 0.23 * k) % 1)
         turn = 3.1416 * ((draws[10] + 0.47 * k) % 1)
         u = (x - at_x) * np.cos(turn) + (y - at_y) * np.sin(turn)
         v = (y - at_y) * np.cos(turn) - (x - at_x) * np.sin(turn)

@@ -113,7 +113,8 @@ def _sampled(x: Any, words: Any, k: Any, lane: Any) -> Any:
     s, t = x[PLACE + at], x[PLACE + at + LANES]
     top, bottom = words[at], words[at + LANES]
     a, b = f32(i32(i32(top << half) >> half)), f32(i32(top >> half))
-    c, d = f32(i32(i32(bottom << half) >> half)), f32(i32(bottom >> half))
+    c = f32(i32(i32(bottom << half) >> half))
+    d = f32(i32(bottom >> half))
     s, t = s * s * (f32(3) - f32(2) * s), t * t * (f32(3) - f32(2) * t)
     above, below = a + (b - a) * s, c + (d - c) * s
     return (above + (below - above) * t) * f32(1 / STEPS)
@@ -353,11 +354,9 @@ def _shade_light(p: Any, x: Any) -> None:
     """
     for i in range(LANES):
         met, disc, pupil = x[INSIDE + i], x[DISC + i], x[PUPIL + i]
-        d, m, c = (
-            _vector(x, D + i, LANES),
-            _vector(x, M + i, LANES),
-            _vector(x, C + i, LANES),
-        )
+        d = _vector(x, D + i, LANES)
+        m = _vector(x, M + i, LANES)
+        c = _vector(x, C + i, LANES)
         ts, tc, seen = x[TS + i], x[TC + i], x[SEEN + i]
         near = _scaled(ts + met * (tc - ts), d)
         n = _blended(_scaled(f32(1) - met, m), met, c)

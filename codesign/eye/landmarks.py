@@ -124,7 +124,8 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         miss = here - iris_um
         if not t.requires_grad and float(miss.abs().max()) < SETTLED_UM:
             break
-        along_x, along_y = (right - left) / (2 * h), (down - up) / (2 * h)
+        along_x = (right - left) / (2 * h)
+        along_y = (down - up) / (2 * h)
         det = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
         det = torch.where(det.abs() < 1e3, 1e3, det)
         dx = (along_y[..., 1] * miss[..., 0] - along_y[..., 0] * miss[..., 1]) / det

@@ -464,10 +464,8 @@ def eye_axes(
         view: other cameras than the rig's.
     """
     axis, across, down = _turned(_face(rig, states, view), states)
-    side, rise = (
-        torch.tan(states.trait("kappa_x_rad")),
-        torch.tan(states.trait("kappa_y_rad")),
-    )
+    side = torch.tan(states.trait("kappa_x_rad"))
+    rise = torch.tan(states.trait("kappa_y_rad"))
     visual = (
         axis - side[:, None] * across - rise[:, None] * down
     )  # nose to -x, up to -y
@@ -532,15 +530,14 @@ def _turned(
     right, down, out = face
     gx, gy = states.gaze_rad[:, :1], states.gaze_rad[:, 1:]
     angle = torch.sqrt(gx**2 + gy**2 + 1e-24)
-    sine, fall = torch.sin(angle) / angle, 2 * (torch.sin(angle / 2) / angle) ** 2
+    sine = torch.sin(angle) / angle
+    fall = 2 * (torch.sin(angle / 2) / angle) ** 2
     toward = gx * right + gy * down
     axis = torch.cos(angle) * out + sine * toward
     across = right - gx * (fall * toward + sine * out)
     below = down - gy * (fall * toward + sine * out)
-    c, s = (
-        torch.cos(states.torsion_rad)[:, None],
-        torch.sin(states.torsion_rad)[:, None],
-    )
+    c = torch.cos(states.torsion_rad)[:, None]
+    s = torch.sin(states.torsion_rad)[:, None]
     return axis, c * across + s * below, c * below - s * across
 
 

@@ -166,10 +166,8 @@ def _compiled(
     values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
     ends = [*np.flatnonzero(np.diff(wide)) + 1, n]  # of runs of frames that are as wide
     for first, end in zip([0, *ends], ends, strict=False):
-        t, run = (
-            (camera.tangents(rig) * wide[first]).astype(np.float32),
-            slice(first, end),
-        )
+        t = (camera.tangents(rig) * wide[first]).astype(np.float32)
+        run = slice(first, end)
         out = (light[run], cover[run], depth[run], pupil[run])
         kernel.render_rows(
             values[run], factor[run], textures.packed_bank(seed), t, t, *out

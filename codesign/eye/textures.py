@@ -134,7 +134,8 @@ def _crypt(rng: np.random.Generator, rho: Array, turns: int) -> Array:
 
 def _bilinear(picture: Array, row: Array, column: Array) -> Array:
     r, c = np.floor(row).astype(int), np.floor(column).astype(int)
-    below, right = np.minimum(r + 1, picture.shape[0] - 1), (c + 1) % picture.shape[1]
+    below = np.minimum(r + 1, picture.shape[0] - 1)
+    right = (c + 1) % picture.shape[1]
     s, t = column - c, row - r
     c = c % picture.shape[1]
     top = picture[r, c] * (1 - s) + picture[r, right] * s
@@ -220,11 +221,9 @@ def _lashes(rng: np.random.Generator) -> Array:
     canvas = np.zeros((SIZE, 3 * SIZE), np.uint8)
     lean = rng.uniform(-0.25, 0.25)
     for root in np.arange(0, SIZE, rng.uniform(4.5, 8.0)) + rng.uniform(0, 3):
-        root, length, bend = (
-            root + rng.normal(0, 2.5),
-            rng.uniform(60, 235),
-            lean + rng.normal(0, 0.3),
-        )
+        root = root + rng.normal(0, 2.5)
+        length = rng.uniform(60, 235)
+        bend = lean + rng.normal(0, 0.3)
         along = np.linspace(0, 1, 12)
         x, y = root + SIZE + length * bend * along**2, length * along
         points = np.round(np.stack([x, y], 1) * 16).astype(np.int32)

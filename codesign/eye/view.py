@@ -67,5 +67,6 @@ def seen_axes(elevation_rad: float, view: CameraView) -> Tensor:
     down = torch.stack([zero, c, -s], 1)
     out = torch.stack([-a, -b * s, -b * c], 1)
     x, y, z = torch.stack([right, down, out], 1).unbind(2)
-    sine, cosine = torch.sin(view.roll_rad)[:, None], torch.cos(view.roll_rad)[:, None]
+    sine = torch.sin(view.roll_rad)[:, None]
+    cosine = torch.cos(view.roll_rad)[:, None]
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], 2)

@@ -273,7 +273,8 @@ def augment_irises(states: EyeStates, worn: DrawnAugmentations) -> EyeStates:
     Args:
         worn: augmentations of every frame.
     """
-    traits, size = states.traits.clone(), torch.from_numpy(worn.size["iris"])
+    traits = states.traits.clone()
+    size = torch.from_numpy(worn.size["iris"])
     traits[:, list(POPULATION).index("iris")] *= torch.where(size > 0, size, 1.0)
     return replace(states, traits=traits)
 
@@ -396,7 +397,8 @@ def _add_glints(canvas: _Canvas, labels: FrameLabels) -> None:
         for k in range(1 + int(4 * draws[5])):
             at = turn + 1.7 * k
             size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
-            dx, dy = x - px - apart * np.cos(at), y - py - apart * np.sin(at)
+            dx = x - px - apart * np.cos(at)
+            dy = y - py - apart * np.sin(at)
             canvas.light[i, 1] += (
                 radiance * canvas.cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
             )
@@ -423,26 +425,22 @@ def _add_spectacles(canvas: _Canvas) -> None:
     x, y = canvas.places
     for i, radiance, draws in canvas.having("reflection"):
         for k in range(1 + int(3 * draws[0])):
-            at_x, at_y = (
-                (draws[1] + 0.61 * k) % 1 - 0.5,
-                (draws[2] + 0.43 * k) % 1 - 0.5,
-            )
-            half_x, half_y = (
-                0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1),
-                0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1),
-            )
+            at_x = (draws[1] + 0.61 * k) % 1 - 0.5
+            at_y = (draws[2] + 0.43 * k) % 1 - 0.5
+            half_x = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1)
+            half_y = 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
             lean = 0.6 * (draws[5] - 0.5)
-            u, v = (x - at_x) + lean * (y - at_y), (y - at_y) - lean * (x - at_x)
+            u = (x - at_x) + lean * (y - at_y)
+            v = (y - at_y) - lean * (x - at_x)
             canvas.light[i] += (
                 radiance * canvas.cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
             )
     for i, width, draws in canvas.having("rim"):
-        radius, at, gap = (
-            0.45 + 0.5 * draws[6],
-            6.283 * draws[7],
-            0.30 + 0.17 * draws[8],
-        )
-        middle_x, middle_y = (radius - gap) * np.cos(at), (radius - gap) * np.sin(at)
+        radius = 0.45 + 0.5 * draws[6]
+        at = 6.283 * draws[7]
+        gap = 0.30 + 0.17 * draws[8]
+        middle_x = (radius - gap) * np.cos(at)
+        middle_y = (radius - gap) * np.sin(at)
         away = (
             torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
         )
@@ -530,7 +528,8 @@ def line_kernel(length_px: float, angle_rad: float) -> Tensor:
     reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     for along in ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach):
-        x, y = along * np.cos(angle_rad) + reach, along * np.sin(angle_rad) + reach
+        x = along * np.cos(angle_rad) + reach
+        y = along * np.sin(angle_rad) + reach
         column, row = (min(int(v), 2 * reach - 1) if reach else 0 for v in (x, y))
         s, t = (x - column, y - row) if reach else (0.0, 0.0)
         for dy, dx, weight in (

@@ -90,10 +90,8 @@ def angle_rad(one: Tensor, other: Tensor) -> Tensor:
     Args:
         one: to compare. other: the one it is compared with.
     """
-    a, b = (
-        one / one.norm(dim=-1, keepdim=True),
-        other / other.norm(dim=-1, keepdim=True),
-    )
+    a = one / one.norm(dim=-1, keepdim=True)
+    b = other / other.norm(dim=-1, keepdim=True)
     gap = ((a - b) ** 2).sum(-1)
     near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
     return 2 * torch.atan2(near, (a + b).norm(dim=-1))

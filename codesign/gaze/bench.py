@@ -124,10 +124,8 @@ def calibrated_error_deg(
         share: part of each person's frames that calibrates.
         test: people, their frames and where they look.
     """
-    how, known = (
-        how or SphereCalibrator(test.scenes.rig),
-        max(3, round(share * test.each)),
-    )
+    how = how or SphereCalibrator(test.scenes.rig)
+    known = max(3, round(share * test.each))
     looked, errors = looked_deg(test), []
     for first in range(0, test.people * test.each, test.each):
         mine = np.arange(first, first + known)

@@ -162,7 +162,8 @@ def calibrate_person(
     if not hidden:
         return person
     first = person.sphere(pupil, slip)
-    features, missed = np.concatenate([first, slip], 1), gaze_deg - first
+    features = np.concatenate([first, slip], 1)
+    missed = gaze_deg - first
     penalty = _penalty(features, missed, gaze_deg, hidden=hidden, seed=seed)
     return replace(
         person,

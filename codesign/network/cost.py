@@ -60,7 +60,9 @@ def backbone_cost(
         rows: blocks in order. inputs: channels of the input.
         stem_kernel: side of the stem's kernel.
     """
-    per_pixel, constant, stride = {2: inputs * stem * stem_kernel**2}, 0, 2
+    per_pixel = {2: inputs * stem * stem_kernel**2}
+    constant = 0
+    stride = 2
     for block in rows:
         if block.hidden != block.inputs:
             per_pixel[stride] = per_pixel.get(stride, 0) + block.inputs * block.hidden
@@ -181,10 +183,8 @@ def interpolate_counts(at: Callable[[Array], Array], size: Tensor | float) -> Te
     low = int(torch.floor(size.detach()))
     counts = at(np.arange(low - 1, low + 3)).astype(float)
     before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
-    slope, next_slope = (
-        _slope(here - before, after - here),
-        _slope(after - here, beyond - after),
-    )
+    slope = _slope(here - before, after - here)
+    next_slope = _slope(after - here, beyond - after)
     u = size - low
     return (
         here * (1 + 2 * u) * (1 - u) ** 2

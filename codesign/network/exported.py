@@ -106,11 +106,9 @@ def write_onnx(
     Raises:
         OSError: the target cannot be written.
     """
-    made, example, names = (
-        ExportedNetwork(net, scale),
-        torch.zeros(2, 1, size, size),
-        scale.outputs,
-    )
+    made = ExportedNetwork(net, scale)
+    example = torch.zeros(2, 1, size, size)
+    names = scale.outputs
     with replace_atomically(path) as part:
         with warnings.catch_warnings():
             warnings.simplefilter(

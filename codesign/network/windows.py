@@ -145,7 +145,8 @@ def window_content(maps: Tensor) -> Tensor:
     two of them wide.
     """
     height, width = (int(n) for n in maps.shape[-2:])
-    steps, sides = GRID + 1, (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
+    steps = GRID + 1
+    sides = (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
     coarse = F.avg_pool2d(maps, sides)
     if tuple(coarse.shape[-2:]) != (steps, steps):
         coarse = F.interpolate(
@@ -177,10 +178,8 @@ def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
     sides = [int(n) for n in x.shape[1:]]
     sides[along - 1 : along] = [GRID + 1, sides[along - 1] // (GRID + 1)]
     halves = x.reshape(-1, *sides).movedim(along + 1, -1)
-    before, after = (
-        halves.narrow(along, 0, GRID).flip(-1),
-        halves.narrow(along, 1, GRID),
-    )
+    before = halves.narrow(along, 0, GRID).flip(-1)
+    after = halves.narrow(along, 1, GRID)
     return after + before, after - before
 
 

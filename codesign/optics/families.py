@@ -52,7 +52,8 @@ def phase_terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor
         sine.append(sine[-1] * x + cosine[-2] * y)
         rings.append(rings[-1] * square)
         for m in range(-order, order + 1, 2):
-            wave, ring = (cosine if m >= 0 else sine)[abs(m)], (order - abs(m)) // 2
+            wave = (cosine if m >= 0 else sine)[abs(m)]
+            ring = (order - abs(m)) // 2
             found.append(rings[ring - 1] * wave if ring else wave)
         order += 1
     return found[:count]

@@ -181,14 +181,10 @@ def variance_rad2(state: State, rates: PhaseRates, *, rings: int = 12) -> float:
         rings: Gauss nodes over the radius.
     """
     node, weight = np.polynomial.legendre.leggauss(rings)
-    radius, turn = (
-        np.sqrt((node[:, None] + 1) / 2),
-        np.arange(2 * rings) * (math.pi / rings),
-    )
-    bias, answers = (
-        state.bias_um(radius * np.cos(turn), radius * np.sin(turn)),
-        state.answers(),
-    )
+    radius = np.sqrt((node[:, None] + 1) / 2)
+    turn = np.arange(2 * rings) * (math.pi / rings)
+    bias = state.bias_um(radius * np.cos(turn), radius * np.sin(turn))
+    answers = state.answers()
     mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
     c = rates.covariance
     return float(

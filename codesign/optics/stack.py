@@ -316,7 +316,8 @@ def _node_factor(
 ) -> Tensor:
     """(nodes, nodes) complex transmission on top of the hyperbolic focus."""
     if settings.parameters == "diameters":
-        seen, wave = _pupil_view(settings), pillar_wave(settings, coefficients_rad)
+        seen = _pupil_view(settings)
+        wave = pillar_wave(settings, coefficients_rad)
         angle = math.radians(settings.angle_deg)
         found = wave.factor(seen.x_um, seen.y_um, settings.focus.wavelength_um, angle)
         return torch.as_tensor(found)
@@ -447,10 +448,8 @@ def pillar_diameters(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor
         coefficients_rad: (pillars,) change of each from :func:`starting_lens`.
     """
     lens = starting_lens(settings)
-    start, domain_um = (
-        torch.from_numpy(lens.diameters.diameter_um),
-        lens.proxy.domain_um,
-    )
+    start = torch.from_numpy(lens.diameters.diameter_um)
+    domain_um = lens.proxy.domain_um
     low, high = domain_um
     ends = lens.proxy.phase_rad(np.array(domain_um), lens.wavelength_um)
     um_per_rad = (high - low) / float(ends[1] - ends[0])
@@ -558,7 +557,8 @@ def _carriers(settings: OpticsConfig) -> Tensor:
     """(depths, nodes, nodes) light of every source on the pupil behind the hyperbolic
     lens, complex64.
     """
-    seen, k = _pupil_view(settings), 2 * math.pi / settings.pupil.wavelength_um
+    seen = _pupil_view(settings)
+    k = 2 * math.pi / settings.pupil.wavelength_um
     tangents = Field(math.radians(settings.angle_deg)).tangents
     paths = [
         source_path(seen.x_um, seen.y_um, tangents, 1 / float(z))

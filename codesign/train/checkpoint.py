@@ -148,11 +148,9 @@ def settings_difference(old: str, settings: object) -> str:
     default is not what was done before
     needs another :data:`VERSION`.
     """
-    before, after, plain = (
-        _flat(old),
-        _flat(config.dumps(settings)),
-        _flat(config.dumps(_plain(settings))),
-    )
+    before = _flat(old)
+    after = _flat(config.dumps(settings))
+    plain = _flat(config.dumps(_plain(settings)))
     before = {key: value for key, value in plain.items() if key in after} | before
     keys = sorted(before.keys() | after.keys())
     changed = [k for k in keys if before.get(k) != after.get(k)]

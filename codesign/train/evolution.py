@@ -367,7 +367,8 @@ def uniform_architectures(space: SearchSpace) -> Iterator[Architecture]:
     Args:
         space: architectures to choose from.
     """
-    whole, least = largest_architecture(space), smallest_architecture(space)
+    whole = largest_architecture(space)
+    least = smallest_architecture(space)
     shallow = dataclasses.replace(whole, depths=least.depths)
     for width in sorted(space.widths, reverse=True):
         yield from (

@@ -123,7 +123,9 @@ def _end(
     shown: _Frames,
 ) -> BudgetResult:
     """The row of one budget; ``run`` holds the trainer that reached it."""
-    settings, trainer, architecture = run.settings, run.trainer, best.architecture
+    settings = run.settings
+    trainer = run.trainer
+    architecture = best.architecture
     net, inner = trainer.model.net, settings.inner
     recalibrate_batch_norm(net, architecture, shown.measured)
     row: dict[str, Any] = {

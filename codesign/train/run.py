@@ -276,7 +276,8 @@ def _affordable(run: CodesignRun, *, moves: bool) -> float:
     """
     settings = run.settings
     least = smallest_architecture(settings.space)
-    budget, begins = min(settings.run.budgets_mmacs) * 1e6, settings.run.pitch_um
+    budget = min(settings.run.budgets_mmacs) * 1e6
+    begins = settings.run.pitch_um
     count = _counter(run, least)
     if count(begins) > budget:
         coarsest = cost.coarsest_um(run.window_um, settings.space.resolution[0])

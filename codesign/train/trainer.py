@@ -449,10 +449,8 @@ class Trainer:
         }
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        moves, live = (
-            rates["pitch"] > 0,
-            rates["optics"] > 0 and "optics" in self.optimisers,
-        )
+        moves = rates["pitch"] > 0
+        live = rates["optics"] > 0 and "optics" in self.optimisers
         return self._take_step(
             self._prepare_step(self.step, batch, live=live, seen=not moves), rates
         )
@@ -462,10 +460,8 @@ class Trainer:
         means = running.keep_running_means(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
-        total, macs = (
-            task + self.inner.optics_weight * optics_loss.to(self.light.device),
-            each.mean(),
-        )
+        total = task + self.inner.optics_weight * optics_loss.to(self.light.device)
+        macs = each.mean()
         if self._budget:
             over = losses.over_budget(each, self._budget).mean()
             total = total + self.inner.budget_weight * over.to(self.light.device)
@@ -584,7 +580,8 @@ class Trainer:
         )
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
-        config, every = self.inner.separability, self.inner.separability.every
+        config = self.inner.separability
+        every = self.inner.separability.every
         if every and (self.triplets is None or step % every):
             return optics, torch.zeros(())
         made = lens.lens_psf_stack(

@@ -195,7 +195,8 @@ def _in_unit(library: MaskLibrary, unit_nm: float, where: str) -> MaskLibrary:
     def scaled(values: Array) -> Array:
         new = np.asarray(values, float) * ratio
         whole = np.rint(new)
-        off, far = np.abs(new - whole).max(initial=0), np.abs(whole).max(initial=0)
+        off = np.abs(new - whole).max(initial=0)
+        far = np.abs(whole).max(initial=0)
         if off > 1e-6 or far > 2**31 - 1:
             raise MaskFileError(
                 f"{where}: its database unit is {library.unit_nm:g} nm, and its "
@@ -262,7 +263,8 @@ def _lattice_boxes(plan: MaskPlan, lattice: PillarArray) -> list[Array]:
     where there are few.
     """
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
-    high, wide = -(-lattice.rows // _TILES), -(-lattice.columns // _TILES)
+    high = -(-lattice.rows // _TILES)
+    wide = -(-lattice.columns // _TILES)
     found = []
     for first, block in lattice.blocks(high):
         for left in range(0, lattice.columns, wide):

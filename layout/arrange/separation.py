@@ -96,7 +96,8 @@ def check_separation(
         raise ProcessError(
             f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer"
         )
-    gap, far = process.rules.minimum_gap_nm * PER_UM / 1e3, reach_um(process) * PER_UM
+    gap = process.rules.minimum_gap_nm * PER_UM / 1e3
+    far = reach_um(process) * PER_UM
     around = np.array([one.box() for one in standing])
     found: list[Violation] = []
     for n, one in enumerate(standing):
@@ -152,7 +153,8 @@ def _between(
 ) -> Iterator[Violation]:
     """At most one finding for each exposure that both have shapes of."""
     for kind in sorted(one.part.boxes.keys() & two.part.boxes.keys()):
-        first, second = one.moved(one.part.boxes[kind]), two.moved(two.part.boxes[kind])
+        first = one.moved(one.part.boxes[kind])
+        second = two.moved(two.part.boxes[kind])
         need = gap if kind == APERTURE else max(gap, scattered)
         first = (
             first[box_distance(first, box_around(second)) < need]
@@ -169,16 +171,15 @@ def _between(
             distance = box_distance(first, each)
             n = int(distance.argmin())
             if distance[n] < least:
-                least, box = float(distance[n]), box_around(np.stack([first[n], each]))
+                least = float(distance[n])
+                box = box_around(np.stack([first[n], each]))
         if least >= need:
             continue
         left, bottom, right, top = (int(v) for v in box)
         nm = least * 1e3 / PER_UM
         if least < gap:
-            limit, text = (
-                process.rules.minimum_gap_nm,
-                f"{one.text} to {two.text}, {kind}",
-            )
+            limit = process.rules.minimum_gap_nm
+            text = f"{one.text} to {two.text}, {kind}"
         else:
             limit = need * 1e3 / PER_UM
             text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"

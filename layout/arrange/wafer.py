@@ -103,7 +103,8 @@ def chord_um(wafer: WaferSettings) -> float:
 
 def _usable(wafer: WaferSettings, boxes: Array) -> Array:
     """(n,) whether boxes (n, 4) lie whole on the usable part."""
-    radius, exclusion = 500 * wafer.diameter_mm, 1e3 * wafer.edge_exclusion_mm
+    radius = 500 * wafer.diameter_mm
+    exclusion = 1e3 * wafer.edge_exclusion_mm
     far = np.hypot(np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1))
     inside = (far <= radius - exclusion + 1e-6) & (
         boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6

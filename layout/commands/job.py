@@ -152,10 +152,8 @@ class LayoutJob:
         """That the writer holds fewer doses than the tolerance needs; empty where it
         holds enough.
         """
-        needed, most = (
-            0 if self.dose is None else self.dose.needed,
-            self.process.exposure.maximum_classes,
-        )
+        needed = 0 if self.dose is None else self.dose.needed
+        most = self.process.exposure.maximum_classes
         return (
             f" ({needed} doses are needed, exposure.maximum_classes = {most})"
             if needed > most

@@ -143,7 +143,9 @@ def make_mask(
 
 def _checked(drawing: DrawnLens, plan: MaskPlan, dose: DoseLadder | None) -> LayoutJob:
     """A job whose write fields are planned and whose design rules are checked."""
-    source, rules, stages = drawing.source, drawing.process, drawing.stages
+    source = drawing.source
+    rules = drawing.process
+    stages = drawing.stages
     made = drawing.made
     with stages("write fields"):
         split = fields.split_write_fields(source.diameters, rules, drawn=made.cells)

@@ -113,8 +113,10 @@ def _lead(job: LayoutJob) -> str:
 
 def _key_figures(job: LayoutJob) -> list[KeyFigure]:
     found = job.drc
-    counts, same = found.counts, all(outcome.ok for outcome in job.compared.values())
-    broken, close = sum(counts.values()), counts["space"] + counts["overlap"]
+    counts = found.counts
+    same = all(outcome.ok for outcome in job.compared.values())
+    broken = sum(counts.values())
+    close = counts["space"] + counts["overlap"]
     gap, width = map(format_size, (found.minimum_space_nm, found.minimum_width_nm))
     return [
         KeyFigure("pillars", f"{found.shapes:,}"),
@@ -151,7 +153,8 @@ def _rules(found: DrcReport) -> Section:
 def _classes(job: LayoutJob, shots: dict[str, bytes]) -> Section:
     rules, classes = job.process.rules, job.plan.classes
     if not classes[0].round:
-        shape, area = job.source.cell.shape, [made.twice_area / 2 for made in classes]
+        shape = job.source.cell.shape
+        area = [made.twice_area / 2 for made in classes]
         two = job.source.pairs is not None
         kind = f"{shape.kind} of its own width and length" if two else shape.name
         turned = job.source.diameters.angle_rad is not None

@@ -36,7 +36,8 @@ def plot_die(plan: MaskPlan, found: DrcReport) -> bytes:
     shares = np.concatenate([image[np.isfinite(image)] for image in images])
     shown, reach = None, 0.0
     for lattice, image in zip(plan.lattices, images, strict=True):
-        left, top = lattice.x0 - lattice.pitch / 2, lattice.y0 + lattice.down / 2
+        left = lattice.x0 - lattice.pitch / 2
+        top = lattice.y0 + lattice.down / 2
         right = left + lattice.columns * lattice.pitch
         bottom = top - lattice.rows * lattice.down
         extent = np.array([left, right, bottom, top]) * scale
@@ -179,7 +180,8 @@ def _draw_figures(axes: Any, plan: MaskPlan, scale: float) -> float:
             drawn.setdefault(layer[0], []).extend(p * scale for p in polygons)
             names.setdefault(layer[0], plan.layer_names.get(layer, "layer"))
     for n, (number, shapes) in enumerate(sorted(drawn.items())):
-        name, colour = names[number].split("_dose_")[0], _COLOURS[n % len(_COLOURS)]
+        name = names[number].split("_dose_")[0]
+        colour = _COLOURS[n % len(_COLOURS)]
         fill, edge = (colour, "none") if name in _FILLED else ("none", colour)
         style: dict[str, Any] = {
             "facecolors": fill,

@@ -138,7 +138,8 @@ def _marks(path: Path) -> list[tuple[float, float, str]]:
                 float(number)
                 for number in box[4:].strip(" ()").replace(";", ",").split(",")
             ]
-            x, y = (corners[0] + corners[2]) / 2, (corners[1] + corners[3]) / 2
+            x = (corners[0] + corners[2]) / 2
+            y = (corners[1] + corners[3]) / 2
         except (ValueError, IndexError):
             continue
         found.append((x, y, f"{item.findtext('category', '').strip(chr(39))}"))

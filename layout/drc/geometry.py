@@ -166,7 +166,8 @@ def find_sharp_corners(contours: Sequence[Array]) -> list[ShapeMeasurement]:
         before = np.roll(points, 1, axis=0) - points
         after = np.roll(points, -1, axis=0) - points
         lengths = np.hypot(*before.T), np.hypot(*after.T)
-        scalar, product = (before * after).sum(1), lengths[0] * lengths[1]
+        scalar = (before * after).sum(1)
+        product = lengths[0] * lengths[1]
         rounding = 2**0.5 * (lengths[0] + lengths[1])
         for n in np.flatnonzero(scalar > product / 2 + rounding).tolist():
             angle = np.degrees(np.arccos(min(scalar[n] / product[n], 1.0)))
@@ -290,7 +291,8 @@ def _sweep_bands(
                 two = boxes[which[j]]
                 if two[0] + shift[j, 0] >= right:
                     break
-                bottom, next_bottom = one[1] + shift[i, 1], two[1] + shift[j, 1]
+                bottom = one[1] + shift[i, 1]
+                next_bottom = two[1] + shift[j, 1]
                 if int((max(bottom, next_bottom) - low) // height) != band:
                     continue
                 if (
@@ -499,5 +501,6 @@ def _clip_to_range(
     """
     if start == end:
         return (0.0, 1.0) if low <= start <= high else (1.0, 0.0)
-    first, last = (low - start) / (end - start), (high - start) / (end - start)
+    first = (low - start) / (end - start)
+    last = (high - start) / (end - start)
     return max(min(first, last), 0.0), min(max(first, last), 1.0)

@@ -190,7 +190,9 @@ class _LatticeCheck:
         """
         vector, first, second = np.nonzero(table)
         filled = (first > 0) & (second > 0)
-        vector, first, second = vector[filled], first[filled], second[filled]
+        vector = vector[filled]
+        first = first[filled]
+        second = second[filled]
         bound = np.hypot(*steps[vector].T) - radius[first] - radius[second]
         order = np.argsort(bound, kind="stable")
         edges = [contour_edges(outline[:1]) for outline in outlines]
@@ -260,7 +262,8 @@ class _LatticeCheck:
             count = locate_pairs(block, new, kind, vectors, marked, found)
             for row, column, vector in found[:count].tolist():
                 right, up = vectors[vector].tolist()
-                one, two = int(block[row, column]), int(block[row - up, column + right])
+                one = int(block[row, column])
+                two = int(block[row - up, column + right])
                 shapes = self.plan.classes[one - 1], self.plan.classes[two - 1]
                 places = (
                     self._place(top + row, column),
@@ -282,7 +285,9 @@ class _LatticeCheck:
         """
         vector, first, second = np.nonzero(table)
         filled = (first > 0) & (second > 0)
-        vector, first, second = vector[filled], first[filled], second[filled]
+        vector = vector[filled]
+        first = first[filled]
+        second = second[filled]
         away = np.hypot(*steps[vector].T) * self.plan.unit_nm
         return away - (foot[first] + foot[second]) / 2, table[vector, first, second]
 
@@ -471,10 +476,8 @@ def _check_density(
     dense = np.argwhere(density > rules.maximum_density)
     shown = []
     for row, column in dense[:MAX_LISTED].tolist():
-        x, y = (
-            lattice.x0 + column * across * lattice.pitch,
-            lattice.y0 - row * down * lattice.down,
-        )
+        x = lattice.x0 + column * across * lattice.pitch
+        y = lattice.y0 - row * down * lattice.down
         box = (x, y - height, x + width, y)
         shown.append(
             Violation(
@@ -635,12 +638,14 @@ def _check_zone(
     """Pillars that share area with an exclusion zone."""
     scale = 1e3 / plan.unit_nm
     left, bottom = zone.x_um * scale, zone.y_um * scale
-    right, top = left + zone.width_um * scale, bottom + zone.height_um * scale
+    right = left + zone.width_um * scale
+    top = bottom + zone.height_um * scale
     box = left, bottom, right, top
     corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     for number, places in _sites_near(plan, lattice, box):
         shape = plan.classes[number - 1]
-        low, high = shape.outline.min(0) + places, shape.outline.max(0) + places
+        low = shape.outline.min(0) + places
+        high = shape.outline.max(0) + places
         meets = ((low < box[2:]) & (high > box[:2])).all(1)
         inside = ((low >= box[:2]) & (high <= box[2:])).all(1)
         for n in np.flatnonzero(meets & ~inside).tolist():
@@ -691,10 +696,8 @@ def _check_clearance(plan: MaskPlan, rules: DesignRules, report: DrcReport) -> N
     reach = max(outlines, default=0)
     names, boxes = [], []
     for lattice in plan.lattices:
-        right, down = (
-            (lattice.columns - 1) * lattice.pitch,
-            (lattice.rows - 1) * lattice.down,
-        )
+        right = (lattice.columns - 1) * lattice.pitch
+        down = (lattice.rows - 1) * lattice.down
         names.append(lattice.name)
         boxes.append(
             (

@@ -80,9 +80,11 @@ def mask_differences(library: MaskLibrary, content: MaskLibrary) -> list[str]:
         read = content.cells[name]
         found += shape_differences(cell, read)
         merged = read.sums is not None
-        planned, there = _sums(cell, merged=merged), _sums(read, merged=merged)
+        planned = _sums(cell, merged=merged)
+        there = _sums(read, merged=merged)
         for who in sorted(planned.keys() | there.keys(), key=str):
-            wanted, got = planned.get(who, (0,) * 5), there.get(who, (0,) * 5)
+            wanted = planned.get(who, (0,) * 5)
+            got = there.get(who, (0,) * 5)
             if wanted != got:
                 found.append(f"cell {name}: {who[0]}: {_difference(wanted, got)}")
     return found

@@ -163,10 +163,8 @@ def sites_in(
         return
     block = lattice.source(first, end)[:, left:right]
     for row, column in np.argwhere(block > 0).tolist():
-        x, y = (
-            lattice.x0 + (left + column) * lattice.pitch,
-            lattice.y0 - (first + row) * lattice.down,
-        )
+        x = lattice.x0 + (left + column) * lattice.pitch
+        y = lattice.y0 - (first + row) * lattice.down
         yield int(block[row, column]), x, y
 
 

@@ -282,10 +282,8 @@ def read_dose_table(path: str | Path) -> dict[LayerNumber, float]:
     found: dict[LayerNumber, float] = {}
     for number, row in enumerate(rows, 2):
         try:
-            layer, dose = (
-                (int(row["layer"]), int(row["datatype"])),
-                float(row["relative_dose"]),
-            )
+            layer = (int(row["layer"]), int(row["datatype"]))
+            dose = float(row["relative_dose"])
         except (KeyError, TypeError, ValueError):
             raise MaskFileError(
                 f"{path}, line {number}: need columns {', '.join(DOSE_HEAD[:3])} of numbers"

@@ -55,7 +55,8 @@ class Orientation:
                 x, y = -y, x
             return x, y
         angle = math.radians(self.angle_deg)
-        c, s = self.scale * math.cos(angle), self.scale * math.sin(angle)
+        c = self.scale * math.cos(angle)
+        s = self.scale * math.sin(angle)
         turned = np.rint(c * x - s * y), np.rint(s * x + c * y)
         return turned[0].astype(np.int64), turned[1].astype(np.int64)
 
@@ -274,7 +275,9 @@ class MaskCell:
         wanted = np.array([name in among for name in placed.children], bool)
         for first in range(0, len(placed.child) if wanted.any() else 0, _AT_ONCE):
             block = slice(first, first + _AT_ONCE)
-            x, y, kinds = placed.x[block], placed.y[block], placed.kinds(block)
+            x = placed.x[block]
+            y = placed.y[block]
+            kinds = placed.kinds(block)
             if not wanted.all():
                 chosen = wanted[placed.child[block]]
                 x, y, kinds = x[chosen], y[chosen], kinds[chosen]

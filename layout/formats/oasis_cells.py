@@ -234,7 +234,8 @@ class CellReader:
             m.height = m.width
         elif info & 0x20:
             m.height = c.within(c.unsigned())
-        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        w = self._need(c, m.width, "width")
+        h = self._need(c, m.height, "height")
         self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
 
     def _polygon(self, c: ByteCursor) -> None:
@@ -255,10 +256,8 @@ class CellReader:
             m.path_end = self._extent(c, scheme & 3, m.path_end)
         if info & 0x20:
             m.path_points = c.points(closed=False)
-        points, half = (
-            self._need(c, m.path_points, "point list"),
-            self._need(c, m.half_width, "width"),
-        )
+        points = self._need(c, m.path_points, "point list")
+        half = self._need(c, m.half_width, "width")
         begin = self._need(c, m.path_begin, "extension at its start")
         end = self._need(c, m.path_end, "extension at its end")
         outline = paths.path_outline(points, half, begin=begin, end=end)
@@ -278,7 +277,8 @@ class CellReader:
         self._size(c, info)
         a = c.coordinate() if kind != oasis.TRAPEZOID_B else 0
         b = c.coordinate() if kind != oasis.TRAPEZOID_A else 0
-        w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
+        w = self._need(c, m.width, "width")
+        h = self._need(c, m.height, "height")
         if max(abs(a), abs(b), abs(a - b)) > (h if info & 0x80 else w):
             raise c.fail(
                 f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross"

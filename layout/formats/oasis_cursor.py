@@ -189,7 +189,8 @@ class ByteCursor:
         if form in (1, 2, 3):
             return self._matrix(form, limit)
         if form in (4, 5, 6, 7):
-            count, grid = self._count(limit), self.unsigned() if form % 2 else 1
+            count = self._count(limit)
+            grid = self.unsigned() if form % 2 else 1
             steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
             line = self._sums(steps)
             return (
@@ -200,7 +201,8 @@ class ByteCursor:
         if form in (8, 9):
             return self._vectors(form, limit)
         if form in (10, 11):
-            count, grid = self._count(limit), self.unsigned() if form == 11 else 1
+            count = self._count(limit)
+            grid = self.unsigned() if form == 11 else 1
             x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
             at = sum_deltas(self.data, self.at, self.end, self.within(grid), x, y)
             if at < 0:

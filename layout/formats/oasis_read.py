@@ -254,10 +254,8 @@ class _Reader:
         if scheme not in (0, 1, 2) or c.left != (4 if scheme else 0):
             raise c.fail(f"validation scheme {scheme} with {c.left} bytes left")
         if scheme == 1:
-            found, wanted = (
-                zlib.crc32(c.data[: c.at].data),
-                struct.unpack("<I", c.take(4))[0],
-            )
+            found = zlib.crc32(c.data[: c.at].data)
+            wanted = struct.unpack("<I", c.take(4))[0]
             if found != wanted:
                 raise c.fail(
                     f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged"

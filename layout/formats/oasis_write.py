@@ -65,7 +65,8 @@ def write_oasis(mask: MaskPlan | MaskLibrary, path: str | Path) -> None:
     ):
         for piece in itertools.chain((head, layers), _cells(library, number)):
             file.write(piece)
-            checksum, written = zlib.crc32(piece, checksum), written + len(piece)
+            checksum = zlib.crc32(piece, checksum)
+            written = written + len(piece)
         table = b"".join(cell_name(k, name) for name, k in number.items())
         file.write(table)
         offsets = (written, 0, 0, 0, len(head) if layers else 0, 0)
@@ -286,7 +287,8 @@ def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> in
     out[0] = 15  # XYABSOLUTE
     at, last_x, last_y = 1, 0, 0
     for n in range(x.shape[0]):
-        move_x, move_y = n == 0 or x[n] != last_x, n == 0 or y[n] != last_y
+        move_x = n == 0 or x[n] != last_x
+        move_y = n == 0 or y[n] != last_y
         out[at] = 17  # PLACEMENT
         out[at + 1] = (
             0xC0

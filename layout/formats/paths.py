@@ -57,10 +57,8 @@ def _side(p: Array, along: Array, long: Array, half: float) -> list[Array]:
     normal = np.column_stack([-along[:, 1], along[:, 0]])
     made = [p[0] + half * normal[0]]
     for k in range(1, len(along)):
-        dot, cross = (
-            float(along[k - 1] @ along[k]),
-            float(np.linalg.det(along[k - 1 : k + 1])),
-        )
+        dot = float(along[k - 1] @ along[k])
+        cross = float(np.linalg.det(along[k - 1 : k + 1]))
         short = half * math.sqrt(
             max(1 - dot, 0.0) / max(1 + dot, 1e-12)
         )  # by which a mitre makes each arm shorter

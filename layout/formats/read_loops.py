@@ -172,10 +172,8 @@ def scan_placements(
             dy, p = unsigned_at(data, p, end)
         if p < 0 or number < 0:
             break
-        new_x, new_y = (
-            -(dx >> 1) if dx & 1 else dx >> 1,
-            -(dy >> 1) if dy & 1 else dy >> 1,
-        )
+        new_x = -(dx >> 1) if dx & 1 else dx >> 1
+        new_y = -(dy >> 1) if dy & 1 else dy >> 1
         new_x = new_x + state[0] if state[2] or not info & 0x20 else new_x
         new_y = new_y + state[1] if state[2] or not info & 0x10 else new_y
         if abs(new_x) > FARTHEST or abs(new_y) > FARTHEST or number > FARTHEST:

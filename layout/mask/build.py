@@ -227,8 +227,10 @@ def _origin(
     """First site on the grid such that the axis is at (0, 0), or half a grid step off
     where it cannot be.
     """
-    half_x, half_y = (shape[1] - 1) * steps[0] / 2, (shape[0] - 1) * steps[1] / 2
-    x0, y0 = math.floor(-half_x / grid) * grid, math.ceil(half_y / grid) * grid
+    half_x = (shape[1] - 1) * steps[0] / 2
+    half_y = (shape[0] - 1) * steps[1] / 2
+    x0 = math.floor(-half_x / grid) * grid
+    y0 = math.ceil(half_y / grid) * grid
     return x0, y0, (x0 + half_x, y0 - half_y)
 
 

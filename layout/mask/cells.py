@@ -122,7 +122,8 @@ def with_isolation(
     )
     size = max(1, BLOCK_SITES // max(1, design.shape[1]), 4 * reach)
     for first in range(0, design.shape[0], size):
-        end, begin = min(first + size, design.shape[0]), max(0, first - reach)
+        end = min(first + size, design.shape[0])
+        begin = max(0, first - reach)
         around = np.asarray(design[begin : end + reach])
         here = slice(first - begin, end - begin)
         alone = None

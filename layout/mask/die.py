@@ -224,10 +224,8 @@ def _tests(
         _WITNESS,
         own,
     )
-    inner, outer = (
-        unit(radius_um + CLEAR_UM),
-        die.right - unit(process.die.street_um + CLEAR_UM),
-    )
+    inner = unit(radius_um + CLEAR_UM)
+    outer = die.right - unit(process.die.street_um + CLEAR_UM)
     middle = (inner + outer) // 2
     lattices, windows = [], []
     for name, sites, x in (
@@ -341,7 +339,8 @@ def _blocks(numbers: Array, side: int, lattice: PillarArray) -> Array:
 def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
     """Sites about (x, 0), as far apart as those of the lens."""
     (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
-    left, top = x - (columns - 1) * like.pitch // 2, (rows - 1) * like.down // 2
+    left = x - (columns - 1) * like.pitch // 2
+    top = (rows - 1) * like.down // 2
     made = PillarArray.of(
         name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid
     )
@@ -349,10 +348,8 @@ def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> PillarArray:
 
 
 def _extent(lattice: PillarArray) -> MarkBox:
-    right, bottom = (
-        (lattice.columns - 1) * lattice.pitch,
-        (lattice.rows - 1) * lattice.down,
-    )
+    right = (lattice.columns - 1) * lattice.pitch
+    bottom = (lattice.rows - 1) * lattice.down
     box = MarkBox(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
     return box.grown(max(lattice.constant, lattice.down) // 2)
 

@@ -103,10 +103,8 @@ def split_write_fields(
         )
     made = quantise_diameters(diameters, process) if drawn is None else drawn
     seen = _Seen.of(diameters, made, settings.size_um)
-    rows, columns = (
-        _edges(settings, seen.rows, sites),
-        _edges(settings, seen.columns, across),
-    )
+    rows = _edges(settings, seen.rows, sites)
+    columns = _edges(settings, seen.columns, across)
     clearance = (
         min(pitch, down) - float(made.diameters_nm[-1]) * nm
     ) / 2  # below 0 where borders cut pillars
@@ -137,9 +135,11 @@ class _Seen:
     @classmethod
     def of(cls, diameters: DiameterMap, made: DrawnClasses, size_um: float) -> "_Seen":
         """In one pass over the classes."""
-        shape, table = made.sites.shape, np.r_[0.0, made.diameters_nm * nm]
+        shape = made.sites.shape
+        table = np.r_[0.0, made.diameters_nm * nm]
         found = cls(np.zeros(shape[0], bool), np.zeros(shape[1], bool))
-        near_x, near_y = _near(diameters.x_um, size_um), _near(diameters.y_um, size_um)
+        near_x = _near(diameters.x_um, size_um)
+        near_y = _near(diameters.y_um, size_um)
         columns = np.flatnonzero(near_x < np.inf)
         for first, block in made.sites.blocks():
             found.rows[first : first + len(block)] = block.any(1)
@@ -155,10 +155,8 @@ class _Seen:
 
 def _counted(made: DrawnClasses, rows: Array, columns: Array) -> Array:
     """(y fields, x fields) pillars in each field."""
-    down, across = (
-        np.clip(rows, 0, made.sites.shape[0]).tolist(),
-        np.clip(columns, 0, made.sites.shape[1]).tolist(),
-    )
+    down = np.clip(rows, 0, made.sites.shape[0]).tolist()
+    across = np.clip(columns, 0, made.sites.shape[1]).tolist()
     step = max(1, BLOCK_SITES // max(1, made.sites.shape[1]))
     found = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
     for i, (first, end) in enumerate(itertools.pairwise(down)):

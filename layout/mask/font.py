@@ -68,11 +68,9 @@ def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
                 )
         for row, (above, below) in enumerate(itertools.pairwise(rows)):
             for column, rises in _joints(above, below):
-                left, at, half = (
-                    x + (n * 6 + column) * square,
-                    y + (6 - row) * square,
-                    square // 2,
-                )
+                left = x + (n * 6 + column) * square
+                at = y + (6 - row) * square
+                half = square // 2
                 yield _box(left - half * rises, at, half, half)
                 yield _box(left - half * (not rises), at - half, half, half)
 

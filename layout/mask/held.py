@@ -74,7 +74,8 @@ def hold_on_disk(
     scratch.flush()
 
     def read(first: int, end: int) -> Array:
-        start, size = first * columns * dtype.itemsize, (end - first, columns)
+        start = first * columns * dtype.itemsize
+        size = (end - first, columns)
         return np.array(np.memmap(scratch, dtype, "r", start, size))
 
     return ScratchArray((rows, columns), read, None)

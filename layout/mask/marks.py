@@ -102,12 +102,11 @@ def alignment_crosses(
         unit: of the plan.
         die: outline of the die.
     """
-    arm, width = unit(process.die.mark_um / 2), unit(process.die.mark_width_um / 2)
+    arm = unit(process.die.mark_um / 2)
+    width = unit(process.die.mark_width_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM) + arm
-    fine, thin = (
-        max(unit.grid, arm // _FINE // unit.grid * unit.grid),
-        _thin(width, unit),
-    )
+    fine = max(unit.grid, arm // _FINE // unit.grid * unit.grid)
+    thin = _thin(width, unit)
     shapes: list[Array] = []
     boxes = []
     for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
@@ -121,7 +120,8 @@ def alignment_crosses(
                 ).grown(unit(CLEAR_UM / 2))
             )
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
-    left, bottom = die.left + inset + arm + unit(CLEAR_UM), die.top - inset - arm
+    left = die.left + inset + arm + unit(CLEAR_UM)
+    bottom = die.top - inset - arm
     shapes.append(_letter_f(left, bottom, square))
     boxes.append(
         MarkBox(left, bottom, left + 5 * square, bottom + 7 * square).grown(
@@ -165,7 +165,8 @@ def wafer_cross(
         width_um: line width.
     """
     arm, half = unit(mark_um / 2), unit(width_um / 2)
-    inner, thin = arm // _FINE // unit.grid * unit.grid * 2, _thin(half, unit)
+    inner = arm // _FINE // unit.grid * unit.grid * 2
+    thin = _thin(half, unit)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
     turn = np.array([[0, 1], [-1, 0]])
     bars = [upright]
@@ -194,10 +195,8 @@ def vernier_scales(
     """
     if not process.die.verniers:
         return VernierScales((), ())
-    pitch, step = (
-        unit(process.die.vernier_pitch_um),
-        unit(process.die.vernier_step_nm * 1e-3),
-    )
+    pitch = unit(process.die.vernier_pitch_um)
+    step = unit(process.die.vernier_step_nm * 1e-3)
     if step < unit.grid:
         raise ProcessError(
             f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
@@ -239,10 +238,8 @@ def _vernier(
     """Bars about (0, 0): drawn ones above, within a window of the film; openings of the
     film below.
     """
-    half, gap = (
-        max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid),
-        unit(_GAP_UM),
-    )
+    half = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid)
+    gap = unit(_GAP_UM)
     drawn = [
         MarkBox(x - half, gap, x + half, gap + long).polygon
         for x, long in _bars(unit, pitch)

@@ -89,7 +89,8 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
     lone = process.bias.isolated_nm
     for first, block, alone in with_isolation(d, process):
         rows = slice(first, first + len(block))
-        design, beside = np.asarray(block, float) / nm, 0.0 if alone is None else alone
+        design = np.asarray(block, float) / nm
+        beside = 0.0 if alone is None else alone
         drawn = _steps(design, design, process, beside)
         if d.length_um is not None:
             drawn += _LENGTHS * _steps(
@@ -145,7 +146,8 @@ def _class(
         _gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm
         for part in made.parts
     ]
-    outline, holes = contours[0], tuple(hole[::-1] for hole in contours[1:])
+    outline = contours[0]
+    holes = tuple(hole[::-1] for hole in contours[1:])
     pieces = (
         tuple(region.without_holes([outline, *holes], grid=process.rules.grid_nm))
         if holes

@@ -61,10 +61,8 @@ def lattice_box(lattice: PillarArray, grid: int) -> Array:
         grid: step of the coordinates.
     """
     left, bottom, right, top = _square(lattice, grid)
-    across, down = (
-        (lattice.columns - 1) * lattice.pitch,
-        (lattice.rows - 1) * lattice.down,
-    )
+    across = (lattice.columns - 1) * lattice.pitch
+    down = (lattice.rows - 1) * lattice.down
     x, y = lattice.x0, lattice.y0
     return rectilinear.box_corners(
         np.array([x + left, y - down + bottom, x + across + right, y + top])
@@ -185,7 +183,10 @@ def _rim(boxes: list[Array], width: int, process: Process) -> FigureCell:
     shapes: list[Array] = []
     for box in boxes:
         (left, bottom), (right, top) = box.min(0).tolist(), box.max(0).tolist()
-        x0, y0, x1, y1 = left - width, bottom - width, right + width, top + width
+        x0 = left - width
+        y0 = bottom - width
+        x1 = right + width
+        y1 = top + width
         sides = (
             (x0, y0, x1, bottom),
             (x0, top, x1, y1),

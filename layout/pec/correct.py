@@ -196,7 +196,9 @@ class WantedDoses:
             first: row of the block.
             block: (rows, columns) classes.
         """
-        lattice, grid, table = self.lattices[number], self.marks.grid, self.table
+        lattice = self.lattices[number]
+        grid = self.marks.grid
+        table = self.table
         field = np.empty(block.shape, np.float32)
         down = grid.y.at(lattice.rows_um(first, len(block)))
         interpolate_from_nodes(self.far, *down, *grid.x.at(lattice.columns_um), field)
@@ -275,7 +277,8 @@ def solve_doses(plan: MaskPlan, exposure: ExposureSettings) -> WantedDoses:
     lattices = [dataclasses.replace(l, unit_um=unit) for l in plan.lattices]
     point = psf.point_exposure(exposure)
     goal = np.array([1.0, *(made.goal for made in plan.classes)])
-    kinds, number = _drawn(plan, unit), bodies.count_pillars(lattices, len(goal))
+    kinds = _drawn(plan, unit)
+    number = bodies.count_pillars(lattices, len(goal))
     densest = min(lattices, key=lambda lattice: lattice.nearest_um)
     ranges = bodies.split_ranges(point, kinds, number, densest)
     table = bodies.exposure_table(
@@ -344,7 +347,8 @@ def _backgrounds(
             own = _relaxed(middle, per_own, drive, bound_below=0.9)
             near.append(own.astype(np.float32))
             rows, columns = np.nonzero(index)
-            x, y = lattice.columns_um[columns], lattice.rows_um(0, lattice.rows)[rows]
+            x = lattice.columns_um[columns]
+            y = lattice.rows_um(0, lattice.rows)[rows]
             taken += grid.deposit(x, y, (own * per_own)[rows, columns])
         before = field
         field = _relaxed(reach, mass, THRESHOLD * goal - taken, marks=marks)
@@ -434,11 +438,9 @@ def _pieces(
     """Rectangles of all exposed figures, fractured to pieces of one dose each: (n, 4)
     boxes, (n, 2) figure and layer number, (n,) shape.
     """
-    whole, of, group = (
-        [np.empty((0, 4), np.int64)],
-        [np.empty((0, 2), np.int64)],
-        [np.empty(0, np.int64)],
-    )
+    whole = [np.empty((0, 4), np.int64)]
+    of = [np.empty((0, 2), np.int64)]
+    group = [np.empty(0, np.int64)]
     shapes = 0
     for f, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:

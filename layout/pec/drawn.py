@@ -53,10 +53,8 @@ class DrawnDiscs:
             (entries,) ``own`` at unit dose, and its fall per um that all edges move
             out; 0 where not used.
         """
-        d, terms = (
-            np.where(used, self.diameter_um, 0.0),
-            list(zip(point.widths_um, point.weights, strict=True)),
-        )
+        d = np.where(used, self.diameter_um, 0.0)
+        terms = list(zip(point.widths_um, point.weights, strict=True))
         own, slope = (
             sum(w * f(d, a) for a, w in terms) for f in (rim_of_own_disc, slope_at_rim)
         )
@@ -172,7 +170,8 @@ def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
     node, share = np.polynomial.legendre.leggauss(4)
     y = (left[:, None] + wide[:, None] * (node + 1) / 2).ravel()
     weight = (wide[:, None] * share / 2).ravel()
-    low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+    low = np.minimum(start[:, 1], end[:, 1])
+    high = np.maximum(start[:, 1], end[:, 1])
     edge, line = np.nonzero((low[:, None] < y) & (y < high[:, None]))
     rise = (end - start)[edge]
     place = start[edge, 0] + (y[line] - start[edge, 1]) / rise[:, 1] * rise[:, 0]
@@ -232,7 +231,9 @@ def _above(image: Array, down: Array, across: Array, level: float) -> float:
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
             p, q = abs(down[row, column]), abs(across[row, column])
-            steep, flat, over = max(p, q), min(p, q), image[row, column] - level
+            steep = max(p, q)
+            flat = min(p, q)
+            over = image[row, column] - level
             beyond = (p + q) / 2 - abs(
                 over
             )  # of the corner that the edge comes to last

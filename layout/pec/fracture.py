@@ -131,7 +131,8 @@ def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
     doses there are as even without.
     """
     order = np.argsort(around.widths_um)
-    widths, total = around.widths_um[order], np.cumsum(around.weights[order])
+    widths = around.widths_um[order]
+    total = np.cumsum(around.weights[order])
     usual = float(widths[np.searchsorted(total, total[-1] / 2)])
     return usual, widths[(widths < usual) & (total > 8 * change)][::-1].tolist()
 

@@ -83,7 +83,8 @@ def fit_point_spread(
     """
     from scipy.optimize import nnls
 
-    radius, value = np.asarray(radius_um, float), np.asarray(density, float)
+    radius = np.asarray(radius_um, float)
+    value = np.asarray(density, float)
     sound = (
         np.isfinite(value).all()
         and np.isfinite(radius).all()
@@ -120,7 +121,8 @@ def _fit_error(found: PointExposure, radius: Array, density: Array) -> float:
     table by power laws.
     """
     slope = np.diff(np.log(density)) / np.diff(np.log(radius)) + 2
-    start, end = density[:-1] * radius[:-1] ** 2, density[1:] * radius[1:] ** 2
+    start = density[:-1] * radius[:-1] ** 2
+    end = density[1:] * radius[1:] ** 2
     flat = abs(slope) < 1e-9
     ring = np.where(
         flat, start * np.diff(np.log(radius)), (end - start) / np.where(flat, 1, slope)

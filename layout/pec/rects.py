@@ -74,7 +74,8 @@ def pairs_near(
     first = np.cumsum(counts) - counts
     near = np.empty(int(counts.sum()), np.int64)
     _pairs(boxes, starts, distance, first, near)
-    one, two = order[np.repeat(np.arange(len(boxes)), counts)], order[near]
+    one = order[np.repeat(np.arange(len(boxes)), counts)]
+    two = order[near]
     rank = np.lexsort((two, one))
     return one[rank], two[rank]
 
@@ -127,12 +128,11 @@ def sums_of_boxes(
         (n, j, i) exposure, exact to rounding.
     """
     one, two = pairs
-    first, last = np.searchsorted(one, row), np.searchsorted(one, row, side="right")
+    first = np.searchsorted(one, row)
+    last = np.searchsorted(one, row, side="right")
     out = np.zeros((len(row), y_um.shape[1], x_um.shape[1]))
-    lines, boxes = (
-        (np.ascontiguousarray(x_um), np.ascontiguousarray(y_um)),
-        np.ascontiguousarray(boxes_um, float),
-    )
+    lines = (np.ascontiguousarray(x_um), np.ascontiguousarray(y_um))
+    boxes = np.ascontiguousarray(boxes_um, float)
 
     def work(start: int, stop: int) -> None:
         _sum(
@@ -197,11 +197,9 @@ def _outer(
     the nearest place beyond). Runs of twice that length are round: left out.
     """
     room = 4 * (len(near) + len(boxes))
-    part, piece, side = (
-        np.empty((room, 3)),
-        np.empty(room, np.int64),
-        np.empty(room, np.int64),
-    )
+    part = np.empty((room, 3))
+    piece = np.empty(room, np.int64)
+    side = np.empty(room, np.int64)
     count = _free(boxes, starts, near, _OUTSIDE_UM, part, piece, side)
     part, piece, side = part[:count], piece[:count], side[:count]
     low, high = _run(part, group[piece], side)

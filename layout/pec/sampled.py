@@ -100,7 +100,8 @@ def _distant(scene: ExposedLattices, sites: tuple[Array, Array]) -> Array:
     of Gaussians.
     """
     lens, area = scene.bodies[0], scene.drawn.area_um2
-    at_x, at_y = lens.columns_um[sites[1]], lens.rows_um(0, lens.rows)[sites[0]]
+    at_x = lens.columns_um[sites[1]]
+    at_y = lens.rows_um(0, lens.rows)[sites[0]]
     ranges = [*_terms(scene.ranges.far), *_terms(scene.ranges.middle)]
     total = np.zeros(len(at_x))
     for number, body in enumerate(scene.bodies):
@@ -110,7 +111,8 @@ def _distant(scene: ExposedLattices, sites: tuple[Array, Array]) -> Array:
             y = body.rows_um(first, len(block))
             for width, weight in ranges:
                 scale = weight / (np.pi * width**2)
-                wx, wy = _bell(body.columns_um, at_x, width), _bell(y, at_y, width)
+                wx = _bell(body.columns_um, at_x, width)
+                wy = _bell(y, at_y, width)
                 total += scale * ((mass @ wx) * wy).sum(0, dtype=float)
                 if not number:
                     total -= scale * _own_block(mass, first, sites, wx, wy)

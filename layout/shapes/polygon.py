@@ -250,7 +250,8 @@ def edge_error(points: Array, radius: float) -> float:
         points: (n, 2) corners.
         radius: of the circle.
     """
-    p, q = points.astype(float), np.roll(points, -1, axis=0).astype(float)
+    p = points.astype(float)
+    q = np.roll(points, -1, axis=0).astype(float)
     edge = q - p
     along = np.clip(-(p * edge).sum(1) / (edge**2).sum(1), 0, 1)
     foot = np.hypot(*(p + along[:, None] * edge).T)

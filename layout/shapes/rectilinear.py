@@ -21,17 +21,16 @@ def split_rectilinear(points: Array) -> Array:
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
     """
-    start, end = (
-        np.asarray(points, np.int64),
-        np.roll(np.asarray(points, np.int64), -1, axis=0),
-    )
+    start = np.asarray(points, np.int64)
+    end = np.roll(np.asarray(points, np.int64), -1, axis=0)
     if ((start != end).all(axis=1)).any():
         raise ProcessError(
             "a shape with slanted edges where horizontal and vertical ones are needed"
         )
     upright = start[:, 0] == end[:, 0]
     x = start[upright, 0]
-    low, high = np.minimum(start, end)[upright, 1], np.maximum(start, end)[upright, 1]
+    low = np.minimum(start, end)[upright, 1]
+    high = np.maximum(start, end)[upright, 1]
     levels = np.unique(points[:, 1])
     found = []
     for bottom, top in zip(levels[:-1].tolist(), levels[1:].tolist(), strict=True):

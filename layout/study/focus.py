@@ -75,10 +75,8 @@ class FocusSums:
             shift_um: (x, y) by which the pillars stand off their sites.
         """
         window, k = self.window, self.case.wavenumber
-        nodes_x, nodes_y = (
-            self.nodes_x_um + shift_um[0],
-            self.nodes_y_um[:, None] + shift_um[1],
-        )
+        nodes_x = self.nodes_x_um + shift_um[0]
+        nodes_y = self.nodes_y_um[:, None] + shift_um[1]
         slow = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])
         inverse = np.array(self.case.inverse_depths_per_um)[:, None, None]
         sources = np.exp(

@@ -202,7 +202,9 @@ def _beside(lens: Lens, process: Process) -> str:
     """What the numbers are not of: light that keeps its hand, and walls that the
     process leans otherwise.
     """
-    text, wall, made = "", lens.cell.sidewall_rad / deg, process.etch.sidewall_deg
+    text = ""
+    wall = lens.cell.sidewall_rad / deg
+    made = process.etch.sidewall_deg
     if lens.hand:
         text += (
             " All of it for the light that changes hand: what keeps its hand has no focus, and lies under the image "

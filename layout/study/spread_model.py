@@ -47,18 +47,14 @@ class SpreadModel:
         """(lenses, nodes y, nodes x) moments of lenses that a process makes of this
         one.
         """
-        x, y = (
-            self.focus.nodes_x_um / self.radius_um,
-            self.focus.nodes_y_um[:, None] / self.radius_um,
-        )
+        x = self.focus.nodes_x_um / self.radius_um
+        y = self.focus.nodes_y_um[:, None] / self.radius_um
         knots = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
         found = []
         for state in lenses:
             bias = state.bias_um(x, y)
-            middle, half = (
-                (bias.max() + bias.min()) / 2,
-                (bias.max() - bias.min()) / 2 + 1e-9,
-            )
+            middle = (bias.max() + bias.min()) / 2
+            half = (bias.max() - bias.min()) / 2 + 1e-9
             curves = self.pillars.curve(middle + half * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
             series = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)

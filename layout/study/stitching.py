@@ -119,7 +119,8 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: FocusSums) -> tuple[int, A
 
 
 def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    d, long = lens.diameters.diameter_um[rows].astype(float), lens.diameters.length_um
+    d = lens.diameters.diameter_um[rows].astype(float)
+    long = lens.diameters.length_um
     if lens.pairs is not None and long is not None:
         return lens.pairs.amplitude(d, long[rows], lens.wavelength_um, lens.light)[
             :, columns
@@ -140,7 +141,11 @@ def _expansion(focus: FocusSums, moments: Array, step_um: float) -> tuple[Array,
     def at(x: float, y: float) -> Array:
         return np.asarray(focus.light(moments, (x, y))[:, 0])
 
-    still, right, left, down, up = at(0, 0), at(h, 0), at(-h, 0), at(0, h), at(0, -h)
+    still = at(0, 0)
+    right = at(h, 0)
+    left = at(-h, 0)
+    down = at(0, h)
+    up = at(0, -h)
     cross = (at(h, h) + at(-h, -h) - right - left - down - up) / 2 + still
     terms = [
         (right - left) / 2,

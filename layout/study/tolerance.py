@@ -138,10 +138,8 @@ def analyse_tolerance(
             else pair_sensitivities(lens)[lens.light]
         )
     near, far = reach.depth_range_um(lens)
-    depths_um, step_um = (
-        depths_um or (near, (near + far) / 2, far),
-        (far - near) / STEPS,
-    )
+    depths_um = depths_um or (near, (near + far) / 2, far)
+    step_um = (far - near) / STEPS
     every = np.array(
         [lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))]
     )
@@ -275,15 +273,11 @@ def _pillar_change(model: SpreadModel, state: State) -> tuple[float, float]:
     """(rms phase change about the mean, rms change of |T|) over pillars spread evenly
     over the aperture.
     """
-    radius, angle = (
-        np.sqrt((np.arange(64) + 0.5) / 64),
-        np.arange(64) * np.pi * (3 - np.sqrt(5)),
-    )
+    radius = np.sqrt((np.arange(64) + 0.5) / 64)
+    angle = np.arange(64) * np.pi * (3 - np.sqrt(5))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    before, after = (
-        model.pillars.curve(np.zeros(1), State.of()),
-        model.pillars.curve(state.bias_um(u, v), state),
-    )
+    before = model.pillars.curve(np.zeros(1), State.of())
+    after = model.pillars.curve(state.bias_um(u, v), state)
     weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
     turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
     turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))

@@ -151,7 +151,8 @@ def read_scene(
     contours: list[Sequence[Array]] = [()] * (len(plan.classes) + 1)
     dose, layer, size = np.zeros((3, len(plan.classes) + 1))
     for k in used.tolist():
-        made, stacks = plan.classes[k - 1], list(exposed(plan.classes[k - 1].name))
+        made = plan.classes[k - 1]
+        stacks = list(exposed(plan.classes[k - 1].name))
         if not stacks:
             continue
         contours[k] = [c * unit for c in _one_outline(made.name, stacks)]

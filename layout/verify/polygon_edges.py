@@ -46,11 +46,9 @@ def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
         polygons: with their layers.
         range_um: of the core of the point exposure.
     """
-    places, normals, layers = (
-        [np.empty((0, 2))],
-        [np.empty((0, 2))],
-        [np.empty(0, np.int64)],
-    )
+    places = [np.empty((0, 2))]
+    normals = [np.empty((0, 2))]
+    layers = [np.empty(0, np.int64)]
     for layer in np.unique(polygons.layer).tolist():
         drawn = zip(polygons.corners, polygons.layer.tolist(), strict=True)
         units = [np.rint(corners / nm) for corners, other in drawn if other == layer]
@@ -76,10 +74,8 @@ def sample_edges(polygons: ExposedPolygons, range_um: float) -> EdgeSamples:
 
 def _turns(contour: Array) -> Array:
     """(n,) which points are corners, not on the way between two others."""
-    before, after = (
-        contour - np.roll(contour, 1, axis=0),
-        np.roll(contour, -1, axis=0) - contour,
-    )
+    before = contour - np.roll(contour, 1, axis=0)
+    after = np.roll(contour, -1, axis=0) - contour
     return np.asarray(before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0])
 
 
@@ -111,10 +107,8 @@ def exposure_at_edges(
     edge = np.repeat(first[two], count[two]) + within
     given = np.repeat(polygons.dose[two], count[two])
     for part in np.array_split(np.arange(len(point)), max(1, len(point) // 1_000_000)):
-        p, q = (
-            start[edge[part]] - at_um[point[part]],
-            end[edge[part]] - at_um[point[part]],
-        )
+        p = start[edge[part]] - at_um[point[part]]
+        q = end[edge[part]] - at_um[point[part]]
         value = sum(weight * _edge(p, q, range_um) for range_um, weight in terms)
         total += np.bincount(point[part], given[part] * value, minlength=len(total))
     return total

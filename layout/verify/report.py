@@ -194,7 +194,9 @@ def _tally(
     count: Array,
     bins: Array,
 ) -> None:
-    rows, columns, last = total.shape[0], total.shape[1], bins.shape[0] - 1
+    rows = total.shape[0]
+    columns = total.shape[1]
+    last = bins.shape[0] - 1
     for n in range(x.shape[0]):
         if not judged[n]:
             continue

@@ -256,11 +256,9 @@ def vignetted_share(
     """
     if lens.layers.stop is None:
         return 0.0
-    tangents, wave, d = (
-        (math.tan(angle_rad[0]), math.tan(angle_rad[1])),
-        lens.wavelength_um,
-        lens.diameters,
-    )
+    tangents = (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
+    wave = lens.wavelength_um
+    d = lens.diameters
     middle = middle_um(lens, source_at(lens, angle_rad, depth_um), depth_um)
     half = 1.5 * max(
         lens.layers.footprint_um(depth_um, wave), lens.layers.stop.radius_um
@@ -286,19 +284,15 @@ def _sharpest(
     """(2,) distance behind the pillars where the line images along x and along y are
     sharpest; NaN at an end.
     """
-    sensor, flat = (
-        lens.sensor_distance_um,
-        lens.layers.after(lens.sensor_distance_um, lens.wavelength_um),
-    )
+    sensor = lens.sensor_distance_um
+    flat = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     aperture = max(min(light.aperture), 1e-6)
     deep = lens.wavelength_um * flat.index[0] / aperture**2
     close = sensor + close_um[np.abs(close_um) < sensor]
     known = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
     films = sum(flat.thickness_um[1:])
-    low, high = (
-        max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films)),
-        max(known) + BEYOND * deep,
-    )
+    low = max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films))
+    high = max(known) + BEYOND * deep
     count = min(max(math.ceil((high - low) / deep * STEPS), 8), MOST_STEPS)
     places, step = np.linspace(low, high, count, retstep=True)
     field = light.at(float(places[0]))

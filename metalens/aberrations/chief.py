@@ -158,7 +158,8 @@ def _incident_direction(lens: Lens, x: Array, source: Array, depth_um: float) ->
     """(2,) n sin θ of the source's light at a place of the pillars."""
     if math.isinf(depth_um):
         return np.asarray(source / math.sqrt(1 + float(source @ source)))
-    layers, away = lens.layers.before(depth_um, lens.wavelength_um).layers, x - source
+    layers = lens.layers.before(depth_um, lens.wavelength_um).layers
+    away = x - source
     return np.asarray(
         away
         / media.reach_per_direction(
@@ -176,7 +177,8 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
         source: place of the source, um.
         depth_um: source depth from the lens, um.
     """
-    stop, between = lens.layers.stop, lens.layers.from_stop(lens.wavelength_um)
+    stop = lens.layers.stop
+    between = lens.layers.from_stop(lens.wavelength_um)
     if stop is None:
         there = lens.diameters.diameter_um > 0
         weights = there.sum(0), there.sum(1)
@@ -224,7 +226,8 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
     """
     rest = after.index[0] ** 2 - float(p @ p)
     slopes = np.eye(2) / rest**0.5 + np.outer(p, p) / rest**1.5
-    spread, change = np.eye(2) + _reach_derivative(after, p) @ q, slopes @ q
+    spread = np.eye(2) + _reach_derivative(after, p) @ q
+    change = slopes @ q
     power = (change**2).sum(1)
     behind = np.divide(
         -(spread * change).sum(1),
@@ -309,7 +312,8 @@ def _pillars_near(
     )
     if not (columns.size and rows.size):
         return np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0), bool)
-    across, down = slice(columns[0], columns[-1] + 1), slice(rows[0], rows[-1] + 1)
+    across = slice(columns[0], columns[-1] + 1)
+    down = slice(rows[0], rows[-1] + 1)
     x, y = d.x_um[across] - at[0], d.y_um[down] - at[1]
     near = (x * x + y[:, None] ** 2 <= radius**2) & (
         np.asarray(d.diameter_um[down, across]) > 0
@@ -333,10 +337,8 @@ def _initial_polynomial(
     how that differs some pillars on. twice_um: twice the middle (x, y) of the map from
     where the slopes are wanted."""
     hop, found = 2 if centred else 1, {}
-    next_x, next_y = (
-        turn[:, hop:] * turn[:, :-hop].conj(),
-        turn[hop:] * turn[:-hop].conj(),
-    )
+    next_x = turn[:, hop:] * turn[:, :-hop].conj()
+    next_y = turn[hop:] * turn[:-hop].conj()
     far = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
     across = next_x[:, far[0] :] * next_x[:, : -far[0]].conj()
     down = next_y[far[1] :] * next_y[: -far[1]].conj()

@@ -66,9 +66,9 @@ class FieldPlaneWaves:
         """The waves at a distance behind the pillars, the films kept; or ``like`` (y,
         x) moved so much farther.
         """
-        cover, films = (
-            self.after.index[0],
-            list(zip(self.after.index[1:], self.after.thickness_um[1:], strict=True)),
+        cover = self.after.index[0]
+        films = list(
+            zip(self.after.index[1:], self.after.thickness_um[1:], strict=True)
         )
         gap = distance_um - (sum(t for _, t in films) if like is None else 0.0)
         w = self.p_x**2 + self.p_y[:, None] ** 2
@@ -94,10 +94,8 @@ def plane_waves_of_source(
             behind the stop.
     """
     wave, d = lens.wavelength_um, lens.diameters
-    after, light_rows = (
-        lens.layers.after(lens.sensor_distance_um, wave),
-        _lighting(lens, angle_rad, depth_um),
-    )
+    after = lens.layers.after(lens.sensor_distance_um, wave)
+    light_rows = _lighting(lens, angle_rad, depth_um)
     low, high = _directions(lens, light_rows)
     found = []
     for n, step, ends in zip(
@@ -140,11 +138,9 @@ def _lighting(
     """(rows, x) complex light behind the pillars of some rows of the map, as a function
     of their numbers.
     """
-    d, wave, tangents = (
-        lens.diameters,
-        lens.wavelength_um,
-        (math.tan(angle_rad[0]), math.tan(angle_rad[1])),
-    )
+    d = lens.diameters
+    wave = lens.wavelength_um
+    tangents = (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
     nodes = SpectralNodes(np.array([wave]), np.ones(1), 0.0)
     (phase, level), _ = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)
     case = propagate.make_case(
@@ -176,7 +172,8 @@ def _directions(
     d, hop = lens.diameters, 2 if lens.diameters.lattice.centred else 1
     ny, nx = d.diameter_um.shape
     rows = np.unique(np.linspace(0, max(ny - 1 - hop, 0), PIECES).astype(int))
-    near, far = light_rows(rows), light_rows(np.minimum(rows + hop, ny - 1))
+    near = light_rows(rows)
+    far = light_rows(np.minimum(rows + hop, ny - 1))
     first = np.arange(0, nx, max(1, nx // PIECES))
     low, high = np.zeros(2), np.zeros(2)
     next_x = np.concatenate([near[:, hop:], np.zeros((len(rows), hop))], axis=1)

@@ -231,11 +231,9 @@ def _formula(block: dict[str, Any], kind: str, where: str) -> DispersionFormula:
     numbers = _words(block, "coefficients").split()
     span = (_words(block, "wavelength_range") or _words(block, "range")).split()
     try:
-        number, values, ends = (
-            int(kind.split()[-1]),
-            tuple(map(float, numbers)),
-            tuple(map(float, span)),
-        )
+        number = int(kind.split()[-1])
+        values = tuple(map(float, numbers))
+        ends = tuple(map(float, span))
     except ValueError:
         raise MaterialError(
             f"{where}, {kind}: coefficients or wavelength_range are not numbers"

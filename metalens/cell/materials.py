@@ -307,10 +307,8 @@ def _index_and_slope(
             f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:
-        n, k = (
-            record.page[0].at(wavelength_um),
-            record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0),
-        )
+        n = record.page[0].at(wavelength_um)
+        k = record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0)
         return complex(n[0].real, max(0.0, k[0].real)), complex(n[1].real, k[1].real)
     if record.table.size:
         return _from_table(record, wavelength_um)
@@ -328,11 +326,16 @@ def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex
     if wanted.other:
         other, other_rate = _index_and_slope(wanted.other, wavelength_um)
         f = 1 - wanted.share
-        a, b, da, db = base**2, other**2, 2 * base * base_rate, 2 * other * other_rate
-        h, dh = (3 * f - 1) * a + (2 - 3 * f) * b, (3 * f - 1) * da + (2 - 3 * f) * db
+        a = base**2
+        b = other**2
+        da = 2 * base * base_rate
+        db = 2 * other * other_rate
+        h = (3 * f - 1) * a + (2 - 3 * f) * b
+        dh = (3 * f - 1) * da + (2 - 3 * f) * db
         root = np.sqrt(h * h + 8 * a * b + 0j)
         root = -root if root.imag < 0 else root
-        e, de = (h + root) / 4, (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
+        e = (h + root) / 4
+        de = (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
         n = complex(np.sqrt(complex(e.real, max(e.imag, 0.0))))  # below 0 is rounding
         rate = complex(de / (2 * n))
     n += complex(wanted.n_offset, wanted.k_offset)

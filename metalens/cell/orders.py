@@ -47,10 +47,8 @@ def propagating_orders(
         MaterialError: a wavelength outside the range of a material.
     """
     found = []
-    kx, ky = (
-        math.sin(angle_rad) * math.cos(azimuth_rad),
-        math.sin(angle_rad) * math.sin(azimuth_rad),
-    )
+    kx = math.sin(angle_rad) * math.cos(azimuth_rad)
+    ky = math.sin(angle_rad) * math.sin(azimuth_rad)
     across = [
         wavelength_um / period for period in cell.lattice.periods_um(cell.pitch_um)
     ]

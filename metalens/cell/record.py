@@ -263,7 +263,8 @@ class Cell:
         """(least, most) that a section is wider than the size says: ends of a tilted
         wall, layers, their coats.
         """
-        slope, foot = -2 * math.tan(self.sidewall_rad), -self.height_um / 2
+        slope = -2 * math.tan(self.sidewall_rad)
+        foot = -self.height_um / 2
         bare, coated = ([0.0], [0.0]) if not self.sections else ([], [])
         for layer in self.sections:
             ends = [

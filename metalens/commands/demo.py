@@ -83,10 +83,8 @@ def run(options: Options) -> int:
         outcomes: list[StageOutcome] = []
         for outcome in _chain(folder, laid.files):
             outcomes.append(outcome)
-            words, verdict = (
-                " ".join(outcome.stage.words),
-                "ok" if outcome.status == 0 else "FAILED",
-            )
+            words = " ".join(outcome.stage.words)
+            verdict = "ok" if outcome.status == 0 else "FAILED"
             options.console.say(
                 f"{outcome.seconds:6.1f} s  metalens {words}  {verdict}"
             )

@@ -318,11 +318,9 @@ def _design_two_sizes(
 def _design_one_size(wanted: DesignSettings, options: Options, draft: Path) -> _Outcome:
     """A lens of pillars of one size: at one wavelength or several, or rotated."""
     pillars, inputs = _pillars(wanted, options.config.parent, options.console)
-    cell, proxy, folder = (
-        pillars.cell,
-        library.proxy_of(pillars),
-        options.config.parent,
-    )
+    cell = pillars.cell
+    proxy = library.proxy_of(pillars)
+    folder = options.config.parent
     sites = int(math.pi * (1e3 * wanted.aperture_mm / cell.pitch_um) ** 2)
     transaction.check_room(options.output, sites)  # 4 bytes each
     wanted = wanted.at(proxy.wavelengths_um)

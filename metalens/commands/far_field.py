@@ -272,7 +272,8 @@ def far_field_picture(wanted: FarFieldRequest, found: list["FarField"]) -> bytes
     )
     for column, ((x, y), one) in enumerate(zip(wanted.angles_deg, found, strict=True)):
         step = float(one.sines[1] - one.sines[0])
-        edge, top = float(one.sines[-1]) + step / 2, float(one.share.max())
+        edge = float(one.sines[-1]) + step / 2
+        top = float(one.share.max())
         panel = panels[0, column]
         low = max(1e-6 * top, 1e-300)
         shown = panel.imshow(

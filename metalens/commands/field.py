@@ -279,7 +279,8 @@ def near_field_picture(wanted: NearFieldRequest, found: list[NearField]) -> byte
     shown = None
     for panel, one, name in zip(panels[0], cuts, CUTS, strict=False):
         across = np.asarray(one.grid.x_um if name == "xz" else one.grid.y_um)
-        e, index = field_magnitude(one.e).squeeze(), one.index.squeeze().real
+        e = field_magnitude(one.e).squeeze()
+        index = one.index.squeeze().real
         shown = _map(panel, across, np.asarray(one.grid.z_um), e, index, top)
         panel.set(
             title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"

@@ -236,7 +236,8 @@ def safetensors_head(path: Path) -> dict[str, Any]:
         raise StoreError(
             f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again"
         )
-    kind, version = str(about.get("kind", "network")), str(about.get("version", "1"))
+    kind = str(about.get("kind", "network"))
+    version = str(about.get("version", "1"))
     return {
         "file": path.name,
         "kind": kind,

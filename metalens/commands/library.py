@@ -92,7 +92,8 @@ def run(options: Options) -> int:
         axes.check_axes_sweep(wanted.cell, wanted.sweep)
         return _run_two_sizes(options, wanted)
     library.check_sweep(wanted.cell, wanted.sweep)
-    target, inputs = options.output, _inputs(options.config, wanted.cell)
+    target = options.output
+    inputs = _inputs(options.config, wanted.cell)
     with options.claim(target, companions=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")

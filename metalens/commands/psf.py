@@ -474,7 +474,8 @@ def run(options: Options) -> int:
     """
     if options.far_field:
         return _far(options)
-    target, settings = options.output or Path("psf.h5"), options.settings
+    target = options.output or Path("psf.h5")
+    settings = options.settings
     psf_export.check_psf_format(target)
     device, built = _read(options.lens)
     device = (
@@ -516,10 +517,8 @@ def _far(options: Options) -> int:
             f"{options.lens}: the far field of a design (lens.h5), not of a file of kind {kind}"
         )
     device = lens.load(options.lens)
-    wanted, inputs = (
-        far_field.far_field_request(options, device),
-        {options.lens.name: store.sha256(options.lens)},
-    )
+    wanted = far_field.far_field_request(options, device)
+    inputs = {options.lens.name: store.sha256(options.lens)}
     with options.claim(
         target,
         companions=("_far.png", ".html"),
@@ -909,7 +908,9 @@ def key_figures(computed: Computed) -> list[KeyFigure]:
     Args:
         found: what was computed.
     """
-    stack, budget, best = computed.stack, computed.stack.budget, computed.figures[0]
+    stack = computed.stack
+    budget = computed.stack.budget
+    best = computed.figures[0]
     shape = len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)
     figures = [
         KeyFigure("field angles × depths × wavelengths", " × ".join(map(str, shape))),

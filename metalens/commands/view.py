@@ -164,7 +164,8 @@ def panels_of(kind: str) -> Callable[[Path], list[Panel]]:
     """What shows a kind of artefact; any other kind is shown plainly."""
     module, _, function = VIEWS.get(kind, "").partition(":")
     if not module:
-        module, function = "metalens.view.artefacts", OWN.get(kind, "plain_panels")
+        module = "metalens.view.artefacts"
+        function = OWN.get(kind, "plain_panels")
     found: Callable[[Path], list[Panel]] = getattr(
         importlib.import_module(module), function
     )

@@ -215,10 +215,8 @@ def describe_fields(record: type[Any]) -> dict[str, str]:
     """{field: what the docstring of a record says of it}: ``name: text`` or ``name,
     other: text``, to an empty line.
     """
-    names, doc = (
-        {f.name for f in dataclasses.fields(record)},
-        inspect.getdoc(record) or "",
-    )
+    names = {f.name for f in dataclasses.fields(record)}
+    doc = inspect.getdoc(record) or ""
     if doc.startswith(
         f"{record.__name__}("
     ):  # the signature that stands for a docstring
@@ -275,11 +273,11 @@ def _check_range(
     """Numbers finite, at most 1e9 in size; no empty list or name, but where these say
     something; see :func:`load`.
     """
-    limits, empty = (
-        field.metadata,
+    limits = field.metadata
+    empty = (
         field.metadata.get("may_be_empty")
         or field.default in ("", ())
-        or _made(field) == (),
+        or _made(field) == ()
     )
     if (value in ((), "") and not empty) or (
         isinstance(value, Path) and not value.name

@@ -506,10 +506,8 @@ def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
     elsewhere, without a checksum.
     """
     if isinstance(value, str):
-        encoded, name = (
-            reading.to_valid_utf8(value).encode(),
-            reading.to_valid_utf8(name),
-        )
+        encoded = reading.to_valid_utf8(value).encode()
+        name = reading.to_valid_utf8(name)
         item.attrs.create(
             name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1))
         )
@@ -636,7 +634,8 @@ def build_record(
     """
     hints = typing.get_type_hints(record_type)
     for entry in dataclasses.fields(record_type):  # type: ignore[arg-type]
-        name, kind = group + entry.name, _without_none(hints[entry.name])
+        name = group + entry.name
+        kind = _without_none(hints[entry.name])
         if entry.name in given or not entry.init:
             continue
         if _holds_arrays(kind):

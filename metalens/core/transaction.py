@@ -349,7 +349,8 @@ def _exchange_names(one: Path, other: Path) -> bool:
         return False
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    first, second = os.fsencode(one.absolute()), os.fsencode(other.absolute())
+    first = os.fsencode(one.absolute())
+    second = os.fsencode(other.absolute())
     return call is not None and not call(here, first, here, second, exchange)
 
 

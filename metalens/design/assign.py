@@ -169,7 +169,8 @@ def phase_of(
         return profiles.hyperbolic_phase(x_um, y_um[:, None], focus)
 
     if isinstance(shape, PhaseMap):
-        samples, add_focus = phase_map.read_phase_map(shape), shape.add_focus
+        samples = phase_map.read_phase_map(shape)
+        add_focus = shape.add_focus
 
         def mapped(x_um: Array, y_um: Array) -> Array:
             phase = phase_map.interpolate_phase(
@@ -269,7 +270,8 @@ def assign_multi_wavelength(
         diameters lie within 1e-4 rad of the least sum for these pistons; the pistons
         are the best of 16 starts, another minimum may be lower.
     """
-    waves, weights = [w.focus.wavelength_um for w in wanted], [w.weight for w in wanted]
+    waves = [w.focus.wavelength_um for w in wanted]
+    weights = [w.weight for w in wanted]
     if not waves or len(set(waves)) < len(waves):
         raise LensError(
             f"wavelengths {', '.join(f'{w:g}' for w in waves)} um: "
@@ -332,7 +334,8 @@ def assign_polarization_multiplexed(
         DomainError: a wavelength that the library lacks.
     """
     limits, cell = limits or Limits(), library.cell
-    at, isotropic = library.at(focuses[0].wavelength_um), phases[1] is None
+    at = library.at(focuses[0].wavelength_um)
+    isotropic = phases[1] is None
     printed = library.usable[at] & _is_printable(library, limits)
     if not printed.any():
         x, y = library.x_um, library.y_um
@@ -469,7 +472,8 @@ def printable_range_um(
         LensError: no diameter, or less than a full turn of phase without leave.
     """
     thinnest, widest = _printed(cell, limits)
-    low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
+    low = max(proxy.domain_um[0], thinnest)
+    high = min(proxy.domain_um[1], widest)
     if low >= high:
         raise LensError(
             f"no printable pillar: the library holds {proxy.domain_um[0]:.4f}-"
@@ -673,7 +677,8 @@ def _covered_share(t: Array, *, isotropic: bool) -> float:
 
 def _check_rotated(cell: Cell, rotated: GeometricPhase, limits: Limits) -> None:
     """Refuse a pillar that the process does not print at every rotation."""
-    outline, named = cell.outline(rotated.size_um), f"a {cell.shape.name} of "
+    outline = cell.outline(rotated.size_um)
+    named = f"a {cell.shape.name} of "
     steps = cell.lattice.steps_um(cell.pitch_um)
     gap = min(np.hypot(*step) for step in steps) - 2 * outline.radius_um
     if gap < limits.min_gap_nm * 1e-3 - 1e-9:

@@ -82,7 +82,8 @@ class CandidateTable:
             pick = self.sums(phases + pistons[:, None]).argmin(1)
             peaks = self.weights * (self.t[:, pick] * np.exp(-1j * phases)).sum(1)
             peaks = peaks.sum(keepdims=True) if self.common_piston else peaks
-            before, pistons = pistons, np.broadcast_to(np.angle(peaks), len(self.t))
+            before = pistons
+            pistons = np.broadcast_to(np.angle(peaks), len(self.t))
             moved = np.angle(np.exp(1j * (pistons - before)))
             if np.abs(moved).max() < _CONVERGED_RAD:
                 break

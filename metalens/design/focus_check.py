@@ -89,12 +89,11 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
         lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um),
     )
     aperture = focus.aperture(radius)
-    resolution, depth = (
-        lens.wavelength_um / (2 * aperture),
-        after.index[0] * lens.wavelength_um / aperture**2,
-    )
+    resolution = lens.wavelength_um / (2 * aperture)
+    depth = after.index[0] * lens.wavelength_um / aperture**2
     zones = radius**2 / (lens.wavelength_um * after.reduced_um)
-    phase, level = lens.phase_rad(), lens.transmission() * _illumination(lens)
+    phase = lens.phase_rad()
+    level = lens.transmission() * _illumination(lens)
     case = _case(lens, resolution, 0.0)
     axial = axial and after.thickness_um[0] > depth / 2
     arm, rest = _ARM * resolution, np.zeros_like(_ARM)

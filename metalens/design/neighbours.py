@@ -105,7 +105,8 @@ def _blazed(
     """Amplitude in the wanted order against pillars one by one, of light along and
     across the row, and power that went
     elsewhere, the mean of both."""
-    count, block = len(diameters_um), block_of(lens.cell.pitch_um, diagonal)
+    count = len(diameters_um)
+    block = block_of(lens.cell.pitch_um, diagonal)
     place = np.arange(count) - (count - 1) / 2
     about: dict[str, Any] = {"harmonics": harmonics, "diagonal": diagonal}
     ratios, lost = [], []

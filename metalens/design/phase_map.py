@@ -160,10 +160,8 @@ def interpolate_phase(
     """
     rows, columns = samples.phase_rad.shape
     (step_x, step_y), (x0, y0) = samples.step_um, samples.centre_um
-    row, column = (
-        (y_um - y0) / step_y + (rows - 1) / 2,
-        (x_um - x0) / step_x + (columns - 1) / 2,
-    )
+    row = (y_um - y0) / step_y + (rows - 1) / 2
+    column = (x_um - x0) / step_x + (columns - 1) / 2
     if (
         min(row.min(), column.min()) < -0.5
         or row.max() > rows - 0.5
@@ -469,8 +467,11 @@ def _zemax_head(
     path: Path, words: list[str]
 ) -> tuple[int, int, tuple[float, float], tuple[float, float]]:
     try:
-        columns, rows, unit = int(words[0]), int(words[1]), ZEMAX_UNIT_UM[int(words[4])]
-        step_x, step_y = abs(float(words[2])) * unit, abs(float(words[3])) * unit
+        columns = int(words[0])
+        rows = int(words[1])
+        unit = ZEMAX_UNIT_UM[int(words[4])]
+        step_x = abs(float(words[2])) * unit
+        step_y = abs(float(words[3])) * unit
         right, up = (
             (float(w) * unit for w in words[5:7]) if len(words) >= 7 else (0.0, 0.0)
         )

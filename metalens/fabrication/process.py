@@ -203,10 +203,8 @@ def draw_lenses(spread: Spread, count: int, *, seed: int) -> list[Draw]:
     """
     random, stated = np.random.default_rng(seed), spread.stated
     sigma = np.array(list(stated.values()))
-    normal, turns = (
-        random.standard_normal((count, len(sigma))) * sigma,
-        random.uniform(0, 2 * np.pi, count),
-    )
+    normal = random.standard_normal((count, len(sigma))) * sigma
+    turns = random.uniform(0, 2 * np.pi, count)
     return [
         Draw(dict(zip(stated, row.tolist(), strict=True)), float(turn))
         for row, turn in zip(normal, turns, strict=True)

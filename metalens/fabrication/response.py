@@ -108,7 +108,8 @@ class Sensitivity:
 
     def _series(self, coefficients: Array, diameter_um: Array) -> list[Array]:
         inside = np.clip(diameter_um, self.low_um, self.high_um)
-        offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
+        offset = inside - self.center_um
+        beyond = np.asarray(diameter_um - inside)
         values = [polynomial.polyval(offset, row) for row in coefficients]
         if beyond.any():
             slopes = [
@@ -194,10 +195,8 @@ def proxy_sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     if not lens.cell.round:
         return _of_its_own(lens)
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-    low, high = (
-        max(float(d.min()), lens.proxy.domain_um[0]),
-        min(float(d.max()), lens.proxy.domain_um[1]),
-    )
+    low = max(float(d.min()), lens.proxy.domain_um[0])
+    high = min(float(d.max()), lens.proxy.domain_um[1])
     seen = effective_indices(
         lens.cell,
         lens.proxy,

@@ -58,10 +58,8 @@ class PairTable:
 
     def t(self, width_um: Array, length_um: Array) -> Array:
         """(*shape) of the table."""
-        x, y = (
-            np.clip(width_um, self.x_um[0], self.x_um[-1]),
-            np.clip(length_um, self.y_um[0], self.y_um[-1]),
-        )
+        x = np.clip(width_um, self.x_um[0], self.x_um[-1])
+        y = np.clip(length_um, self.y_um[0], self.y_um[-1])
         value = self._spline(x, y)
         if (x == width_um).all() and (y == length_um).all():
             return value
@@ -188,7 +186,8 @@ def pair_sensitivities(
 
 def _farthest_points(points: Array, first: int, count: int) -> list[int]:
     """The first, then always the point that is farthest from all before it."""
-    chosen, away = [first], np.linalg.norm(points - points[first], axis=1)
+    chosen = [first]
+    away = np.linalg.norm(points - points[first], axis=1)
     while len(chosen) < count and away.max() > 0:
         chosen.append(int(away.argmax()))
         away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))

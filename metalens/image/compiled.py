@@ -152,10 +152,8 @@ def _weigh(light, depth, table, near, far, start, stop, out):  # type: ignore[no
                 for k in range(table.shape[0]):
                     row = table[k]
                     for kind in range(kinds):
-                        given, made = (
-                            light[n, kind, sheet, y],
-                            out[k, n, kind, sheet, y],
-                        )
+                        given = light[n, kind, sheet, y]
+                        made = out[k, n, kind, sheet, y]
                         for x in range(width):
                             made[x] = row[code[x]] * given[x]
 

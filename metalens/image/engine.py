@@ -159,7 +159,8 @@ def normalise_psfs(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, T
         optics: lens, light and distances at the nodes.
         plan: field nodes, depths and wavelengths.
     """
-    total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
+    total = light.sum((-2, -1))
+    wave = float(plan.waves.wavelengths_um.mean())
     cosine4 = _cosine4(optics, plan.places_um, plan.depths_um, wave)
     return light / total[..., None, None], total * cosine4.reshape(total.shape).to(
         total

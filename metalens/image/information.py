@@ -39,7 +39,9 @@ def span_angle(fisher: Tensor) -> Tensor:
     Args:
         fisher: (..., n, n) Fisher matrix.
     """
-    f11, f22, f12 = fisher[..., 0, 0], fisher[..., 1, 1], fisher[..., 0, 1]
+    f11 = fisher[..., 0, 0]
+    f22 = fisher[..., 1, 1]
+    f12 = fisher[..., 0, 1]
     across = torch.sqrt((f11 * f22 - f12**2).clamp_min(torch.finfo(fisher.dtype).tiny))
     dark = (f11 <= 0) | (f22 <= 0)
     return torch.where(dark, 0.0, torch.atan2(across, f12))
@@ -243,11 +245,9 @@ def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
     Args:
         fisher: (..., n, n) Fisher matrix.
     """
-    a, b, c = (
-        fisher[:wanted, :wanted],
-        fisher[:wanted, wanted:],
-        fisher[wanted:, wanted:],
-    )
+    a = fisher[:wanted, :wanted]
+    b = fisher[:wanted, wanted:]
+    c = fisher[wanted:, wanted:]
     scale = torch.sqrt(torch.diagonal(c).clamp_min(torch.finfo(c.dtype).tiny))
     inverse = torch.linalg.pinv(
         c / torch.outer(scale, scale), hermitian=True, rtol=1e-12

@@ -156,7 +156,8 @@ def gathering_error(
     most = 256  # along an axis; of a wider window the middle is looked at
     finer *= 2 if (window.samples + 2) * 2 * finer <= most else 1
     count = min(window.samples, max(most // finer - 2, 3) | 1)
-    share, edge = _triangles(count, finer), (window.samples - count) // 2
+    share = _triangles(count, finer)
+    edge = (window.samples - count) // 2
     few = slice(edge, edge + count)
     errors, lights = [], []
     with torch.no_grad():

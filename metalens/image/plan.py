@@ -314,7 +314,8 @@ def waves_of(
     at = at * torch.tensor(
         [half_um[1], half_um[0]], dtype=torch.float64
     ) + torch.tensor(middle_um, dtype=torch.float64)
-    ends, window = depth_nodes(grid, 2), Window(grid.window, grid.step_um)
+    ends = depth_nodes(grid, 2)
+    window = Window(grid.window, grid.step_um)
     last = sum_over_spectrum(optics, at, ends, _coarse(optics, source, 1), window)
     beside = source.beside if isinstance(source, spectra.MeasuredSpectrum) else 0.0
     for count in range(2, 17):

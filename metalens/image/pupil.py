@@ -161,7 +161,8 @@ def aperture_light(pupil: Pupil, window_um: float) -> float:
         pupil: sampled pupil of the lens.
         window_um: side of the window, um.
     """
-    step, k = 2 * pupil.edge / pupil.nodes, 2 * math.pi / pupil.wavelength_um
+    step = 2 * pupil.edge / pupil.nodes
+    k = 2 * math.pi / pupil.wavelength_um
     given = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
     dimmed = 2 * math.sqrt(2) * window_um / (3 * k * pupil.edge * pupil.period_um**2)
     return given * (1 - dimmed)
@@ -201,7 +202,8 @@ def psf(
             "raise Pupil.nodes or take a smaller window"
         )
     to_window = kernel(pupil, sample_um, samples)
-    k, added = 2 * math.pi / pupil.wavelength_um, wrap_phase(phase_rad).float()
+    k = 2 * math.pi / pupil.wavelength_um
+    added = wrap_phase(phase_rad).float()
     angles, weights = [], []
     for depth, field in zip(
         depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True
@@ -241,7 +243,8 @@ def view_pupil(pupil: Pupil, field: Field, focus_um: float) -> PupilView:
         node_cosines(pupil) + my, node_cosines(pupil) + mx, indexing="ij"
     )
     rest = (1 - qx**2 - qy**2).clamp_min(1e-3)
-    x, y = cx + qx * d / torch.sqrt(rest), cy + qy * d / torch.sqrt(rest)
+    x = cx + qx * d / torch.sqrt(rest)
+    y = cy + qy * d / torch.sqrt(rest)
     r2, n = x**2 + y**2, pupil.nodes
     step = (
         2 * pupil.edge / n * d / torch.sqrt(rest)
@@ -273,7 +276,8 @@ def wrap_phase(phase_rad: Tensor) -> Tensor:
 def _middle(radius_um: float, cx: float, cy: float, d: float) -> tuple[float, float]:
     """Middle of the direction cosines that the aperture fills."""
     turn = torch.arange(256, dtype=torch.float64) * (2 * math.pi / 256)
-    x, y = radius_um * torch.cos(turn) - cx, radius_um * torch.sin(turn) - cy
+    x = radius_um * torch.cos(turn) - cx
+    y = radius_um * torch.sin(turn) - cy
     path = torch.sqrt(x**2 + y**2 + d**2)
     qx, qy = x / path, y / path
     return float(qx.min() + qx.max()) / 2, float(qy.min() + qy.max()) / 2

@@ -202,7 +202,8 @@ def low_snr(
     """
     _check("mean_irradiance", mean_irradiance, above=True)
     _check("ambient_ratio", ambient_ratio, above=False)
-    q2, area = 10 ** (snr_db / 10), float(kappa(sensor.pitch_um, sensor.base_pitch_um))
+    q2 = 10 ** (snr_db / 10)
+    area = float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     shot = q2 * (1 + ambient_ratio)
     signal = (shot + math.sqrt(shot**2 + 4 * q2 * sensor.read_noise_e**2)) / 2 / area
     return replace(

@@ -59,7 +59,8 @@ def texture_error(psf: Tensor, reference: Tensor) -> Tensor:
     Args:
         psf: (..., h, w) PSFs.
     """
-    a, b = texture_spectrum(psf.double()), texture_spectrum(reference.double())
+    a = texture_spectrum(psf.double())
+    b = texture_spectrum(reference.double())
     error: Tensor = (a - b).norm(dim=-1) / b.norm(dim=-1)
     return error
 

@@ -323,7 +323,9 @@ def focusing_phase(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
         y_um: places along y, um.
     """
     r2 = x_um * x_um + y_um * y_um
-    d, s, films = focus.sensor_distance_um, focus.source_distance_um, focus.layers
+    d = focus.sensor_distance_um
+    s = focus.source_distance_um
+    films = focus.layers
     total = _longer(films.after(d, focus.wavelength_um), r2)
     if math.isfinite(s):
         total = total + _longer(films.before(s, focus.wavelength_um), r2)

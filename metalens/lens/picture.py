@@ -74,7 +74,8 @@ def mean_field(lens: Lens, sites: int) -> Array:
 
     Read in bands of rows: a large lens stays in its file.
     """
-    d, centred = lens.diameters.diameter_um, lens.diameters.lattice.centred
+    d = lens.diameters.diameter_um
+    centred = lens.diameters.lattice.centred
     height, width = (-(-n // sites) for n in d.shape)
     mean = np.empty((height, width), complex)
     for i in range(height):
@@ -93,8 +94,10 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     d = lens.diameters
     ny, nx = d.diameter_um.shape
     side = 28  # pillars along the side of the picture
-    row, column = ny // 2 - side // 2, min(nx * 3 // 4, max(nx - side, 0))
-    rows, columns = slice(max(row, 0), row + side), slice(column, column + side)
+    row = ny // 2 - side // 2
+    column = min(nx * 3 // 4, max(nx - side, 0))
+    rows = slice(max(row, 0), row + side)
+    columns = slice(column, column + side)
     part = d.diameter_um[rows, columns]
     x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
     there = part > 0

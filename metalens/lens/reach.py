@@ -140,7 +140,8 @@ def depth_range_um(
     """
     radius = _widest(lens)
     most = 3.5 * lens.wavelength_um / radius**2
-    focus, films = _reduced(lens, lens.source_distance_um), _thinner(lens)
+    focus = _reduced(lens, lens.source_distance_um)
+    films = _thinner(lens)
     near = max(1 / (1 / focus + most), min(2 * radius, focus))
     far = 1 / max(1 / focus - most, 0.1 / near)
     thick = sum(film.thickness_um for film in lens.layers.front)

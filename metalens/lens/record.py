@@ -189,10 +189,8 @@ class DiameterMap:
             there = block > 0
             held = there.any(axis=1)
             if held.any():
-                first, last = (
-                    there.argmax(axis=1),
-                    there.shape[1] - 1 - there[:, ::-1].argmax(axis=1),
-                )
+                first = there.argmax(axis=1)
+                last = there.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
                 outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
                 y = self.y_um[start : start + len(block)]
                 farthest = max(farthest, float(np.hypot(outer, y)[held].max()))
@@ -412,7 +410,8 @@ class Lens:
     def _amplitude(
         self, rows: slice, pairs: TwoSizeTable, wavelength_um: float | None
     ) -> Array:
-        x, y = self.diameters.diameter_um[rows], self.diameters.length_um
+        x = self.diameters.diameter_um[rows]
+        y = self.diameters.length_um
         return pairs.amplitude(
             x, x if y is None else y[rows], self._at(wavelength_um), self.light
         )

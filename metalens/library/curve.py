@@ -128,7 +128,8 @@ class ResponseCurve:
 
     def _steepness(self, d: Array) -> Array:
         """|dt/dD| and what a curve without features would have, 1/um."""
-        low, high = self.nodes.diameter_um.min(), self.nodes.diameter_um.max()
+        low = self.nodes.diameter_um.min()
+        high = self.nodes.diameter_um.max()
         step = FINEST_UM / 100
         rise = np.abs(self.best(d + step)[..., 0] - self.best(d - step)[..., 0]) / (
             2 * step
@@ -142,7 +143,8 @@ class ResponseCurve:
         Poles that a rival fit does not share (within a fifth of their width) carry no
         meaning and are left out.
         """
-        low, high = self.nodes.diameter_um.min(), self.nodes.diameter_um.max()
+        low = self.nodes.diameter_um.min()
+        high = self.nodes.diameter_um.max()
         poles = self.best.poles()
         poles = poles[
             (poles.real > low)
@@ -271,10 +273,8 @@ def _suspect(
         & (np.abs(poles.imag) < 0.1 * (high - low))
     ]
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
-    even, near = (
-        np.concatenate([np.linspace(low, high, 1201), cheaper]),
-        np.concatenate(around),
-    )
+    even = np.concatenate([np.linspace(low, high, 1201), cheaper])
+    near = np.concatenate(around)
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
     near = near[(near > low) & (near < high) & (_distance(near, x) > FINEST_UM)]
     places = np.concatenate([even, near])
@@ -296,10 +296,8 @@ def _widest_gap(x: list[float], cheaper: Array) -> float:
     """
     ordered = np.sort(x)
     widest = int(np.argmax(np.diff(ordered)))
-    middle, quarter = (
-        (ordered[widest] + ordered[widest + 1]) / 2,
-        (ordered[widest + 1] - ordered[widest]) / 4,
-    )
+    middle = (ordered[widest] + ordered[widest + 1]) / 2
+    quarter = (ordered[widest + 1] - ordered[widest]) / 4
     away = np.abs(cheaper - middle)
     return float(
         cheaper[np.argmin(away)] if away.min(initial=np.inf) < quarter else middle

@@ -62,10 +62,8 @@ class ProxyTolerances:
         follow what is not known.
         """
         usual = max(FOLLOWED, KNOWN_SHARE * entry_error)
-        phase, level = (
-            self.phase_tolerance_rad or usual,
-            self.transmission_tolerance or usual,
-        )
+        phase = self.phase_tolerance_rad or usual
+        level = self.transmission_tolerance or usual
         return dataclasses.replace(
             self, phase_tolerance_rad=phase, transmission_tolerance=level
         )
@@ -173,7 +171,9 @@ def longest_monotonic_branch(
     gaps = _gaps(sharp, wanted.least_half_width_um) if across_resonances else ()
     for least, largest in gaps:
         inside &= (d < least) | (d > largest)
-    d, t, bars = d[inside], library.t[..., inside], library.t_error[..., inside]
+    d = d[inside]
+    t = library.t[..., inside]
+    bars = library.t_error[..., inside]
     faults = _faults(library, d, t, bars, wanted.least_transmission)
     faults += [] if gaps else [_near_resonance(d, *one) for one in sharp]
     bad = np.any([mask for mask, _ in faults], axis=0)
@@ -440,7 +440,8 @@ def _longest_domain(
     """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
     tolerances.
     """
-    good, bad = min(len(data.diameter_um), 3 * terms), len(data.diameter_um) + 1
+    good = min(len(data.diameter_um), 3 * terms)
+    bad = len(data.diameter_um) + 1
     best = _best_power(data.part(slice(good)), wanted, terms)
     if best is None:
         raise DomainError(
@@ -588,10 +589,8 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     1961: weights times deviation).
     """
     weight = np.ones(values.shape)
-    best, least = (
-        np.zeros((*values.shape[:-1], basis.shape[1])),
-        np.full(values.shape[:-1], np.inf),
-    )
+    best = np.zeros((*values.shape[:-1], basis.shape[1]))
+    least = np.full(values.shape[:-1], np.inf)
     for _ in range(rounds):
         root = np.sqrt(weight)[..., None]
         q, r = np.linalg.qr(basis * root)

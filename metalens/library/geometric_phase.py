@@ -179,10 +179,8 @@ def solve_rotations(
                 tolerance=tolerance,
             )
         )
-    t, error = (
-        np.array([one.t for one in found]),
-        np.array([one.t_error for one in found]),
-    )
+    t = np.array([one.t for one in found])
+    error = np.array([one.t_error for one in found])
     earlier = np.array([one.earlier for one in found])
     back = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
     return GeometricPhase(

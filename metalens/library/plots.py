@@ -60,7 +60,8 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
     panels = figure.subplots(1, len(study.wavelengths_um), sharey=True, squeeze=False)[
         0
     ]
-    pitch, height = NM * np.array(study.pitches_um), NM * np.array(study.heights_um)
+    pitch = NM * np.array(study.pitches_um)
+    height = NM * np.array(study.heights_um)
     for panel, wavelength in zip(panels, study.wavelengths_um, strict=True):
         found = [v.turns for v in verdicts if v.wavelength_um == wavelength]
         turns = np.array(found[: len(height) * len(pitch)]).reshape(
@@ -146,7 +147,8 @@ def _residuals(panel: Any, library: "PillarLibrary", made: "ProxyFit") -> None:
     proxy = made.proxy
     low, high = proxy.domain_um
     inside = (library.diameter_um >= low - 1e-9) & (library.diameter_um <= high + 1e-9)
-    d, mean = library.diameter_um[inside], library.t[..., inside].mean(axis=0)
+    d = library.diameter_um[inside]
+    mean = library.t[..., inside].mean(axis=0)
     first = True
     for j, k in np.ndindex(*mean.shape[:2]):
         place = (float(library.wavelength_um[k]), float(library.angle_rad[j]))

@@ -263,5 +263,6 @@ def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, f
         basis = chebyshev.chebvander(nodes, degree)
         values = np.moveaxis(np.tensordot(basis, values, (1, axis)), 0, axis)
         slack /= math.cos(math.pi * degree / (2 * len(nodes))) if degree else 1.0
-    middle, half = (values.max() + values.min()) / 2, (values.max() - values.min()) / 2
+    middle = (values.max() + values.min()) / 2
+    half = (values.max() - values.min()) / 2
     return float(middle - half * slack), float(middle + half * slack)

@@ -221,10 +221,8 @@ def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
     Raises:
         CellError: there is none.
     """
-    low, high = (
-        cell.size_um(study.min_diameter_um, study.min_gap_um),
-        cell.widest_um(study.min_gap_um),
-    )
+    low = cell.size_um(study.min_diameter_um, study.min_gap_um)
+    high = cell.widest_um(study.min_gap_um)
     if low >= high:
         raise CellError(
             f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "
@@ -249,10 +247,8 @@ def judge_cell(
     hole = (
         cell.shape.hole
     )  # the wider an opening, the less phase: taken with the other sign
-    level, phase = (
-        np.abs(value[:, 0]),
-        np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1),
-    )
+    level = np.abs(value[:, 0])
+    phase = np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
     back = "the phase rises" if hole else "the phase falls"
     faults = {
         "|t| falls": level < study.least_transmission,
@@ -370,19 +366,15 @@ def _subject(study: CellStudy) -> str:
     """What the pillars are, in words."""
     if study.cell is None:
         return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
-    substrate, cover = (
-        material_name(study.cell.substrate),
-        material_name(study.cell.cover),
-    )
+    substrate = material_name(study.cell.substrate)
+    cover = material_name(study.cell.cover)
     return f"Pillars of {material_name(study.material)} on {substrate} under {cover}: {study.cell.described}"
 
 
 def _limits(study: CellStudy) -> str:
     """What is printed, in words."""
-    least, gap = (
-        f"{1e3 * study.min_diameter_um:.4g} nm",
-        f"{1e3 * study.min_gap_um:.4g} nm",
-    )
+    least = f"{1e3 * study.min_diameter_um:.4g} nm"
+    gap = f"{1e3 * study.min_gap_um:.4g} nm"
     if study.made(study.pitches_um[0], study.heights_um[0]).round:
         return f"diameter from {least} to the pitch less {gap}"
     return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"

@@ -94,10 +94,8 @@ class _SweepRun:
         points = self.points(diameters, rows)
         solved = self.journal.run(points, self.console, "entries one by one")
         for task, (made,) in zip(points, solved, strict=True):
-            row, place = (
-                rows[task.lights[0]],
-                np.searchsorted(diameters, made.diameter_um),
-            )
+            row = rows[task.lights[0]]
+            place = np.searchsorted(diameters, made.diameter_um)
             better = made.error < row[2, place].real
             values = np.concatenate([made.response.T, made.error[None]])
             row[:, place[better]] = values[:, better]
@@ -280,10 +278,8 @@ def _interpolate_family(
     have = {x: wave for x, wave in family.items() if wave in rows}
     if len(have) < NODES:
         return
-    nodes, table = (
-        np.array(list(have)),
-        np.stack([rows[wave] for wave in have.values()]),
-    )
+    nodes = np.array(list(have))
+    table = np.stack([rows[wave] for wave in have.values()])
     for x, wave in family.items():
         if wave not in rows:
             row = interpolate_row(nodes, table, x)

@@ -257,7 +257,8 @@ def _scaled(kind: str, unit: str, values: Array, where: str) -> tuple[float, Arr
 def _amplitudes(found: dict[str, _Column], where: str) -> tuple[Array, list[str]]:
     """Complex t of the rows, and how it was stated."""
     if "complex" in found:
-        t, words = found["complex"].values.astype(complex), ["complex t"]
+        t = found["complex"].values.astype(complex)
+        words = ["complex t"]
     elif {"real", "imaginary"} <= found.keys():
         t = found["real"].values + 1j * found["imaginary"].values
         words = ["t from its real and imaginary part"]
@@ -342,7 +343,8 @@ def _left_out_errors(sizes: Array, t: Array) -> Array:
     error = np.empty(t.shape)
     every = np.arange(len(sizes))
     for parity in (0, 1):
-        mine, others = every[every % 2 == parity], every[every % 2 != parity]
+        mine = every[every % 2 == parity]
+        others = every[every % 2 != parity]
         spline = CubicSpline(sizes[others], t[..., others], axis=-1)
         error[..., mine] = np.abs(spline(sizes[mine]) - t[..., mine])
     return error

@@ -64,7 +64,9 @@ def jacobian_metric(patch: MeshPatch, rho: float) -> JacobianMetric:
     """
     xi = rho * patch.rho_xi + patch.rest_xi
     eta = rho * patch.rho_eta + patch.rest_eta
-    g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
+    g11 = (xi * xi).sum(-1)
+    g22 = (eta * eta).sum(-1)
+    g12 = (xi * eta).sum(-1)
     area = np.abs(xi[..., 0] * eta[..., 1] - xi[..., 1] * eta[..., 0])
     inverse = 1 / area
     return JacobianMetric(g22 * inverse, g11 * inverse, -g12 * inverse, inverse, area)

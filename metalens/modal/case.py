@@ -53,11 +53,9 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
     along = plane_of_incidence(light)
     below, above = half_spaces(cell, light)
     disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.fill))
-    k0, half, sine = (
-        2 * math.pi / light.wavelength_um,
-        cell.pitch_um / 2,
-        abs(math.sin(light.angle_rad)),
-    )
+    k0 = 2 * math.pi / light.wavelength_um
+    half = cell.pitch_um / 2
+    sine = abs(math.sin(light.angle_rad))
     bloch = k0 * sine * half
     if bloch <= NORMAL_RAD:
         bloch = 0.0

@@ -137,12 +137,10 @@ def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
         basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
     """
     around = float(medium.around.real)
-    a, b, k2, step = (
-        len(basis.te),
-        len(basis.tm),
-        medium.k0**2,
-        float((medium.disc - medium.around).real),
-    )
+    a = len(basis.te)
+    b = len(basis.tm)
+    k2 = medium.k0**2
+    step = float((medium.disc - medium.around).real)
     first = add_diagonal(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
     te, te_low, rest = low_levels(first, basis.te, k2 * abs(step))
     second = add_diagonal(k2 * step * basis.disc_mass[a:, a:], k2 * around)
@@ -434,10 +432,8 @@ def symmetric_square(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
     mirror images."""
     n, found = len(e), np.empty_like(e)
     for start in range(0, n, -(-n // STRIPS)):
-        rows, beyond = (
-            slice(start, start - (-n // STRIPS)),
-            slice(start - (-n // STRIPS), n),
-        )
+        rows = slice(start, start - (-n // STRIPS))
+        beyond = slice(start - (-n // STRIPS), n)
         found[rows, start:] = e[rows] @ e[:, start:]
         found[beyond, rows] = (signs[beyond, None] * signs[rows]).astype(
             e.dtype

@@ -98,7 +98,8 @@ def half_space(
     for eps, thickness in films:
         kz, factor = wave(eps)
         once = np.exp(1j * kz * thickness)
-        cosine, sine = (1 + once**2) / 2, (once**2 - 1) / (2j * kz * factor)
+        cosine = (1 + once**2) / 2
+        sine = (once**2 - 1) / (2j * kz * factor)
         through = cosine - y * sine  # all times exp(i kz d), so that nothing grows
         reflection = reflection - 2 * transfer**2 * sine / through
         transfer = once * transfer / through
@@ -138,10 +139,8 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
 def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
     """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
     reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
-    along, across = (
-        bloch + np.pi * np.arange(-reach, reach + 1),
-        np.pi * np.arange(reach + 1),
-    )
+    along = bloch + np.pi * np.arange(-reach, reach + 1)
+    across = np.pi * np.arange(reach + 1)
     wavenumbers: np.ndarray = (along[:, None] ** 2 + across**2).ravel()
     return wavenumbers
 

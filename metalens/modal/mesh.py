@@ -270,7 +270,8 @@ def ring_patch(
     vectors: list[list[list[int]]] = [[], []]
     scalars: list[list[list[int]]] = [[], []]
     for ring in rings:
-        g0, dg = ends[ring - first], ends[ring - first + 1] - ends[ring - first]
+        g0 = ends[ring - first]
+        dg = ends[ring - first + 1] - ends[ring - first]
         for j in range(n):
             dv = cuts[j + 1] - cuts[j]
             g, v = np.meshgrid(
@@ -278,10 +279,8 @@ def ring_patch(
             )
             start, d_start, end, d_end = ring_curves(plan, inside, v.ravel())
             g = g.reshape(-1, 1)
-            from_start, from_end = (
-                (-dg * start, dv * (1 - g) * d_start),
-                (dg * end, dv * g * d_end),
-            )
+            from_start = (-dg * start, dv * (1 - g) * d_start)
+            from_end = (dg * end, dv * g * d_end)
             zero = np.zeros_like(start)
             if inside:
                 jacobians.append(

@@ -90,16 +90,12 @@ def rim_interval(
         fine_rate = side * (tau * fine ** (tau - 1) - 1)
         for _ in range(2):  # twice is enough (Kahan) for orthogonality to rounding
             part = (fine_slope[1:] * fine_weight) @ fine_rate
-            bubble, rate, fine_rate = (
-                bubble - part @ value[2:],
-                rate - part @ slope[1:],
-                fine_rate - part @ fine_slope[1:],
-            )
+            bubble = bubble - part @ value[2:]
+            rate = rate - part @ slope[1:]
+            fine_rate = fine_rate - part @ fine_slope[1:]
         norm = np.sqrt(fine_weight @ fine_rate**2)
-        value, slope = (
-            np.vstack([value, bubble / norm]),
-            np.vstack([slope, rate / norm]),
-        )
+        value = np.vstack([value, bubble / norm])
+        slope = np.vstack([slope, rate / norm])
         fine_slope = np.vstack([fine_slope, fine_rate / norm])
     return IntervalBasis(1 - d if at_end else d, w, value, slope)
 
@@ -144,12 +140,10 @@ def square_basis(xi: IntervalBasis, eta: IntervalBasis) -> SquareBasis:
         return flat
 
     px, py = xi.degree, eta.degree
-    dx, dy, one_x, one_y = (
-        derivative_matrix(px),
-        derivative_matrix(py),
-        np.eye(px),
-        np.eye(py),
-    )
+    dx = derivative_matrix(px)
+    dy = derivative_matrix(py)
+    one_x = np.eye(px)
+    one_y = np.eye(py)
     return SquareBasis(
         weight=np.outer(xi.weight, eta.weight).ravel(),
         along_xi=product(xi.slope, eta.value),

@@ -69,7 +69,8 @@ def select_functions(
     inside = np.flatnonzero(free & ~at_start & ~at_end)
     if half_phase_rad is None:
         return FunctionSelection(inside, len(inside), 0, 0, 0.0, 1.0)
-    start, end = np.flatnonzero(free & at_start), np.flatnonzero(free & at_end)
+    start = np.flatnonzero(free & at_start)
+    end = np.flatnonzero(free & at_end)
     order = np.concatenate([inside, start, end])
     return FunctionSelection(
         order,

@@ -249,7 +249,9 @@ def _wave(w, table):  # type: ignore[no-untyped-def]
         i = int(a * STEPS)
         u = a * STEPS - i
         low, high = table[i], table[i + 1]
-        p, q, r = u * u * (3 - 2 * u), u * (1 - u) * (1 - u), u * u * (u - 1)
+        p = u * u * (3 - 2 * u)
+        q = u * (1 - u) * (1 - u)
+        r = u * u * (u - 1)
         re = low[0] + p * (high[0] - low[0]) + q * low[2] + r * high[2]
         im = low[1] + p * (high[1] - low[1]) + q * low[3] + r * high[3]
         bent = complex(re, im)
@@ -270,7 +272,8 @@ def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyp
         normal = across + (along - across) * cosine * cosine
         scale = np.sqrt(2 / (wavelength * normal))
         middle, half = (radius - far) * scale, width[i] * scale / 2
-        one, other = _wave(middle + half, table), _wave(middle - half, table)
+        one = _wave(middle + half, table)
+        other = _wave(middle - half, table)
         bent = complex(
             0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i])
         )

@@ -301,10 +301,8 @@ def path_difference(
     """
     w = solve_direction_square(layers, reach2 + scale * more)
     pairs = [(n, t, (n * n - w) ** 0.5, (n * n - w0) ** 0.5) for n, t in layers]
-    g, g0 = (
-        _sum([t / s for _, t, s, _ in pairs]),
-        _sum([t / s0 for _, t, _, s0 in pairs]),
-    )
+    g = _sum([t / s for _, t, s, _ in pairs])
+    g0 = _sum([t / s0 for _, t, _, s0 in pairs])
     slope = _sum([t / (s * s0 * (s + s0)) for _, t, s, s0 in pairs])
     extra = more / (g * g + w0 * (g + g0) * slope)
     return w, extra * _sum([t * n * n / (s * s0 * (s + s0)) for n, t, s, s0 in pairs])
@@ -467,7 +465,8 @@ def plane_wave_correction(
     p, g = np.sqrt(w), np.asarray(reach_per_direction(layers, w))
     along = np.asarray(area_spreading_of_square(layers, w)) / g
     turned = np.exp(-0.25j * np.pi)
-    u, v = turned * node[:, None] / np.sqrt(k * along), turned * node / np.sqrt(k * g)
+    u = turned * node[:, None] / np.sqrt(k * along)
+    v = turned * node / np.sqrt(k * g)
     more = 2 * p * u + u * u + v * v
     # p·ρ + Φ - L, its part linear in u taken off in every medium by itself
     path = p * u * g - sum(

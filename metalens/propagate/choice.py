@@ -58,7 +58,8 @@ def choose_method(
     Returns:
         The method, its reason and its tiles.
     """
-    pillars, points = case.shape[0] * case.shape[1], case.samples[0] * case.samples[1]
+    pillars = case.shape[0] * case.shape[1]
+    points = case.samples[0] * case.samples[1]
     depths = len(case.inverse_depths_per_um)
     if not differentiable and pillars * points * (depths + 2) / 3 < EXACT_WORK:
         reason = f"exact sum: {pillars:,} pillars at {points} points"

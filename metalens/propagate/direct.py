@@ -161,7 +161,9 @@ def _add_point_waves(re, im, x, y, points, wave, out):  # type: ignore[no-untype
     (length, level, k, middle, half), series = wave
     columns = x.size
     v, u, work = np.empty(columns), np.empty(columns), np.empty(columns)
-    path, h_re, h_im = np.empty(columns), np.empty(columns), np.empty(columns)
+    path = np.empty(columns)
+    h_re = np.empty(columns)
+    h_im = np.empty(columns)
     for p in range(points.shape[0]):
         for i in range(y.size):
             across = (points[p, 1] - y[i]) ** 2 + length**2

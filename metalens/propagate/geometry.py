@@ -347,10 +347,8 @@ def _check_rays(case: PropagationCase) -> None:
         np.abs(case.centre_um[0]) + across + wide * np.cos(turn)
     )  # the rim of a round lens, the far corner
     y = np.abs(np.abs(case.centre_um[1]) + down + high * np.sin(turn))
-    steepest, most = (
-        float(media.ray_direction(case.behind, np.hypot(x, y).max())),
-        min(case.behind.order),
-    )
+    steepest = float(media.ray_direction(case.behind, np.hypot(x, y).max()))
+    most = min(case.behind.order)
     if steepest >= most:
         raise PropagationError(
             f"layers: the films fill the way from lens to sensor, and rays of n sin θ = {steepest:.3g} from the rim to "
@@ -378,10 +376,8 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
         PropagationError: no number and no pair, parts of samples, or cells that are not
             square to 1e-6.
     """
-    wide, many = (
-        np.ravel(np.asarray(window_um, float)),
-        np.ravel(np.asarray(samples, float)),
-    )
+    wide = np.ravel(np.asarray(window_um, float))
+    many = np.ravel(np.asarray(samples, float))
     if wide.size not in (1, 2) or many.size not in (1, 2) or (many % 1 != 0).any():
         raise PropagationError(
             f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each, samples whole"

@@ -276,7 +276,8 @@ class ReferencePhase:
         """(block, chunk, order, column) coefficients of block rows start to stop; whole
         turns are left out.
         """
-        order, columns = ORDER[np.dtype(dtype).itemsize], self.case.shape[1]
+        order = ORDER[np.dtype(dtype).itemsize]
+        columns = self.case.shape[1]
         chunks = -(-columns // self.chunk)
         out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
         for first in range(start, stop, TABLE_ROWS):
@@ -346,10 +347,8 @@ class PillarMoments:
         """
         rows, columns = self.blocks
         itemsize = self.dtype.itemsize
-        nodes, carrier = (
-            2 * rows.nodes * columns.count * columns.nodes,
-            ORDER[itemsize] * self.carrier.case.shape[1],
-        )
+        nodes = 2 * rows.nodes * columns.count * columns.nodes
+        carrier = ORDER[itemsize] * self.carrier.case.shape[1]
         step = max(4, int(KEEP_BYTES / ((nodes + carrier) * itemsize)))
         return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
@@ -728,12 +727,10 @@ def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
 def _add_rows(rows, shares, first, sums):  # type: ignore[no-untyped-def]
     """Add four rows (row, re/im, column) to the row nodes: sums (node, re/im, column)."""
     for a in range(sums.shape[0]):
-        s0, s1, s2, s3 = (
-            shares[a, first],
-            shares[a, first + 1],
-            shares[a, first + 2],
-            shares[a, first + 3],
-        )
+        s0 = shares[a, first]
+        s1 = shares[a, first + 1]
+        s2 = shares[a, first + 2]
+        s3 = shares[a, first + 3]
         for k in range(2):
             for j in range(sums.shape[2]):
                 sums[a, k, j] += (
@@ -751,7 +748,8 @@ def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def
     """
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
-        low, high = max(block * length, span[0]), min((block + 1) * length, span[1])
+        low = max(block * length, span[0])
+        high = min((block + 1) * length, span[1])
         for a in range(sums.shape[0]):
             for k in range(2):
                 values = sums[a, k, low - span[0] : high - span[0]]
@@ -782,7 +780,8 @@ def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ig
     padded[:, :length] = shares[0]
     power = 0.0
     for block in range(table.shape[0]):
-        start, stop = (first + block) * length, min((first + block + 1) * length, ny)
+        start = (first + block) * length
+        stop = min((first + block + 1) * length, ny)
         base = bases[0][first + block]
         for c in range(table.shape[1]):
             x0, x1 = c * chunk, min((c + 1) * chunk, nx)
@@ -822,7 +821,8 @@ def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped
     """Adjoint of :func:`_add_columns`: column nodes to the columns of a tile."""
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
-        low, high = max(block * length, span[0]), min((block + 1) * length, span[1])
+        low = max(block * length, span[0])
+        high = min((block + 1) * length, span[1])
         for a in range(grad.shape[0]):
             for k in range(2):
                 values = sums[a, k, low - span[0] : high - span[0]]
@@ -840,12 +840,10 @@ def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
     """
     row[:] = 0
     for a in range(0, sums.shape[0], 4):
-        s0, s1, s2, s3 = (
-            shares[a, i],
-            shares[a + 1, i],
-            shares[a + 2, i],
-            shares[a + 3, i],
-        )
+        s0 = shares[a, i]
+        s1 = shares[a + 1, i]
+        s2 = shares[a + 2, i]
+        s3 = shares[a + 3, i]
         for k in range(2):
             for j in range(sums.shape[2]):
                 row[k, j] += (
@@ -884,7 +882,8 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
     padded = np.zeros((len(sums), length), grad.dtype)
     padded[:nodes] = shares[0]
     for block in range(table.shape[0]):
-        start, stop = (first + block) * length, min((first + block + 1) * length, ny)
+        start = (first + block) * length
+        stop = min((first + block + 1) * length, ny)
         base = bases[0][first + block]
         for c in range(table.shape[1]):
             x0, x1 = c * chunk, min((c + 1) * chunk, nx)

@@ -213,7 +213,8 @@ def _fitted(
         return None
     out = []
     for along, p in zip((y[:, None], x), both, strict=True):
-        reach, p0 = np.broadcast_to(along, p.shape), float(p.min() + p.max()) / 2
+        reach = np.broadcast_to(along, p.shape)
+        p0 = float(p.min() + p.max()) / 2
         slope, level = np.polyfit((p - p0).ravel(), reach.ravel(), 1)
         left = float(np.abs(reach - level - slope * (p - p0)).max())
         out.append(
@@ -487,7 +488,8 @@ def _behind(
     chirps, ramps, squares, paths = [], [], [], []
     for axis, samples, c in zip(axes, case.samples, case.centre_um[::-1], strict=True):
         period = axis.fine * case.step_um / axis.every
-        n, width = np.arange(axis.size) - axis.size // 2, period / axis.size
+        n = np.arange(axis.size) - axis.size // 2
+        width = period / axis.size
         place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
         turns = n * (
             axis.size // 2 / axis.size - place / axis.first
@@ -625,10 +627,8 @@ def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
     """(depth, y, x) |Σ_b coefficients[depth, b] fields[b]|², some rows at a time."""
     depths, (count, my, mx) = len(coefficients), fields.shape
     step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
-    bands, out = (
-        [],
-        None if fields.requires_grad else fields.real.new_empty((depths, my, mx)),
-    )
+    bands = []
+    out = None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
     for start in range(0, my, step):
         some = fields[:, start : start + step]
         field = torch.view_as_real(

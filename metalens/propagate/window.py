@@ -99,7 +99,8 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
             for this method.
     """
     nodes = lens_nodes(case, tolerance / 4)
-    parts, most = max(1, round(math.sqrt(max(nodes)) / 4)), max(case.samples)
+    parts = max(1, round(math.sqrt(max(nodes)) / 4))
+    most = max(case.samples)
     while True:
         parts = min(parts, most)
         rows = window_tiles(case, parts)[1]
@@ -416,10 +417,8 @@ def build_operators(
     """
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um
-    e, x = (
-        legendre.mapped_nodes(ny, -high_y, high_y),
-        legendre.mapped_nodes(nx, -high_x, high_x),
-    )
+    e = legendre.mapped_nodes(ny, -high_y, high_y)
+    x = legendre.mapped_nodes(nx, -high_x, high_x)
     low, high = direction_range(case, e)
     p = legendre.mapped_nodes(m, low, high)
     far = (e - case.centre_um[1])[:, None]
@@ -454,27 +453,25 @@ def _low_rank(
     """
     (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
     (my, mx), (me, mp) = chosen.window, chosen.lens
-    Y, X = legendre.mapped_nodes(my, -wy, wy), legendre.mapped_nodes(mx, -wx, wx)
-    e, p = legendre.mapped_nodes(me, -hy, hy), legendre.mapped_nodes(mp, *span)
+    Y = legendre.mapped_nodes(my, -wy, wy)
+    X = legendre.mapped_nodes(mx, -wx, wx)
+    e = legendre.mapped_nodes(me, -hy, hy)
+    p = legendre.mapped_nodes(mp, *span)
     at = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
     table = plane_wave_residual(case, *at)
     if slope is not None:
         table = table * kernel_derivatives(case, *at)[slope]
     left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
     y_um, x_um = case.window_um
-    Iy, Ix = (
-        legendre.interpolation_matrix(my, y_um / wy),
-        legendre.interpolation_matrix(mx, x_um / wx),
-    )
+    Iy = legendre.interpolation_matrix(my, y_um / wy)
+    Ix = legendre.interpolation_matrix(mx, x_um / wx)
     window_terms = np.einsum(
         "Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True
     )
     e_um = legendre.gauss_legendre_nodes(chosen.nodes[0])[0]
     p_um = legendre.gauss_legendre_nodes(chosen.directions)[0]
-    Ie, Ip = (
-        legendre.interpolation_matrix(me, e_um),
-        legendre.interpolation_matrix(mp, p_um),
-    )
+    Ie = legendre.interpolation_matrix(me, e_um)
+    Ip = legendre.interpolation_matrix(mp, p_um)
     lens_terms = np.einsum(
         "Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True
     )
@@ -736,10 +733,8 @@ def light_windowed(
     reduced = [
         reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
     ]
-    moments, powers = (
-        torch.stack([m for m, _ in reduced]),
-        [power for _, power in reduced],
-    )
+    moments = torch.stack([m for m, _ in reduced])
+    powers = [power for _, power in reduced]
     parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
     total: Any = 0
     for sign, light in parts:
@@ -794,7 +789,8 @@ def _joined(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     """
     (rows, columns), _ = window_tiles(plan.case, plan.layout.parts)
     (my, mx), n = plan.case.samples, len(columns)
-    heights, widths = np.diff([*rows, my]).tolist(), np.diff([*columns, mx]).tolist()
+    heights = np.diff([*rows, my]).tolist()
+    widths = np.diff([*columns, mx]).tolist()
     bands = [
         torch.cat(
             [field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1

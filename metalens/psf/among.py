@@ -124,7 +124,8 @@ def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
     """Rows of the map with those around them, and which of these count."""
     rows, shares = light.shape[-2], []
     for start in range(0, rows, ROWS):
-        first, last = max(start - REACH - 1, 0), min(start + ROWS + REACH + 1, rows)
+        first = max(start - REACH - 1, 0)
+        last = min(start + ROWS + REACH + 1, rows)
         shares.append(
             (
                 slice(start - first, min(start + ROWS, rows) - first),
@@ -146,8 +147,6 @@ def _turned(
         torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)),
         torch.zeros_like(square),
     )
-    cosine2, both = (
-        torch.where(steep, across * across / safe, 0.5),
-        torch.where(steep, across * down / safe, 0.0),
-    )
+    cosine2 = torch.where(steep, across * across / safe, 0.5)
+    both = torch.where(steep, across * down / safe, 0.0)
     return s, 4 * both * both, (cosine2, both)

@@ -192,7 +192,8 @@ def with_model(
         polarisation: that was computed.
         left_out: what is known of neighbours and angles.
     """
-    aperture, wavelength_um = sine_aperture(lens, angle_rad), lens.wavelength_um
+    aperture = sine_aperture(lens, angle_rad)
+    wavelength_um = lens.wavelength_um
     slanted = min(1.0, left_out.angle * incidence_sine(angle_rad) ** 2)
     area = lens.diameters.pillars * lens.diameters.site_um2 / wavelength_um**2
     pairs = lens.pairs

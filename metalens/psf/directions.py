@@ -252,10 +252,8 @@ def _overlap(axis: Array, square: float, count: int) -> sparse.csr_array:
     low = np.floor(first + 1e-9)
     beyond = np.clip((first + step / square - low - 1) * square / step, 0, 1)
     rows = np.concatenate([low, low + 1]).astype(int)
-    columns, shares = (
-        np.tile(np.arange(len(axis)), 2),
-        np.concatenate([1 - beyond, beyond]),
-    )
+    columns = np.tile(np.arange(len(axis)), 2)
+    shares = np.concatenate([1 - beyond, beyond])
     held = (rows >= 0) & (rows < count)
     where = rows[held], columns[held]
     return sparse.csr_array(

@@ -231,10 +231,8 @@ def _filtered(
 ) -> torch.Tensor:
     """Light through ŵ (which 0), or through √(|ŵ|² + |∇ŵ|²/(2πσ)²) (which 1)."""
     shape = [scipy.fft.next_fast_len(n, real=True) for n in light.shape[-2:]]
-    fy, fx = (
-        np.fft.fftfreq(shape[0], case.step_um)[:, None],
-        np.fft.rfftfreq(shape[1], case.step_um),
-    )
+    fy = np.fft.fftfreq(shape[0], case.step_um)[:, None]
+    fx = np.fft.rfftfreq(shape[1], case.step_um)
     filters = []
     for m in source_to_image_matrices(case, extent):
         level, slope = extent.transform(
@@ -268,10 +266,8 @@ def shift_invariance_error(
     errors = []
     inverse = case.inverse_depths_per_um
     for depth in {int(np.argmin(inverse)), int(np.argmax(inverse))}:
-        one, middle = (
-            replace(case, inverse_depths_per_um=(inverse[depth],)),
-            light[depth : depth + 1].detach(),
-        )
+        one = replace(case, inverse_depths_per_um=(inverse[depth],))
+        middle = light[depth : depth + 1].detach()
         square = 0.0
         for axis in (0, 1):
             other = probe(

@@ -293,7 +293,9 @@ def _of_point(request: IntensityRequest) -> IntensityResult:
     any case.
     """
     request = request.shaded()
-    phase, case, tolerance = request.maps[0], request.cases[0], request.tolerance
+    phase = request.maps[0]
+    case = request.cases[0]
+    tolerance = request.tolerance
     moving = request.moving is not None
     rest = math.hypot(torch.finfo(phase.dtype).eps, request.films_error)
 

@@ -219,7 +219,8 @@ def paths_um(
     more = (0, 0) if view.source is None else source_image_reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
     turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
-    x, y = (radius * np.cos(turn)).ravel(), (radius * np.sin(turn)).ravel()
+    x = (radius * np.cos(turn)).ravel()
+    y = (radius * np.sin(turn)).ravel()
     come = np.array(
         [
             paths.from_source(case, x, y, case.tangents, inverse)
@@ -252,11 +253,9 @@ def _delay_um(
         return 0.0
     um, share = spectra.spectrum_points(source)
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
-    there, tilt, delays = (
-        np.asarray(lens.diameters.diameter_um[rows]) > 0,
-        library_incidence(lens, angle_rad),
-        [],
-    )
+    there = np.asarray(lens.diameters.diameter_um[rows]) > 0
+    tilt = library_incidence(lens, angle_rad)
+    delays = []
     for quantile in (0.05, 0.5, 0.95):
         middle = float(
             np.clip(um[np.searchsorted(np.cumsum(share), quantile)], low, high)
@@ -350,7 +349,8 @@ def _at_wavelengths(
             nodes, error=_quadrature_error(lens, view, angle, parts[-1], nodes)
         )
         budgets.append(with_model(parts[-1].budget, lens, angle, judged, counted, own))
-    budget, stack = worst_of_budgets(budgets), _concatenated(parts, provenance)
+    budget = worst_of_budgets(budgets)
+    stack = _concatenated(parts, provenance)
     words = [
         stack.reason,
         ABOVE if budget.computed > tolerance and stack.converged else "",
@@ -446,7 +446,8 @@ def all_maps(
         angle_rad: field angles along x and y, rad.
     """
     shape = len(nodes.weights), *lens.diameters.diameter_um.shape
-    phase, level = torch.empty(shape, dtype=dtype), torch.empty(shape, dtype=dtype)
+    phase = torch.empty(shape, dtype=dtype)
+    level = torch.empty(shape, dtype=dtype)
     for wave, one, other in zip(
         nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True
     ):

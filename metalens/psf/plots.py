@@ -134,10 +134,8 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
     cut = 0.5 / stack.step_um
     if limit is not None:
         cut = min(cut, limit.cutoff_per_um)
-    frequency, radius = (
-        np.linspace(0, cut, 81),
-        np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61),
-    )
+    frequency = np.linspace(0, cut, 81)
+    radius = np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61)
     curves = psf_metrics.mtf(stack, frequencies_per_um=frequency)
     angles = sorted({0, len(stack.angles_rad) - 1})
     curves = curves.reshape(len(stack.angles_rad), -1, 2, len(frequency))
@@ -186,7 +184,8 @@ def plot_mtf(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes
 def _encircled(stack: PsfStack, light: Array, radius_um: Array) -> Array:
     """(radius,) share of (y, x) light within circles about its centroid."""
     x, y = stack.x_um, stack.y_um
-    cx, cy = light.sum(0) @ x / light.sum(), light.sum(1) @ y / light.sum()
+    cx = light.sum(0) @ x / light.sum()
+    cy = light.sum(1) @ y / light.sum()
     away = np.hypot(x - cx, (y - cy)[:, None]).ravel()
     order = np.argsort(away)
     shares = np.cumsum(light.ravel()[order])

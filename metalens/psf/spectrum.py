@@ -66,7 +66,8 @@ class SpectralNodes:
     source: "Source | MeasuredSpectrum | None" = None
 
     def __post_init__(self) -> None:
-        waves, weights = np.asarray(self.wavelengths_um), np.asarray(self.weights)
+        waves = np.asarray(self.wavelengths_um)
+        weights = np.asarray(self.weights)
         if (
             waves.ndim != 1
             or not len(waves)
@@ -160,7 +161,8 @@ def read_measured_spectrum(
             "spectrum: no file; need one of wavelength in nm and value, or more"
         )
     curves = [_curve(file) for file in files]
-    low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
+    low = max(c[0, 0] for c in curves)
+    high = min(c[-1, 0] for c in curves)
     if low >= high:
         raise PropagationError(
             f"spectrum: {', '.join(map(str, files))} share no wavelength"
@@ -280,7 +282,8 @@ def spectral_nodes(
     Raises:
         PropagationError: more than 64 wavelengths would be needed.
     """
-    spans, light = np.atleast_1d(path_um), np.ones(1) if light is None else light
+    spans = np.atleast_1d(path_um)
+    light = np.ones(1) if light is None else light
     um, share = spectrum_points(source)
     beside = getattr(source, "beside", 0.0)
     for count in range(1, MOST_NODES + 1):
@@ -445,11 +448,9 @@ def gauss_rule(points: Array, share: Array, count: int) -> tuple[Array, Array]:
     (Lanczos, Golub and Welsch).
     """
     count = min(count, len(points))
-    basis, diagonal, beside = (
-        np.zeros((count, len(points))),
-        np.zeros(count),
-        np.zeros(count),
-    )
+    basis = np.zeros((count, len(points)))
+    diagonal = np.zeros(count)
+    beside = np.zeros(count)
     q = np.sqrt(share / share.sum())
     for i in range(count):
         basis[i] = q

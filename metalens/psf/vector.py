@@ -82,10 +82,8 @@ class PolarizationMixing:
             of_flux(one, b) if self.flux else VectorPupil(one, (1.0,) * len(one))
             for one in both
         ]
-        factors, signs = (
-            torch.stack([one.pupils for one in fields], 1).numpy(),
-            np.array(fields[0].signs),
-        )
+        factors = torch.stack([one.pupils for one in fields], 1).numpy()
+        signs = np.array(fields[0].signs)
         if self.flux and not self.apart and not has_faces(case):
             factors, signs = factors[:4], signs[:4]
         else:
@@ -155,10 +153,8 @@ def rays_to(
         case: maps, geometry and window of the propagation.
         at_um: (points, 2) field points on the sensor, um.
     """
-    across, down = (
-        at_um[1][None, :] - case.centre_um[0],
-        (at_um[0] - case.centre_um[1])[:, None],
-    )
+    across = at_um[1][None, :] - case.centre_um[0]
+    down = (at_um[0] - case.centre_um[1])[:, None]
     n = index or case.media.order[-1]
     p, q = (
         torch.as_tensor(-ray_cosines(case, *at) / n)
@@ -210,7 +206,8 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
     steep, cosine = sine / order[-1], torch.sqrt(1 - w / order[-1] ** 2)
     s_power, p_power = media.passed_apart(order, w)
     both = (s_power + p_power) / 2 * cosine / first[2]
-    s_level, p_level = torch.sqrt(s_power / both), torch.sqrt(p_power / both)
+    s_level = torch.sqrt(s_power / both)
+    p_level = torch.sqrt(p_power / both)
     out = []
     for e in electric.reshape(2, 3, *electric.shape[1:]):
         s = (ux * e[1] - uy * e[0]) * s_level

@@ -78,7 +78,8 @@ def focus_scan(
     waves = nodes or SpectralNodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     maps, _ = all_maps(lens, waves, (0.0, 0.0), torch.float64, scalar=True)
     shade = lens_stop_shadow(lens, (0.0, 0.0), lens.source_distance_um)
-    turn, part = torch.from_numpy(np.angle(shade)), torch.from_numpy(np.abs(shade))
+    turn = torch.from_numpy(np.angle(shade))
+    part = torch.from_numpy(np.abs(shade))
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = sine_aperture(lens, (0.0, 0.0))
     depth = after.index[0] * lens.wavelength_um / sine**2

@@ -147,7 +147,8 @@ def _reduced(
     the field reversed: they vanish.
     """
     images = np.stack([(sx * m) * 4096 + sy * n for sx, sy, _ in operations])
-    own, signs = images[0], tuple(sign[field] for _, _, sign in operations)
+    own = images[0]
+    signs = tuple(sign[field] for _, _, sign in operations)
     first = own == images.max(axis=0)
     vanishes = ((images == own) & (np.array(signs)[:, None] < 0)).any(axis=0)
     keep = first & ~vanishes

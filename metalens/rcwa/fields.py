@@ -331,9 +331,12 @@ class _SolvedClass:
         """Components of E, H (times the impedance of vacuum) and D (x and y), each an
         order set with amplitudes (nz, k), by (1).
         """
-        waves, space, media = self.waves, self.space, self.stack.problem.media
+        waves = self.waves
+        space = self.space
+        media = self.stack.problem.media
         u, w = self._tangential(z_um)
-        ez, d = np.zeros((len(z_um), len(space.ez.m)), complex), np.zeros_like(u)
+        ez = np.zeros((len(z_um), len(space.ez.m)), complex)
+        d = np.zeros_like(u)
         p = slice(waves.bare, waves.p_count)
         curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
         for i, place in enumerate(self.stack.indices(z_um)):
@@ -380,7 +383,8 @@ class _SolvedClass:
         return U * up, V * up
 
     def _in_substrate(self, height: float) -> tuple[Array, Array]:
-        index, incident = self.stack.problem.media.substrate, self.incident
+        index = self.stack.problem.media.substrate
+        incident = self.incident
         U, V = half_space(self.waves, index)
         kz = normal_component(self.waves.kappa, index)
         up = incident.copy()
@@ -462,10 +466,8 @@ class _PointSums:
         k0 = 2 * math.pi / light.wavelength_um
         self.operations, self.reach = operations, reach
         axes = np.asarray(grid.x_um), np.asarray(grid.y_um)
-        tangential, periods = (
-            (light.kx, light.ky),
-            cell.lattice.periods_um(cell.pitch_um),
-        )
+        tangential = (light.kx, light.ky)
+        periods = cell.lattice.periods_um(cell.pitch_um)
         self.along, self.across = (
             np.exp(
                 1j

@@ -275,7 +275,8 @@ def _nearest_circle(
         distance = np.abs(np.sqrt(square) - radius)
         nearer = distance < least - _TIE * radius
         near = distance < least + _TIE * radius
-        total, count = np.where(nearer, 0.0, total), np.where(nearer, 0.0, count)
+        total = np.where(nearer, 0.0, total)
+        count = np.where(nearer, 0.0, count)
         middle = square < (_TIE * radius) ** 2  # no direction is preferred there
         scale = np.where(middle, 1.0, square)
         products = np.stack([dx * dx, dy * dy, dx * dy]) / scale

@@ -93,7 +93,8 @@ def solve_textbook_rcwa(
         return kz, matrices(index_of**2 * one)[1] / np.concatenate([kz, kz])
 
     def toeplitz(layer: Layer) -> Array:
-        gx, gy = 2 * np.pi / px * (m[:, None] - m), 2 * np.pi / py * (n[:, None] - n)
+        gx = 2 * np.pi / px * (m[:, None] - m)
+        gy = 2 * np.pi / py * (n[:, None] - n)
         inside = index(layer.material or cell.pillar, wavelength_um) ** 2
         around = index(layer.between or cell.fill, wavelength_um) ** 2
         if cell.shape.hole:

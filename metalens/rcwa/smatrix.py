@@ -133,7 +133,8 @@ def scatter_zero_order(
         match: what matches the fields in place of the layers, given the pairs above and
             below and the source.
     """
-    below, above = half_space(waves, media.substrate), half_space(waves, media.cover)
+    below = half_space(waves, media.substrate)
+    above = half_space(waves, media.cover)
     top, lift = _through_films(waves, above, tuple(reversed(media.over)))
     foot, drop = _through_films(waves, below, media.under)
     source = np.zeros(len(waves.kappa), complex)
@@ -211,13 +212,12 @@ def _layer_reflection(
     if not modes.symmetric:
         # up + down = W^-1 U a and up - down = V^-1 V' a of the pair (U, V') above
         U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
-        total, difference = np.linalg.solve(modes.W, U), np.linalg.solve(modes.V, V)
+        total = np.linalg.solve(modes.W, U)
+        difference = np.linalg.solve(modes.V, V)
         back = (total - difference) @ np.linalg.inv(total + difference)
         return back[:, :kept] * fade, fade
-    wv, vw = (
-        _transposed_product(pair[0], modes.V),
-        _transposed_product(pair[1], modes.W),
-    )
+    wv = _transposed_product(pair[0], modes.V)
+    vw = _transposed_product(pair[1], modes.W)
     return np.linalg.solve(wv + vw, (wv - vw)[:, :kept] * fade), fade
 
 

@@ -436,7 +436,8 @@ def truncation_sequence(
         return TruncationSequence(range(1, 2), 0, 1.0)
     pitch = cell.pitch_um
     if cell.round:
-        gap, spans = max(0.0, pitch - size_um), np.array([size_um / pitch])
+        gap = max(0.0, pitch - size_um)
+        spans = np.array([size_um / pitch])
     else:
         gap = cell.gap_um(size_um)
         spans = np.array(cell.outline(size_um).spans_um) / pitch

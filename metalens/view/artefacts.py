@@ -308,15 +308,11 @@ def far_field_panels(path: Path) -> list[Panel]:
     """
     stored = store.load(path, "far-field")
     held, about = stored.arrays, stored.attributes
-    share, sine, angles = (
-        np.asarray(held["share"], float),
-        np.asarray(held["sine"]),
-        held["angles_deg"],
-    )
-    step, names = (
-        float(sine[1] - sine[0]),
-        [SliderAxis("light from", [_degrees(pair) for pair in angles])],
-    )
+    share = np.asarray(held["share"], float)
+    sine = np.asarray(held["sine"])
+    angles = held["angles_deg"]
+    step = float(sine[1] - sine[0])
+    names = [SliderAxis("light from", [_degrees(pair) for pair in angles])]
     edges = np.degrees(
         np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1)))
     )
@@ -368,10 +364,8 @@ def near_field_panels(path: Path) -> list[Panel]:
     """
     stored = store.load(path, "near-field")
     held, about = stored.arrays, stored.attributes
-    step, heights = (
-        float(about["step_um"]),
-        SliderAxis("height", (1e3 * held["heights_um"]).tolist(), "nm"),
-    )
+    step = float(about["step_um"])
+    heights = SliderAxis("height", (1e3 * held["heights_um"]).tolist(), "nm")
     out: list[Panel] = []
     for name, title in (
         ("xz", "Along x and z"),

@@ -132,7 +132,8 @@ def of_stack(lens_path: Path, path: Path) -> Iterator[Output]:
     kernel = plain.kernel_table(BEHIND, WAVE, 36.0)
     face = plain.normal_transmission((1.0, small.GLASS_N))
     for a, angle in enumerate(stack.angles_rad):
-        x, y = stack.centres_um[a][0] + stack.x_um, stack.centres_um[a][1] + stack.y_um
+        x = stack.centres_um[a][0] + stack.x_um
+        y = stack.centres_um[a][1] + stack.y_um
         lights = np.stack([p.t * plain.source_wave(p.x, p.y, front(z), np.tan(angle), WAVE)
                            for z in stack.depths_um], -1)  # fmt: skip
         true = (
@@ -168,7 +169,8 @@ def of_mask(lens_path: Path, folder: Path) -> Iterator[Output]:
 
     p = pillars(lens_path)
     goal = plain.drawn_diameter_nm(p.diameter * 1e3, small.BIAS_TABLE_NM) * 1e-3
-    area, mean = np.pi / 4 * (goal**2).sum(), np.pi / 4 * (goal**2).mean()
+    area = np.pi / 4 * (goal**2).sum()
+    mean = np.pi / 4 * (goal**2).mean()
     for name in ("mask.oas", "mask.gds"):
         drawn = db.Layout()
         drawn.read(str(folder / name))

@@ -28,7 +28,8 @@ def sommerfeld_kernel(films, wavelength_um, radii_um, count=1500):
     least = min(n for n, _ in films)
     node, weight = np.polynomial.legendre.leggauss(count)
     theta, weight = (node + 1) * np.pi / 4, weight * np.pi / 4
-    q, dq = k * least * np.sin(theta), k * least * np.cos(theta) * weight
+    q = k * least * np.sin(theta)
+    dq = k * least * np.cos(theta) * weight
     path = sum(t * (np.sqrt((k * n) ** 2 - q**2) - k * n) for n, t in films)
     wave = np.exp(1j * path) * q * dq / (2 * np.pi)
     return np.array([wave @ j0(q * rho) for rho in np.asarray(radii_um)])

@@ -170,12 +170,14 @@ def test_a_square_of_the_lens_holds_its_pillars(tmp_path):
 
 def test_pillars_of_two_sizes_have_width_and_length_as_fabricated():
     rng = np.random.default_rng(8)
-    size, length = rng.choice([0.12, 0.2], (5, 6)), rng.choice([0.14, 0.24], (5, 6))
+    size = rng.choice([0.12, 0.2], (5, 6))
+    length = rng.choice([0.14, 0.24], (5, 6))
     axes = np.array([0.12, 0.2]), np.array([0.14, 0.24])
     table = TwoSizeTable(
         np.array([0.94]), *axes, np.ones((1, 2, 2, 2), complex), (77.0, math.inf)
     )
-    grid, cell = DiameterMap(size, 0.4, length_um=length), Cell(0.4, shape=Rectangle())
+    grid = DiameterMap(size, 0.4, length_um=length)
+    cell = Cell(0.4, shape=Rectangle())
     made = Lens(grid, cell, table.proxy, 0.94, 77.0, math.inf, "map", pairs=table)
     biased = Process(bias=Bias(table_nm=((100.0, -6.0), (300.0, -6.0))))
     tile = solids.cut_tile(made, biased)

@@ -61,7 +61,8 @@ def _toeplitz(lines, reach):
     """(strip, order, order) of the Fourier coefficients of every strip between lines."""
     period = lines[-1] - lines[0]
     m = np.arange(-2 * reach, 2 * reach + 1)
-    middle, width = (lines[1:] + lines[:-1])[:, None] / 2, np.diff(lines)[:, None]
+    middle = (lines[1:] + lines[:-1])[:, None] / 2
+    width = np.diff(lines)[:, None]
     c = (
         width
         / period
@@ -76,11 +77,9 @@ def _products(layer, reach):
     """Operators D = [e] E of Ex, Ey and Ez: across edges the inverse rule, along them
     Laurent's.
     """
-    e, x, y = (
-        layer.permittivity,
-        _toeplitz(layer.x_um, reach[0]),
-        _toeplitz(layer.y_um, reach[1]),
-    )
+    e = layer.permittivity
+    x = _toeplitz(layer.x_um, reach[0])
+    y = _toeplitz(layer.y_um, reach[1])
     size = x.shape[1] * y.shape[1]
     of_x = np.array([np.linalg.inv(np.einsum("i,iab->ab", 1 / row, x)) for row in e])
     of_y = np.array(
@@ -147,10 +146,8 @@ def _star(first, second):
 
 
 def _face(before, after):
-    electric, magnetic = (
-        np.linalg.solve(before[0], after[0]),
-        np.linalg.solve(before[1], after[1]),
-    )
+    electric = np.linalg.solve(before[0], after[0])
+    magnetic = np.linalg.solve(before[1], after[1])
     both, apart = (electric + magnetic) / 2, (electric - magnetic) / 2
     inverse = np.linalg.inv(both)
     return apart @ inverse, both - apart @ inverse @ apart, inverse, -inverse @ apart

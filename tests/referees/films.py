@@ -81,12 +81,14 @@ class Stack:
         size = np.sqrt(np.where(runs, self.p2, 0))
         ux = np.where(size > 0, self.px / np.where(size > 0, size, 1), 1.0)
         uy = np.where(size > 0, self.py / np.where(size > 0, size, 1), 0.0)
-        near, far = np.sqrt(1 - (size / first) ** 2), np.sqrt(1 - (size / last) ** 2)
+        near = np.sqrt(1 - (size / first) ** 2)
+        far = np.sqrt(1 - (size / last) ** 2)
         in_s, in_p = self.transfer() * np.sqrt(first * near / (last * far))
         total = 0.0
         for ex, ey in light:
             ex, ey = self._waves(ex, at), self._waves(ey, at)
-            s, p = (ux * ey - uy * ex) * in_s, (ux * ex + uy * ey) / near * in_p
+            s = (ux * ey - uy * ex) * in_s
+            p = (ux * ex + uy * ey) / near * in_p
             e = p * far * ux - s * uy, p * far * uy + s * ux
             h = last * (-s * far * ux - p * uy), last * (-s * far * uy + p * ux)
             e, h = (tuple(np.fft.ifft2(part) for part in both) for both in (e, h))
@@ -184,7 +186,8 @@ def sums(light, at, points, films, order, wavelength):
         return np.exp(1j * k * path) / path
 
     far = np.hypot(points[:, None, 0] - at[:, 0], points[:, None, 1] - at[:, 1])
-    low, high = np.zeros(far.shape), np.full(far.shape, rare * (1 - 1e-9))
+    low = np.zeros(far.shape)
+    high = np.full(far.shape, rare * (1 - 1e-9))
     for _ in range(60):
         p = (low + high) / 2
         less = lands(p) < far
@@ -194,7 +197,8 @@ def sums(light, at, points, films, order, wavelength):
             t * n * n / np.sqrt(n * n - p * p) ** 3 for n, t in films
         )
     ends = np.sqrt(rare**2 - p.max() ** 2), np.sqrt(rare**2 - p.min() ** 2)
-    middle, half = (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2 + 1e-9
+    middle = (ends[0] + ends[1]) / 2
+    half = (ends[1] - ends[0]) / 2 + 1e-9
     node = np.cos(np.pi * (np.arange(18) + 0.5) / 18)
     some = np.sqrt(rare**2 - (middle + half * node) ** 2)
     length = sum(t for _, t in films)

@@ -102,10 +102,8 @@ def start() -> Any:
         SceneError: Mitsuba is not installed.
     """
     try:
-        mitsuba, drjit = (
-            importlib.import_module("mitsuba"),
-            importlib.import_module("drjit"),
-        )
+        mitsuba = importlib.import_module("mitsuba")
+        drjit = importlib.import_module("drjit")
     except ImportError as error:
         raise SceneError(
             "the path-traced referee needs Mitsuba 3, which is not installed: pip install 'metalens-toolchain[referee]'"
@@ -215,7 +213,8 @@ def _regions(
     """Masks of REGIONS: pixels that show one of them alone, those that show a lamp in
     the cornea, and the others.
     """
-    p, t = _parameters(states, rig, camera), torch.from_numpy(camera.tangents(rig))
+    p = _parameters(states, rig, camera)
+    t = torch.from_numpy(camera.tangents(rig))
     dx, dy, dz = plain_eye.ray(t[None], t[:, None])
     seen = plain_eye.lids(p, dx, dy, dz)[1]
     disc, pupil, *_ = plain_eye.iris(
@@ -239,7 +238,8 @@ def _mirrors(p: Tensor, dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
     it.
     """
     tc, cx, cy, cz, inside = plain_eye.cornea(p, dx, dy, dz)
-    ray, normal = torch.stack([dx, dy, dz], -1), torch.stack([cx, cy, cz], -1)
+    ray = torch.stack([dx, dy, dz], -1)
+    normal = torch.stack([cx, cy, cz], -1)
     back = ray - 2 * (ray * normal).sum(-1, keepdim=True) * normal
     lamps = p[model.LED : model.LED + 3 * model.LED_COUNT].reshape(-1, 1, 1, 3)
     way = lamps - tc[..., None] * ray

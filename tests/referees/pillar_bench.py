@@ -309,10 +309,8 @@ def _kernel(lens, session, shape, k, field):
     Samples are those of a circular convolution that no wrapped light reaches: one less
     than pillars and samples a side.
     """
-    pitch, d = (
-        lens.diameters.pitch_um,
-        lens.sensor_distance_um + session.of("distance_um"),
-    )
+    pitch = lens.diameters.pitch_um
+    d = lens.sensor_distance_um + session.of("distance_um")
     side = _fine_side(session, pitch)
     *slices, dx, dy = field
     counts = [one.stop - one.start for one in slices]

@@ -16,13 +16,12 @@ def field(lens, amplitude, where, *, shift_um=None):
     its phase is 0 at the middle.
     """
     rows, columns = np.nonzero(lens.diameters.diameter_um)
-    x, y, t = (
-        lens.diameters.x_um[columns],
-        lens.diameters.y_um[rows],
-        amplitude[rows, columns],
-    )
+    x = lens.diameters.x_um[columns]
+    y = lens.diameters.y_um[rows]
+    t = amplitude[rows, columns]
     if shift_um is not None:
-        x, y = x + shift_um[0][rows, columns], y + shift_um[1][rows, columns]
+        x = x + shift_um[0][rows, columns]
+        y = y + shift_um[1][rows, columns]
     k, d = 2 * np.pi / where.wavelength_um, where.distance_um
     step = (axis[1] - axis[0] for axis in (lens.diameters.x_um, lens.diameters.y_um))
     site_um2 = math.prod(step) * (

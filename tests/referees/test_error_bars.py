@@ -104,10 +104,8 @@ def test_scores_of_the_referee_s_noise_scatter_as_the_fit_believes():
         shots = to_electrons(
             dataclasses.replace(seen.capture, frames=frames, dark=dark, flat=flat)
         )
-        data, counted = (
-            data_of(shots, (slice(None), slice(None))),
-            shots.gain.gain_e / session.gain_e,
-        )
+        data = data_of(shots, (slice(None), slice(None)))
+        counted = shots.gain.gain_e / session.gain_e
         root = data.usable / np.sqrt(data.variance(counted * image))
         slope = counted * by * root
         score = np.tensordot(

@@ -39,10 +39,8 @@ def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
     """The same sum in another order, of one write field or of sixteen out of place (the
     last ones narrower).
     """
-    lens, session = (
-        hidden.lens(12.0, 40.0, 200.0),
-        hidden.session(4, depths_um=(200.0,)),
-    )
+    lens = hidden.lens(12.0, 40.0, 200.0)
+    session = hidden.session(4, depths_um=(200.0,))
     session = bench.with_faults(session, stitch_nm=stitch_nm, field_um=3.1)
     x, y, d, light, fields = bench._pillars(lens, session, np.random.default_rng(0))
     k, z = 2 * np.pi / 0.85, 211.0
@@ -62,7 +60,8 @@ def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
     for rows, columns, dx, dy in fields:
         x[rows, columns] += dx
         y[rows, columns] += dy
-    middle, at = (len(found) - 1) / 2, (len(found) // 2 + 7, len(found) // 2 - 4)
+    middle = (len(found) - 1) / 2
+    at = (len(found) // 2 + 7, len(found) // 2 - 4)
     X = (at[1] - middle) * lens.diameters.pitch_um + session.of("decentre_x_um")
     Y = (at[0] - middle) * lens.diameters.pitch_um + session.of("decentre_y_um")
     distance = lens.sensor_distance_um + session.of("distance_um")

@@ -33,10 +33,8 @@ def amounts(height_um=0.0, index=0.0, sidewall_rad=0.0):
     """Of the causes that pillars answer, in the order of the table; of a round one no
     others.
     """
-    names, found = (
-        names_of_kind(ResponseError),
-        np.zeros(len(names_of_kind(ResponseError))),
-    )
+    names = names_of_kind(ResponseError)
+    found = np.zeros(len(names_of_kind(ResponseError)))
     for name, amount in (
         ("height_nm", height_um),
         ("index", index),

@@ -30,7 +30,8 @@ def build(
     half = math.degrees(
         math.atan(camera.pixels * camera.pitch_um / 2 / rig.sensor_distance_um)
     )
-    centre, axis = p[model.CENTRE : model.CENTRE + 3], p[model.AXIS : model.AXIS + 3]
+    centre = p[model.CENTRE : model.CENTRE + 3]
+    axis = p[model.AXIS : model.AXIS + 3]
     cornea = ((centre + p[model.CORNEA_D] * axis) * 1e-3).tolist()
     out: dict[str, Any] = {
         "type": "scene",
@@ -182,7 +183,8 @@ def _iris(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
         p, height[:, None], radius[:, None], 513
     )
     turn = torch.linspace(0, 2 * math.pi, 513, dtype=p.dtype)
-    x, y = radius[:, None] * torch.cos(turn), radius[:, None] * torch.sin(turn)
+    x = radius[:, None] * torch.cos(turn)
+    y = radius[:, None] * torch.sin(turn)
     albedo = plain_eye.pigment(p, bank, x, y, torch.sqrt(x * x + y * y + 1))
     albedo[:3] = p[model.PUPIL]
     kept = (

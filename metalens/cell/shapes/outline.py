@@ -46,10 +46,8 @@ class EllipseArc:
         from scipy.special import j1
 
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        along, across = (
-            self.half_x_um * (c * gx + s * gy),
-            self.half_y_um * (c * gy - s * gx),
-        )
+        along = self.half_x_um * (c * gx + s * gy)
+        across = self.half_y_um * (c * gy - s * gx)
         x = np.hypot(along, across)
         safe = np.where(x < 1e-6, 1.0, x)
         shape = np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe)
@@ -64,10 +62,8 @@ class EllipseArc:
         """
         turn = 2 * np.pi * np.arange(count) / count
         swell = math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
-        x, y = (
-            swell * self.half_x_um * np.cos(turn),
-            swell * self.half_y_um * np.sin(turn),
-        )
+        x = swell * self.half_x_um * np.cos(turn)
+        y = swell * self.half_y_um * np.sin(turn)
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return np.stack([c * x - s * y, s * x + c * y], axis=1) + self.centre_um
 
@@ -248,10 +244,8 @@ class Outline:
             _bends(corners[:: part.sign])
             for corners, part in zip(parts, self.parts, strict=True)
         ]
-        start, end = (
-            np.concatenate(parts),
-            np.concatenate([np.roll(c, -1, axis=0) for c in parts]),
-        )
+        start = np.concatenate(parts)
+        end = np.concatenate([np.roll(c, -1, axis=0) for c in parts])
         of = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
         along = (end - start) / np.hypot(*(end - start).T)[:, None]
         i, j = np.nonzero(
@@ -269,7 +263,8 @@ class Outline:
             end[i] - _ASIDE * (end - start)[i],
         ):
             foot, before = _foot(tip, start[j], end[j])
-            within, away = self.inside(*((tip + foot) / 2).T), np.hypot(*(tip - foot).T)
+            within = self.inside(*((tip + foot) / 2).T)
+            away = np.hypot(*(tip - foot).T)
             solid = min(solid, float(away[before & within].min(initial=math.inf)))
             space = min(space, float(away[before & ~within].min(initial=math.inf)))
         return solid, space

@@ -88,7 +88,8 @@ class Ring:
         """The section of this outer diameter; ``grow_um`` widens the rim and closes the
         hole.
         """
-        outer, inner = _half(size_um + grow_um), self.ratio * size_um / 2 - grow_um / 2
+        outer = _half(size_um + grow_um)
+        inner = self.ratio * size_um / 2 - grow_um / 2
         whole = EllipseArc(outer, outer)
         return Outline(
             (whole, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (whole,)

@@ -92,10 +92,8 @@ class AxialObjective:
         for y, x in (positions * settings.pixel_um).tolist():
             value = pixel_information(near, far, shift_um=(y, x), **_counted(settings))
             value = value.reshape(-1, len(settings.angles_deg))
-            spread, mean = (
-                torch.log(value + 1e-4).mean(),
-                torch.log(value.mean(0) + 1e-4).mean(),
-            )
+            spread = torch.log(value + 1e-4).mean()
+            mean = torch.log(value.mean(0) + 1e-4).mean()
             total = total - (settings.even * spread + (1 - settings.even) * mean) / len(
                 positions
             )
@@ -286,11 +284,9 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
 
     def stepped(x_um: Array, y_um: Array) -> Array:
         path = np.sqrt(x_um**2 + y_um[:, None] ** 2 + pupil.sensor_distance_um**2)
-        scale, middle, last = (
-            pupil.nodes / (2 * pupil.edge),
-            (pupil.nodes - 1) / 2,
-            pupil.nodes - 1,
-        )
+        scale = pupil.nodes / (2 * pupil.edge)
+        middle = (pupil.nodes - 1) / 2
+        last = pupil.nodes - 1
         row, column = (
             np.clip(np.rint(a / path * scale + middle), 0, last).astype(np.intp)
             for a in (y_um[:, None], x_um)
@@ -350,10 +346,8 @@ def optimize_free_form(
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
         zones = settings.zones[start % len(settings.zones)]
         made = _climb(pupil, settings, objective, focus, zones, generator)
-        information, least = (
-            float(made.score.information.mean()),
-            float(made.score.encircled.min()),
-        )
+        information = float(made.score.information.mean())
+        least = float(made.score.encircled.min())
         reached.append((information, least))
         if best is None or (made.converged, information) > (
             best.converged,
@@ -452,10 +446,8 @@ def _climb(
             controls = _refined(controls, grid)
         controls = controls.detach().requires_grad_(True)
         rate = RATE if grid else NODE_RATE
-        build, step = (
-            _Phase(pupil, grid, zones),
-            torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99)),
-        )
+        build = _Phase(pupil, grid, zones)
+        step = torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
         for _ in range(count):
             for group in step.param_groups:
                 group["lr"] = _rate(rate, done, total)
@@ -555,6 +547,7 @@ class _Phase:
 def _refined(controls: Tensor, grid: int) -> Tensor:
     """The same phase on a finer control grid, in the sense of least squares."""
     place = np.linspace(-1, 1, 4 * grid)
-    coarse, fine = bspline_weights(place, len(controls)), bspline_weights(place, grid)
+    coarse = bspline_weights(place, len(controls))
+    fine = bspline_weights(place, grid)
     change = torch.from_numpy(np.linalg.lstsq(fine, coarse, rcond=None)[0])
     return change @ controls @ change.mT

@@ -230,10 +230,8 @@ def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
     flat = np.stack([counts(4000.0) for _ in range(40)])
     z = []
     for _ in range(12):
-        dark, frames = (
-            np.stack([counts(0.0) for _ in range(4)]),
-            np.stack([counts(0.0) for _ in range(3)]),
-        )
+        dark = np.stack([counts(0.0) for _ in range(4)])
+        frames = np.stack([counts(0.0) for _ in range(3)])
         about = {"gain_e": gain, "read_noise_e": read}
         found = clean.to_electrons(capture(frames, dark=dark, flat=flat, about=about))
         assert found.scale[0, 0, [0, 59]] == pytest.approx([0.6, 1.4], rel=0.02)

@@ -114,10 +114,8 @@ def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
     a pixel off, to rounding.
     """
     light = np.random.default_rng(5).normal(size=(2, 2 * 4 * (9 + 4), 2 * 4 * (7 + 4)))
-    whole, part = (
-        DetectorGrid(18, 14, 1.7, 4, margin=4),
-        DetectorGrid(9, 7, 3.4, 8, margin=2, fill=0.5),
-    )
+    whole = DetectorGrid(18, 14, 1.7, 4, margin=4)
+    part = DetectorGrid(9, 7, 3.4, 8, margin=2, fill=0.5)
     for blur, size in ((0.3, 0.0), (0.3, 2.1)):
         sizes = np.full(2, size)
         every = whole.sample(

@@ -177,7 +177,8 @@ def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_i
     """
     step, light, noise = 1700.0, 0.43, 0.05
     electrons = step * np.array([[[0.0, 1.0]]])
-    image, full = np.full_like(electrons, light * step), np.ones(electrons.shape, bool)
+    image = np.full_like(electrons, light * step)
+    full = np.ones(electrons.shape, bool)
     data = FitImages(
         electrons,
         full,

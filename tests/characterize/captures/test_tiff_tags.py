@@ -42,10 +42,8 @@ def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit,
         return
     assert found.pixel_um == pytest.approx(um / 8, rel=1e-12)
     assert found.position_um == pytest.approx(2.5 * um * np.arange(4), rel=1e-12)
-    step, pixel = (
-        f"stage step of {2.5 * um:.4g} um from the ImageJ tags",
-        f"pixel of {um / 8:.4g} um from the tags",
-    )
+    step = f"stage step of {2.5 * um:.4g} um from the ImageJ tags"
+    pixel = f"pixel of {um / 8:.4g} um from the tags"
     assert found.notes == (step, f"{pixel} of the file")
 
 

@@ -289,10 +289,8 @@ def test_a_picture_of_a_hexagonal_lens_gives_its_bias_table(tmp_path):
     y, x = np.mgrid[:480, :500]
     image = np.full(y.shape, 0.25)
     for row, column in zip(rows, columns, strict=True):
-        cy, cx = (
-            (row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm,
-            (column + 0.7) * 0.5 * pitch_nm / pixel_nm,
-        )
+        cy = (row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm
+        cx = (column + 0.7) * 0.5 * pitch_nm / pixel_nm
         out_px = (
             np.hypot(y - cy, x - cx) - (mask[3 + row, 2 + column] - 3.3) / 2 / pixel_nm
         )

@@ -227,7 +227,8 @@ def test_frames_off_the_chief_ray_hold_no_astigmatism_of_their_own():
     """
     off = {"decentre_x_um": 6.3, "decentre_y_um": -4.6}
     found = fit(b.capture(b.electrons(**off)))
-    sigma, truth = np.sqrt(np.diag(found.within_covariance)), b.VALUES | off
+    sigma = np.sqrt(np.diag(found.within_covariance))
+    truth = b.VALUES | off
     z = [
         (v - truth.get(n, 0.0)) / s
         for n, v, s in zip(found.names, found.value, sigma, strict=True)

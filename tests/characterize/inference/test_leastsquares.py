@@ -30,7 +30,8 @@ def test_starts_are_ranked_by_the_loss_that_is_minimised(huber):
         40 * sigma,
         -11.0,
     )
-    usable, saturated = np.ones(shape.shape, bool), np.zeros(shape.shape, bool)
+    usable = np.ones(shape.shape, bool)
+    saturated = np.zeros(shape.shape, bool)
     usable[0, 4, 4], saturated[0, 0, 6] = False, True
     data = FitImages(
         170.0 * shape + noise,
@@ -60,10 +61,8 @@ def test_the_variance_of_a_pixel_has_three_parts():
     shot noise.
     """
     image = np.array([[[57.0, -8.0], [0.0, 1300.0]]])
-    floor, scale = (
-        np.array([[[3.1, 4.7], [2.2, 9.3]]]),
-        np.array([[[1.7, 0.6], [1.1, 2.3]]]),
-    )
+    floor = np.array([[[3.1, 4.7], [2.2, 9.3]]])
+    scale = np.array([[[1.7, 0.6], [1.1, 2.3]]])
     data = FitImages(image, image > 0, image < 0, floor, scale, 0.03)
     want = [
         [[3.1 + 57 / 1.7 + (0.03 * 57) ** 2, 4.7], [2.2, 9.3 + 1300 / 2.3 + 39.0**2]]
@@ -104,10 +103,8 @@ def test_a_straight_model_has_the_covariance_of_normal_equations():
     covariance, estimate and chi² in numpy.
     """
     rng = np.random.default_rng(8)
-    shapes, sigma = (
-        rng.uniform(0.3, 1.6, (2, 3, 6, 5)),
-        rng.uniform(1.2, 4.1, (3, 6, 5)),
-    )
+    shapes = rng.uniform(0.3, 1.6, (2, 3, 6, 5))
+    sigma = rng.uniform(1.2, 4.1, (3, 6, 5))
     usable = rng.uniform(size=sigma.shape) > 0.1
     image = (
         31.0 * shapes[0] + 17.0 * shapes[1] + sigma * rng.standard_normal(sigma.shape)

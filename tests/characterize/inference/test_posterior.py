@@ -200,7 +200,8 @@ def test_a_mode_weighs_by_its_height_and_its_volume():
 
 
 def test_the_density_of_a_parabola_is_the_normal_one_and_of_a_bent_profile_two_halves():
-    at, z = np.linspace(2.0, 6.0, 41), np.array([-2.5, -1.0, 0.0, 1.0, 2.5])
+    at = np.linspace(2.0, 6.0, 41)
+    z = np.array([-2.5, -1.0, 0.0, 1.0, 2.5])
     want = np.exp(-(((at - 4.1) / 0.7) ** 2) / 2) / (0.7 * math.sqrt(2 * math.pi))
     assert profile_density(np.array([4.1 + 0.7 * z, z**2]), at) == pytest.approx(
         want, rel=0.014
@@ -217,10 +218,10 @@ def test_a_profile_ends_right_where_the_slopes_of_the_mode_have_turned_round():
     two fit, so that its profile is
     that of the third alone; at its ends the slopes of the others point 100 degrees from
     those at the mode."""
-    turn, shapes = (
-        0.45,
-        np.linalg.qr(np.random.default_rng(3).standard_normal((3 * 11 * 13, 3)))[0].T,
-    )
+    turn = 0.45
+    shapes = np.linalg.qr(np.random.default_rng(3).standard_normal((3 * 11 * 13, 3)))[
+        0
+    ].T
     shapes = shapes.reshape(3, 3, 11, 13)
 
     def turned(x, jacobian):

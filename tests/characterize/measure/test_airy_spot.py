@@ -21,7 +21,9 @@ def on_pixels(pixel_um, x_um, y_um):
     """Means over pixels of a disc off the middle, and the fine map, blurred by a pixel
     and centred, with its radii.
     """
-    ny, nx, step = round(73 / pixel_um) | 1, round(84 / pixel_um) | 1, pixel_um / FINE
+    ny = round(73 / pixel_um) | 1
+    nx = round(84 / pixel_um) | 1
+    step = pixel_um / FINE
     y, x = ((np.arange(n * FINE) - (n * FINE - 1) / 2) * step for n in (ny, nx))
     shot = (
         airy(np.hypot(x[None] - x_um, y[:, None] - y_um))

@@ -22,17 +22,13 @@ def drawn(*, top, ground, rim, width, long=1.0, seed=3):
     rng = np.random.default_rng(seed)
     size = int(COUNT * PITCH)
     y, x = (np.indices((size * FINE,) * 2) + 0.5) / FINE
-    picture, diameter = (
-        np.full(y.shape, float(ground)),
-        rng.uniform(20, 31, (COUNT, COUNT)),
-    )
+    picture = np.full(y.shape, float(ground))
+    diameter = rng.uniform(20, 31, (COUNT, COUNT))
     for (j, i), wide in np.ndenumerate(diameter):
         turn = rng.uniform(0, np.pi)
         dy, dx = y - (j + 0.46) * PITCH, x - (i + 0.53) * PITCH  # no cell's middle
-        one, other = (
-            dx * np.cos(turn) + dy * np.sin(turn),
-            dy * np.cos(turn) - dx * np.sin(turn),
-        )
+        one = dx * np.cos(turn) + dy * np.sin(turn)
+        other = dy * np.cos(turn) - dx * np.sin(turn)
         away = np.hypot(one / np.sqrt(long), other * np.sqrt(long))
         picture[away < wide / 2] = rim
         picture[away < wide / 2 - width] = top

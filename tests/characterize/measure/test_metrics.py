@@ -18,10 +18,8 @@ AXIS = (np.arange(129) - 64) * STEP
 def gauss(sx, sy=None, angle=0.0, x0=0.0, y0=0.0):
     sy = sx if sy is None else sy
     x, y = AXIS[None] - x0, AXIS[:, None] - y0
-    u, v = (
-        x * math.cos(angle) + y * math.sin(angle),
-        -x * math.sin(angle) + y * math.cos(angle),
-    )
+    u = x * math.cos(angle) + y * math.sin(angle)
+    v = -x * math.sin(angle) + y * math.cos(angle)
     return np.exp(-(u**2) / (2 * sx**2) - v**2 / (2 * sy**2))
 
 

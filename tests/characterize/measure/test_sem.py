@@ -29,7 +29,8 @@ def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5)
     for j, i in np.ndindex(n, n):
         if (j, i) in missing:
             continue
-        cx, cy = (i + 0.5) * p + (0.35 * p if (j, i) in moved else 0), (j + 0.5) * p
+        cx = (i + 0.5) * p + (0.35 * p if (j, i) in moved else 0)
+        cy = (j + 0.5) * p
         rows = slice(int(j * p * over), int((j + 1) * p * over))
         columns = slice(max(int((i - 0.1) * p * over), 0), int((i + 1.5) * p * over))
         r = (

@@ -14,10 +14,8 @@ def covered(size, row, column, radius):
     """(y, x) share of each pixel within a disc: lengths of its chords in strips of
     pixels, by Pythagoras.
     """
-    edges, strips = (
-        np.arange(size + 1) - 0.5,
-        (np.arange(size * STRIPS) + 0.5) / STRIPS - 0.5,
-    )
+    edges = np.arange(size + 1) - 0.5
+    strips = (np.arange(size * STRIPS) + 0.5) / STRIPS - 0.5
     half = np.sqrt(np.maximum(radius**2 - (strips - column) ** 2, 0))
     ends = np.clip(edges[:, None], row - half, row + half)
     return np.diff(ends, axis=0).reshape(size, size, STRIPS).mean(2)

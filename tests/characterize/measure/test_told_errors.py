@@ -16,10 +16,8 @@ def drawn(rng, *, pitch, blur, noise, long):
     as long as wide, turned.
     """
     size = int(COUNT * pitch)
-    picture, wide = (
-        np.full((size * FINE,) * 2, 0.2),
-        rng.uniform(0.4, 0.7, (COUNT, COUNT)) * pitch,
-    )
+    picture = np.full((size * FINE,) * 2, 0.2)
+    wide = rng.uniform(0.4, 0.7, (COUNT, COUNT)) * pitch
     for (j, i), diameter in np.ndenumerate(wide):
         rows, columns = (
             slice(int(k * pitch) * FINE, int((k + 1) * pitch) * FINE) for k in (j, i)
@@ -30,10 +28,8 @@ def drawn(rng, *, pitch, blur, noise, long):
             for v, k in ((y, j), (x, i))
         )
         turn, ratio = rng.uniform(0, np.pi), rng.uniform(1, long)
-        one, other = (
-            dx * np.cos(turn) + dy * np.sin(turn),
-            dy * np.cos(turn) - dx * np.sin(turn),
-        )
+        one = dx * np.cos(turn) + dy * np.sin(turn)
+        other = dy * np.cos(turn) - dx * np.sin(turn)
         inside = np.hypot(one / np.sqrt(ratio), other * np.sqrt(ratio)) < diameter / 2
         picture[rows, columns][inside] = 0.8
     picture = (

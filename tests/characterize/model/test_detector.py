@@ -36,10 +36,8 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
 
     box = detector.pixel_transfer(FY, FX, pixel)
     spread = detector.gaussian_transfer(FY, FX, 0.9)[0]
-    lit, glow = (
-        detector.disc_transfer(FY, FX, size)[0],
-        detector.ball_transfer(FY, FX, size),
-    )
+    lit = detector.disc_transfer(FY, FX, size)[0]
+    glow = detector.ball_transfer(FY, FX, size)
     for (i, j), f in np.ndenumerate(F):
         one = over(lambda t: 1.0, pixel / 2, FX[0, j]) * over(
             lambda t: 1.0, pixel / 2, FY[i, 0]

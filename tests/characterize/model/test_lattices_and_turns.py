@@ -50,10 +50,8 @@ def made(hexagonal, hand=""):
     diameter = table[np.abs(off).argmin(-1)]
     turn = None
     if hand:
-        turn, diameter = (
-            wanted / (2 if hand == "right" else -2),
-            np.full(x.shape, 0.171),
-        )
+        turn = wanted / (2 if hand == "right" else -2)
+        diameter = np.full(x.shape, 0.171)
     diameter = np.where(
         (x**2 / 12**2 + y**2 / 9.5**2 < 1) & (x + y < 14), diameter, 0.0
     )
@@ -81,10 +79,8 @@ def summed(lens, sites, sign):
     grown = diameter + 1e-3 * (
         VALUES["bias_nm"] + VALUES["bias_x_nm"] * x / np.hypot(x, y).max()
     )
-    phase, size = (
-        lens.proxy.phase_rad(grown, 0.85),
-        lens.proxy.transmission(grown, 0.85),
-    )
+    phase = lens.proxy.phase_rad(grown, 0.85)
+    size = lens.proxy.transmission(grown, 0.85)
     t = size * np.exp(1j * (phase + sign * 2 * turn))
     gauss, weight = np.polynomial.legendre.leggauss(3)
     at = ((np.arange(PIXELS) - (PIXELS - 1) / 2)[:, None] + gauss / 2).ravel() * PIXEL
@@ -140,10 +136,8 @@ def test_the_bench_shows_the_sum_over_every_pillar(hexagonal, hand, sign):
     truth = bench.HiddenLens(
         DEPTHS, parameter=known, camera=bench.BenchCamera(pixel_um=PIXEL, pixels=PIXELS)
     )
-    got, want = (
-        bench.bench_irradiance(lens, truth, b.RESPONSE),
-        summed(lens, sites, sign),
-    )
+    got = bench.bench_irradiance(lens, truth, b.RESPONSE)
+    want = summed(lens, sites, sign)
     got *= (got * want).sum() / (got**2).sum()
     assert np.abs(got - want).max() < 2e-3 * want.max()
 

@@ -60,8 +60,11 @@ def ray(reach, media):
 
 
 def test_paths_are_those_of_snell_s_rays():
-    films, media = FilmStack(FRONT, BEHIND, 1.31), ((1.31, DISTANCE - 49.0), *BEHIND)
-    x, y, centre = np.array([11.0, -17.0]), np.array([3.0, 8.5]), (9.0, -4.0)
+    films = FilmStack(FRONT, BEHIND, 1.31)
+    media = ((1.31, DISTANCE - 49.0), *BEHIND)
+    x = np.array([11.0, -17.0])
+    y = np.array([3.0, 8.5])
+    centre = (9.0, -4.0)
     want = [
         ray(math.hypot(centre[0] - u, centre[1] - v), media)[1]
         for u, v in zip(x, y, strict=True)
@@ -132,7 +135,8 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
     The referee's lattice wraps and its point source is a sum over plane waves: 2e-3 of
     it.
     """
-    made_of, tangents = lens(filling), tuple(math.tan(a) for a in angle_rad)
+    made_of = lens(filling)
+    tangents = tuple(math.tan(a) for a in angle_rad)
     setting = FrameSetting(
         DEPTHS,
         np.array([angle_rad] * 2),
@@ -158,7 +162,8 @@ def test_frames_are_those_of_plane_waves_through_the_stack(angle_rad, filling):
     far = snell(steep / math.sqrt(1 + steep**2), media)[0] / steep if steep else 0.0
     stack = referee.Stack(list(media), wavelength=WAVELENGTH, step=0.4, count=701)
     places = np.meshgrid(made_of.diameters.x_um, made_of.diameters.y_um)
-    pillars, want = made.as_built_transmission(made_of, b.RESPONSE, x), []
+    pillars = made.as_built_transmission(made_of, b.RESPONSE, x)
+    want = []
     for depth in DEPTHS.tolist():
         waves = stack.fields(
             pillars * incident(places, tangents, depth),

@@ -23,11 +23,10 @@ def data(images, usable=None, saturated=None):
 
 
 def test_agreement_counts_light_above_the_background_in_pixels_that_count():
-    seen, told = RNG.uniform(20, 90, (3, 6, 7)), RNG.uniform(20, 90, (3, 6, 7))
-    usable, saturated = (
-        RNG.uniform(size=seen.shape) > 0.2,
-        RNG.uniform(size=seen.shape) > 0.9,
-    )
+    seen = RNG.uniform(20, 90, (3, 6, 7))
+    told = RNG.uniform(20, 90, (3, 6, 7))
+    usable = RNG.uniform(size=seen.shape) > 0.2
+    saturated = RNG.uniform(size=seen.shape) > 0.9
     got = measure_agreement(
         told, data(seen, usable, saturated), np.full_like(seen, 17.0)
     )
@@ -52,7 +51,8 @@ def test_what_noise_explains_is_not_missed():
     """
     light = np.zeros((9, 30, 32))
     light[:, 12:15, 9:20] = 400.0
-    noisy, level = light + RNG.normal(11.0, 3.0, light.shape), np.full_like(light, 11.0)
+    noisy = light + RNG.normal(11.0, 3.0, light.shape)
+    level = np.full_like(light, 11.0)
     assert measure_agreement(light + 11.0, data(noisy), level).unexplained < 0.03
     for share in (0.9, 0.7):  # of the light that is predicted; the noise to 1 %
         found = measure_agreement(share * light + 11.0, data(noisy), level)

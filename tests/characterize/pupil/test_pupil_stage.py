@@ -51,10 +51,8 @@ def beads():
     light = np.exp(1j * phase) / np.sqrt(cosine) * np.tile((x + 1) / 2 * weight, 64)
     k = 2 * np.pi / 0.52
     place = ((np.arange(34) - 17)[:, None] + np.array([-1, 0, 1]) / 3).ravel() * 0.13
-    down, across = (
-        np.exp(1j * k * np.outer(place, 0.9 * v)),
-        np.exp(1j * k * np.outer(0.9 * u, place)),
-    )
+    down = np.exp(1j * k * np.outer(place, 0.9 * v))
+    across = np.exp(1j * k * np.outer(0.9 * u, place))
     stack = np.zeros((13, 102, 102))
     for image, z in zip(stack, Z + OFF, strict=True):
         for radial, around in ((cosine * c, -s), (cosine * s, c), (-sine, 0.0)):

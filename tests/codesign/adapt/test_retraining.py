@@ -78,10 +78,8 @@ def test_a_gap_within_two_of_its_errors_is_no_gap(gap, counted):
     scatter = torch.tensor([0.1, -0.1]).repeat(50)[:, None].expand(100, 3) * math.sqrt(
         99 / 100
     )  # bar of 0.01
-    nominal, before = (
-        NetworkAccuracy(torch.ones(100, 3), torch.ones(100)),
-        NetworkAccuracy(1 + gap + scatter, torch.ones(100)),
-    )
+    nominal = NetworkAccuracy(torch.ones(100, 3), torch.ones(100))
+    before = NetworkAccuracy(1 + gap + scatter, torch.ones(100))
     told = RetrainingOutcome(nominal, nominal, before, nominal, None)
     assert told.gap_sigma_mm == pytest.approx(0.01, rel=1e-5)
     assert (told.recovered is not None) == counted

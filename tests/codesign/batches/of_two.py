@@ -22,10 +22,8 @@ from metalens.core.errors import TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
-SHAPES, KINDS = (
-    ((2, 3), (4,), (), (3, 1, 2)),
-    (torch.float32, torch.float64, torch.float32, torch.float32),
-)
+SHAPES = ((2, 3), (4,), (), (3, 1, 2))
+KINDS = (torch.float32, torch.float64, torch.float32, torch.float32)
 ITEMS = [3, 4, 5, 6, 7]
 
 

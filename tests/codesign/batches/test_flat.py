@@ -165,7 +165,8 @@ def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
     random = np.random.default_rng(7)
     light = random.integers(0, 256, (2, 80, 80)).astype(np.uint8)
     depth = random.integers(9_000, 60_000, (2, 80, 80)).astype(np.uint16)
-    frames, imager = SingleSurfaceFrames(light, depth, np.array([1.0, 0.83])), _imager()
+    frames = SingleSurfaceFrames(light, depth, np.array([1.0, 0.83]))
+    imager = _imager()
     want = sensor_irradiance(frames, imager)
     with elsewhere():
         got = sensor_irradiance(frames, imager.to(AWAY)).cpu()

@@ -248,10 +248,8 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
         "out: through the lens as made"
         in (folder / "shown" / "report.html").read_text()
     )
-    made, plain = (
-        retrained.load_retrained(folder / "out"),
-        retrained.load_retrained(folder / "run"),
-    )
+    made = retrained.load_retrained(folder / "out")
+    plain = retrained.load_retrained(folder / "run")
     design = lens.load_plain(folder / "run" / "lens.h5")
     response = asbuilt.load(folder / "asbuilt.h5").response
     true = config.load(folder / "truth.toml", HiddenLens)

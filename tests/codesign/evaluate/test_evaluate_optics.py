@@ -168,7 +168,9 @@ def _summed(lens, angle_rad, depth_um, place_um, hole_um=math.inf):
     x, y = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
     on = (lens.diameters.diameter_um > 0) & (np.hypot(x, y) <= hole_um)
     x, y, level, phase = (a[on] for a in (x, y, lens.transmission(), lens.phase_rad()))
-    k, z, slope = 2 * math.pi / 0.85, lens.sensor_distance_um, math.tan(angle_rad)
+    k = 2 * math.pi / 0.85
+    z = lens.sensor_distance_um
+    slope = math.tan(angle_rad)
     light = level * np.exp(
         1j * (phase + k * np.sqrt((x + depth_um * slope) ** 2 + y**2 + depth_um**2))
     )

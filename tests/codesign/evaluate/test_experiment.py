@@ -114,7 +114,8 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
     assert (
         np.abs(made(new) - target(new)).mean() < 0.02
     )  # of a range of 2: two tanh terms and a product
-    inside, outside = rng.standard_normal((6, 3)), rng.standard_normal((4, 2))
+    inside = rng.standard_normal((6, 3))
+    outside = rng.standard_normal((4, 2))
     slope = regressor._jacobian(inside, outside, x)
     for k, (array, place) in enumerate(((inside, (2, 1)), (outside, (3, 0)))):
         up, down = array.copy(), array.copy()
@@ -300,7 +301,8 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
     judged = trial.stimulus % 3 > 0
     off = np.array([[0.5, 0.0, -0.7], [-0.4, 0.9, 0.2]])[trial.subject]
     read = trial.slip_mm + off + judged[:, None] * np.array([0.1, -0.2, 0.3])
-    blank, error = np.zeros((len(read), 2)), np.where(judged, 1.0, np.nan)
+    blank = np.zeros((len(read), 2))
+    error = np.where(judged, 1.0, np.nan)
     result = experiment.RunResult(
         "a", 1.0, trial, read, blank, error, error, blank, error
     )
@@ -325,7 +327,8 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
         )
 
     person = np.repeat(np.arange(12), 20)
-    gaze, slip = rng.uniform(-17, 17, (240, 2)), rng.uniform(-5, 5, (240, 3))
+    gaze = rng.uniform(-17, 17, (240, 2))
+    slip = rng.uniform(-5, 5, (240, 3))
     pupil = rng.normal(0, 0.3, (240, 2))
     theirs = NetworkReadings(
         pupil, slip, misread(gaze, slip, rng.normal(5, 2, (12, 2))[person])
@@ -349,7 +352,8 @@ def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
     source = finished.load_finished_run(folder / "run")
-    config, imager = replace(SMALL, people=2), experiment.prepare_run(source)
+    config = replace(SMALL, people=2)
+    imager = experiment.prepare_run(source)
     found, again, dim = (
         experiment.run_calibrator(source, imager, c, experiment.experiment_sensors([source], c)[0])
         for c in (config, config, replace(config, snr_db=3.0))

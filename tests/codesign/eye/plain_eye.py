@@ -99,7 +99,8 @@ def tex(bank: Tensor, index: Tensor, u: Tensor, v: Tensor) -> Tensor:
     fu, fv = torch.floor(u.detach()), torch.floor(v.detach())
     i, j, k = fu.long() % size, fv.long() % size, index.long()
     a, b = bank[k, j, i], bank[k, j, (i + 1) % size]
-    c, d = bank[k, (j + 1) % size, i], bank[k, (j + 1) % size, (i + 1) % size]
+    c = bank[k, (j + 1) % size, i]
+    d = bank[k, (j + 1) % size, (i + 1) % size]
     s, t = u - fu, v - fv
     s, t = s * s * (3 - 2 * s), t * t * (3 - 2 * t)
     return (a + (b - a) * s) * (1 - t) + (c + (d - c) * s) * t

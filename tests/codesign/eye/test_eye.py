@@ -26,10 +26,8 @@ def mean_states(n=1, **changes):
         [[t.mean for t in POPULATION.values()]] * n, dtype=torch.float64
     )
     zero = torch.zeros(n, dtype=torch.float64)
-    pair, triple = (
-        torch.zeros(n, 2, dtype=torch.float64),
-        torch.zeros(n, 3, dtype=torch.float64),
-    )
+    pair = torch.zeros(n, 2, dtype=torch.float64)
+    triple = torch.zeros(n, 3, dtype=torch.float64)
     base = EyeStates(
         traits, still.textures, pair, zero, triple, pair, zero + 1, zero + 1
     )
@@ -63,10 +61,8 @@ def test_people_are_cut_where_few_of_them_are():
             assert trait.low == trait.mean == trait.high
             assert (values == trait.mean).all()
             continue
-        below, above = (
-            (trait.mean - trait.low) / trait.sd,
-            (trait.high - trait.mean) / trait.sd,
-        )
+        below = (trait.mean - trait.low) / trait.sd
+        above = (trait.high - trait.mean) / trait.sd
         assert min(below, above) > 1.5 - 1e-9
         assert max(below, above) < 5.3
         assert abs(values.mean() - trait.mean) < (0.14 + 4 * 0.032) * trait.sd, name
@@ -127,10 +123,8 @@ def test_refracted_rays_obey_snell_at_the_cornea():
     b = ball @ d
     hit = (b - math.sqrt(b**2 - ball @ ball + value[model.CORNEA_R] ** 2)) * d
     normal = (hit - ball) / value[model.CORNEA_R]
-    x, y = (
-        value[model.IRIS_X : model.IRIS_X + 3],
-        value[model.IRIS_Y : model.IRIS_Y + 3],
-    )
+    x = value[model.IRIS_X : model.IRIS_X + 3]
+    y = value[model.IRIS_Y : model.IRIS_Y + 3]
     point = centre + value[model.PUPIL_D] * axis + 1500.0 * x - 700.0 * y
     inner = (point - hit) / np.linalg.norm(point - hit)
     assert np.linalg.norm(np.cross(normal, d)) == pytest.approx(
@@ -140,10 +134,8 @@ def test_refracted_rays_obey_snell_at_the_cornea():
 
 
 def test_slip_to_plus_x_moves_landmarks_by_the_pinhole_law():
-    still, moved = (
-        mean_states(),
-        mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64)),
-    )
+    still = mean_states()
+    moved = mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64))
     camera = PinholeCamera()
     a, b = (
         camera.position_px(landmarks.landmark_points(pack(s)), FRONTAL)[0]

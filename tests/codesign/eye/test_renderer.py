@@ -61,10 +61,8 @@ def test_differences_of_triplets_agree_with_exact_derivatives_in_their_linear_re
         return plain_eye.render_in_torch(_p(moved), CameraRig(), SMALL)[0].sum(1)
 
     zero = torch.zeros(2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    gaze, slip = (
-        torch.eye(2, dtype=torch.float64)[0],
-        torch.eye(3, dtype=torch.float64)[2],
-    )
+    gaze = torch.eye(2, dtype=torch.float64)[0]
+    slip = torch.eye(3, dtype=torch.float64)[2]
     _, by_gaze = torch.func.jvp(shown, zero, (gaze, zero[1]))
     _, by_slip = torch.func.jvp(shown, zero, (zero[0], slip))
 
@@ -167,7 +165,8 @@ def test_mask_is_centred_on_the_refracted_outline():
 
 def test_scale_changes_depth_and_labels_but_not_the_image():
     double = replace(STATES, scale=torch.full((4,), 1.2, dtype=torch.float64))
-    a, b = renderer.render(STATES, camera=SMALL), renderer.render(double, camera=SMALL)
+    a = renderer.render(STATES, camera=SMALL)
+    b = renderer.render(double, camera=SMALL)
     assert torch.equal(a.frames.radiance, b.frames.radiance)
     assert torch.allclose(1.2 * a.frames.depth_um, b.frames.depth_um)
     assert torch.allclose(1.2 * a.labels.pupil_um, b.labels.pupil_um)

@@ -52,10 +52,8 @@ def test_a_lamp_falls_off_with_the_square_and_the_cosine_and_wraps():
 def test_three_lamps_and_more_light_from_above():
     lamps = [[9e3, -5e3, 1e3], [-7e3, -4e3, 2e3], [1e3, -12e3, 3e3]]
     p = parameters(LED=lamps, AMBIENT=0.3, FACE_Y=[0.0, 0.6, -0.8])
-    point, normal = (
-        [number(x) for x in (500, 800, 19e3)],
-        [number(x) for x in (0.1, -0.3, -math.sqrt(0.9))],
-    )
+    point = [number(x) for x in (500, 800, 19e3)]
+    normal = [number(x) for x in (0.1, -0.3, -math.sqrt(0.9))]
     total = 0.0
     for lamp in lamps:
         v = [a - float(b) for a, b in zip(lamp, point, strict=True)]
@@ -79,7 +77,8 @@ def test_a_wet_surface_and_the_iris_behind_it_have_the_light_of_three_lamps_and_
     straight on.
     """
     lamps = [[9e3, -5e3, 1e3], [-7e3, -4e3, 2e3], [1e3, -12e3, 3e3]]
-    axis, normal = (0.2, -0.1, -math.sqrt(0.95)), (0.1, -0.3, -math.sqrt(0.9))
+    axis = (0.2, -0.1, -math.sqrt(0.95))
+    normal = (0.1, -0.3, -math.sqrt(0.9))
     p = parameters(LED=lamps, AMBIENT=0.3, FACE_Y=[0.0, 0.6, -0.8], AXIS=axis)
     point = (500.0, 800.0, 19e3)
     sums, lobes = [0.0, 0.0], []

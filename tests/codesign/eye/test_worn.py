@@ -32,10 +32,8 @@ def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
     depth[:, 0] = 16e3
     pupil = torch.zeros(1, N, N)
     pupil[:, 26:34, left : left + 10] = 1
-    one, three = (
-        torch.zeros(1, dtype=torch.float64),
-        torch.zeros(1, 3, dtype=torch.float64),
-    )
+    one = torch.zeros(1, dtype=torch.float64)
+    three = torch.zeros(1, 3, dtype=torch.float64)
     place = torch.tensor([[34.5, 29.5]], dtype=torch.float64)
     labels = FrameLabels(
         three,
@@ -188,10 +186,8 @@ def test_a_movement_spreads_by_its_length_along_its_way(length, angle):
     assert kernel.sum() == pytest.approx(1, abs=1e-6)
     assert (kernel * x).sum() == pytest.approx(0, abs=1e-6)
     assert (kernel * y).sum() == pytest.approx(0, abs=1e-6)
-    along, across = (
-        x * math.cos(angle) + y * math.sin(angle),
-        y * math.cos(angle) - x * math.sin(angle),
-    )
+    along = x * math.cos(angle) + y * math.sin(angle)
+    across = y * math.cos(angle) - x * math.sin(angle)
     assert (
         -0.01 <= (kernel * along**2).sum() - length**2 / 12 <= 0.25
     )  # 32 places of the line: 0.1 % less

@@ -33,10 +33,8 @@ def _direction(yaw, pitch):
 
 @given(angle, angle, slip, slip, slip)
 def test_solver_inverts_the_projection(yaw, pitch, dx, dy, dz):
-    direction, moved = (
-        _direction(yaw, pitch),
-        torch.tensor([[dx, dy, dz]], dtype=torch.float64),
-    )
+    direction = _direction(yaw, pitch)
+    moved = torch.tensor([[dx, dy, dz]], dtype=torch.float64)
     pupil = pupil_of(direction, moved, GEOMETRY)
     found = gaze.optical_axis(pupil, moved, GEOMETRY)
     # the near intersection is the pupil wherever the pupil faces the camera
@@ -94,7 +92,9 @@ def test_pupil_on_the_sensor_by_similar_triangles():
     )
     look = torch.tensor([[0.48, 0.6, -0.64]], dtype=torch.float64)
     moved = torch.tensor([[0.7, -1.1, 2.3]], dtype=torch.float64)
-    x, y, z = 1.0 - 0.7 + 9.3 * 0.48, -14.0 + 1.1 + 9.3 * 0.6, 27.0 - 2.3 - 9.3 * 0.64
+    x = 1.0 - 0.7 + 9.3 * 0.48
+    y = -14.0 + 1.1 + 9.3 * 0.6
+    z = 27.0 - 2.3 - 9.3 * 0.64
     assert pupil_of(look, moved, geometry)[0].tolist() == pytest.approx(
         [1.7 * x / z, 1.7 * y / z]
     )

@@ -59,10 +59,8 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
     def likelihood(k, mean, variance, noise):
         total = 0.0
         for p in range(6):
-            x, y = (
-                design[person == p],
-                answers[person == p, k] - design[person == p] @ mean,
-            )
+            x = design[person == p]
+            y = answers[person == p, k] - design[person == p] @ mean
             cov = noise * np.eye(len(x)) + x @ np.diag(variance) @ x.T
             total -= 0.5 * (np.linalg.slogdet(cov)[1] + y @ np.linalg.solve(cov, y))
         return total
@@ -123,11 +121,9 @@ def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatc
     reading spread by 0.02 counts as one
     spread by 4, and one that never changes as nothing."""
     rng = np.random.default_rng(10)
-    axis, pupil, slip = (
-        rng.normal(3, 4, (80, 2)),
-        rng.normal(-1, 0.02, (80, 2)),
-        rng.normal(0.5, 1.5, (80, 3)),
-    )
+    axis = rng.normal(3, 4, (80, 2))
+    pupil = rng.normal(-1, 0.02, (80, 2))
+    slip = rng.normal(0.5, 1.5, (80, 3))
     slip[:, 1] = 0.25
     asked = []
     monkeypatch.setattr(
@@ -156,10 +152,8 @@ def _read(rng, people, each, common):
     each does to all alike.
     """
     person = np.repeat(np.arange(people), each)
-    gaze, slip = (
-        rng.uniform(-17, 17, (len(person), 2)),
-        rng.uniform(-5, 5, (len(person), 3)),
-    )
+    gaze = rng.uniform(-17, 17, (len(person), 2))
+    slip = rng.uniform(-5, 5, (len(person), 3))
     kappa = rng.normal([5.0, -1.5], 2.0, (people, 2))[person]
     gain = rng.normal(1.0, 0.05, people)[person]
     axis = (

@@ -77,7 +77,8 @@ def test_slip_is_counted_in_units_of_its_scale():
     """Off by 0.1 and 0.5 units: half the square over the knee below it, straight
     beyond; no scale is 1.
     """
-    truth, scale = torch.tensor([[0.8, -2.1, 3.3]]), torch.tensor([0.4, 0.7, 3.0])
+    truth = torch.tensor([[0.8, -2.1, 3.3]])
+    scale = torch.tensor([0.4, 0.7, 3.0])
     predicted = truth / scale + torch.tensor([[0.1, 0.0, -0.5]])
     want = (0.1**2 / 2 / 0.3 + (0.5 - 0.3 / 2)) / 3
     assert float(losses.slip_loss(predicted, truth, scale)) == pytest.approx(
@@ -108,15 +109,11 @@ def test_task_adds_mask_and_twice_the_slip():
     from codesign.network.supernet import Prediction
 
     generator = torch.Generator().manual_seed(3)
-    logits, slip = (
-        torch.randn(2, 8, 8, generator=generator),
-        torch.randn(2, 3, generator=generator),
-    )
-    mask, truth, scale = (
-        _mask().float(),
-        torch.tensor([[0.3, -0.9, 2.0]] * 2),
-        torch.tensor([0.4, 0.7, 3.0]),
-    )
+    logits = torch.randn(2, 8, 8, generator=generator)
+    slip = torch.randn(2, 3, generator=generator)
+    mask = _mask().float()
+    truth = torch.tensor([[0.3, -0.9, 2.0]] * 2)
+    scale = torch.tensor([0.4, 0.7, 3.0])
     kinds = {"mask_logits": logits, "slip": slip}
     names = (
         Prediction.__dataclass_fields__

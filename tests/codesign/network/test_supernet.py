@@ -43,7 +43,8 @@ def test_a_subnet_equals_its_slice_of_the_supernet(net):
     chosen = arch.sample_architecture(SPACE, np.random.default_rng(3))
     recalibrate_batch_norm(net, chosen, [_frames(), _frames(4)])
     with torch.no_grad():
-        whole, cut = net(_frames(), chosen), Subnet(net, chosen)(_frames())
+        whole = net(_frames(), chosen)
+        cut = Subnet(net, chosen)(_frames())
     for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
         torch.testing.assert_close(
             a, b, rtol=1e-4, atol=1e-5

@@ -37,10 +37,8 @@ def test_a_sensor_too_far_is_the_change_of_the_path_to_it():
     (3/4) (r/z)² of itself.
     """
     got, x, y = phase(focus_um=13.0)
-    r2, z = (
-        (x**2 + y**2) * SETTINGS.pupil.radius_um**2,
-        SETTINGS.pupil.sensor_distance_um,
-    )
+    r2 = (x**2 + y**2) * SETTINGS.pupil.radius_um**2
+    z = SETTINGS.pupil.sensor_distance_um
     path = [r2 / (torch.sqrt(r2 + d**2) + d) for d in (z, z + 13.0)]
     want = 2 * math.pi / SETTINGS.pupil.wavelength_um * (path[1] - path[0])
     steep = (SETTINGS.pupil.radius_um / z) ** 2
@@ -132,14 +130,10 @@ def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
     state = DrawnLensErrors(
         {"bias_nm": 6.0, "gradient_nm": 3.1, "bow_nm": -1.7}, 0.7
     ).state()
-    u, v = (
-        torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64),
-        torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64),
-    )
-    turn, lens = (
-        SETTINGS.proxy.phase_rad,
-        np.linspace(*SETTINGS.proxy.domain_um, 40_001),
-    )
+    u = torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64)
+    v = torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64)
+    turn = SETTINGS.proxy.phase_rad
+    lens = np.linspace(*SETTINGS.proxy.domain_um, 40_001)
     phase = np.asarray(turn(lens, 0.85))
     inside = phase - phase[0] <= 2 * math.pi
     rate = np.gradient(phase, lens)[inside]

@@ -27,7 +27,8 @@ def test_radial_terms_know_no_azimuth_and_free_ones_do():
 
 
 def test_free_terms_are_rings_and_waves_in_their_order():
-    x, y = np.array([0.6, -0.28, 0.0, 0.0, -1.1]), np.array([0.0, 0.53, -0.6, 0.0, 0.4])
+    x = np.array([0.6, -0.28, 0.0, 0.0, -1.1])
+    y = np.array([0.0, 0.53, -0.6, 0.0, 0.4])
     free = families.phase_terms(torch.from_numpy(x), torch.from_numpy(y), 23, "free")
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
     orders = [(n, m) for n in range(2, 7) for m in range(-n, n + 1, 2)]

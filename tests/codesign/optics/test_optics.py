@@ -45,7 +45,8 @@ def _on_samples(fine, settings):
     edge = period / (2 * step)
     top = math.floor(edge + 0.5)
     number = torch.arange(-top, top + 1, dtype=torch.float64)
-    frequency, kept = number / period, (edge - number.abs() + 0.5).clamp(0, 1)
+    frequency = number / period
+    kept = (edge - number.abs() + 0.5).clamp(0, 1)
     from_x = (
         (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2)
         * step

@@ -76,10 +76,8 @@ def test_candidates_born_together_do_not_know_of_each_other():
     """Four at once: the population of the first four births is the same as one at a
     time, and rounds are kept.
     """
-    one, four = (
-        _run(plan=EvolutionSettings(8, 3, 30)),
-        _run(plan=EvolutionSettings(8, 3, 30, together=4)),
-    )
+    one = _run(plan=EvolutionSettings(8, 3, 30))
+    four = _run(plan=EvolutionSettings(8, 3, 30, together=4))
     assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
     assert (
         four[1].history == one[7].history
@@ -200,7 +198,9 @@ def _at_resolution(architecture):
 
 
 def test_a_network_is_fitted_by_resolution_alone():
-    space, count, top = SPACE, _at_resolution, arch.largest_architecture(SPACE)
+    space = SPACE
+    count = _at_resolution
+    top = arch.largest_architecture(SPACE)
     assert evolution.fit_resolution(space, top, count, 2 * count(top)) == top
     budget = 0.4 * count(top)
     made = evolution.fit_resolution(space, top, count, budget)

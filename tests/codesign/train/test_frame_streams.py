@@ -58,7 +58,8 @@ def test_a_mask_that_its_own_table_shows_to_be_worse_is_refused_in_words():
     def state(name, strehl):
         return correction.LensProposal(name, None, strehl, 1.0)
 
-    made, tabled = state("as made", 0.555), state("new bias table", 0.509)
+    made = state("as made", 0.555)
+    tabled = state("new bias table", 0.509)
     words = correction.loss_reason(made, tabled)
     assert "no correction" in words
     assert "0.509 (new bias table)" in words

@@ -122,10 +122,8 @@ def test_optics_and_pitch_move_only_inside_their_schedules():
         lambda slope: slope.abs() + 0.1
     )  # it begins at its coarsest
     list(trainer.run(until=5))
-    lens, pitch = (
-        trainer.model.coefficients_rad.detach().clone(),
-        float(trainer.model.log_pitch.detach()),
-    )
+    lens = trainer.model.coefficients_rad.detach().clone()
+    pitch = float(trainer.model.log_pitch.detach())
     assert float(lens.abs().max()) > 0
     assert pitch != math.log(10.0)
     list(trainer.run())
@@ -341,7 +339,8 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
         "exp_avg"
     ].contiguous()
     training.align_moments(optimiser)
-    step, after = optimiser.state[pitch]["step"], optimiser.state[kernel]["exp_avg"]
+    step = optimiser.state[pitch]["step"]
+    after = optimiser.state[kernel]["exp_avg"]
     assert (step.dtype, float(step)) == (before.dtype, 1.0)
     assert after.stride() == kernel.stride()
     assert torch.equal(after, moment)

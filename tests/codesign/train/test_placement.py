@@ -80,7 +80,8 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
     """Images, pixels, network, losses and the way back to lens and pitch: nothing of it
     is for the processor alone.
     """
-    plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
+    plain = _going(change, frozen).trainer
+    moved = _going(change, frozen).trainer
     (want,) = plain.run(until=1)
     with elsewhere() as done:
         trainer.place_on_device(moved, AWAY)

@@ -215,10 +215,8 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
     """
 
     def of(pitch_um):
-        optics, scenes = (
-            replace(settings.optics, sample_um=4.5),
-            replace(settings.scenes, pixels=192, pool=0),
-        )
+        optics = replace(settings.optics, sample_um=4.5)
+        scenes = replace(settings.scenes, pixels=192, pool=0)
         budgets = replace(settings.run, budgets_mmacs=(1.6,), pitch_um=pitch_um)
         return replace(settings, optics=optics, scenes=scenes, run=budgets)
 

@@ -49,11 +49,12 @@ def counted(wafer, box, reach=40):
     radius = 500 * wafer.diameter_mm
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
-            x, y = (
-                i * wafer.pitch_um[0] + wafer.offset_um[0],
-                j * wafer.pitch_um[1] + wafer.offset_um[1],
-            )
-            left, bottom, right, top = x + box[0], y + box[1], x + box[2], y + box[3]
+            x = i * wafer.pitch_um[0] + wafer.offset_um[0]
+            y = j * wafer.pitch_um[1] + wafer.offset_um[1]
+            left = x + box[0]
+            bottom = y + box[1]
+            right = x + box[2]
+            top = y + box[3]
             if (
                 max(math.hypot(u, v) for u in (left, right) for v in (bottom, top))
                 > radius

@@ -268,7 +268,9 @@ def test_least_width_and_space_are_those_of_klayout_in_projection(tmp_path, kind
     makers, is_turned, tolerance = KINDS[kind]
     rng = np.random.default_rng(seed)
     made = db.Layout()
-    top, sub, layer = made.create_cell("T"), made.create_cell("SUB"), made.layer(3, 1)
+    top = made.create_cell("T")
+    sub = made.create_cell("SUB")
+    layer = made.layer(3, 1)
     for n in range(int(rng.integers(2, 10))):
         points = makers[n % 2](rng)
         a = rng.uniform(0, 7) if is_turned else rng.integers(4) * np.pi / 2

@@ -188,11 +188,9 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
     projection says the same.
     """
     made = db.Layout()
-    top, pillar, layer = (
-        made.create_cell("TOP"),
-        made.create_cell("P"),
-        made.layer(1, 0),
-    )
+    top = made.create_cell("TOP")
+    pillar = made.create_cell("P")
+    layer = made.layer(1, 0)
     angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
     corners = np.rint(51 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
     pillar.shapes(layer).insert(db.Polygon([db.Point(*map(int, p)) for p in corners]))
@@ -251,7 +249,8 @@ def ell(rng):
 
 def fork(rng):
     w, h = rng.integers(300, 900, 2).tolist()
-    a, b = int(rng.integers(40, w // 2 - 20)), int(rng.integers(40, h - 60))
+    a = int(rng.integers(40, w // 2 - 20))
+    b = int(rng.integers(40, h - 60))
     c = int(rng.integers(a + 20, w - 40))
     return [(0, 0), (w, 0), (w, h), (c, h), (c, b), (a, b), (a, h), (0, h)]
 

@@ -97,10 +97,8 @@ def klayout_findings(plan, rules):
 
 
 def agree(size, seeds, seed):
-    plan, rules = (
-        seeded(size, seeds, seed),
-        DesignRules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1),
-    )
+    plan = seeded(size, seeds, seed)
+    rules = DesignRules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1)
     found = check_plan(plan, rules)
     close, thin = klayout_findings(plan, rules)
     assert {v.box for v in found.violations if v.rule == "space"} == close

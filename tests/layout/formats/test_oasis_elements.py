@@ -216,11 +216,9 @@ def test_repetitions_beyond_a_limit_or_32_bits_are_refused():
 
 def test_placements_are_listed_from_each_to_the_next():
     out = np.zeros(200, np.uint8)
-    child, x, y = (
-        np.array([5, 300, 5]),
-        np.array([-100, -93, -93]),
-        np.array([40, 40, 29]),
-    )
+    child = np.array([5, 300, 5])
+    x = np.array([-100, -93, -93])
+    y = np.array([40, 40, 29])
     used = oasis_write.encode_list(child, x, y, np.array([0, 6, 3]), out)
     want = "0f 11 f0 05 c9 01 50 10"  # absolute, (-100, 40), then relative
     # 7 to the right; turned by two quarters after a mirror; the same y is left out

@@ -14,7 +14,8 @@ def wound(polygon, places):
     """How often a polygon goes around each place: crossings of the ray to +x, upwards
     less downwards.
     """
-    a, b = polygon.astype(float), np.roll(polygon, -1, axis=0).astype(float)
+    a = polygon.astype(float)
+    b = np.roll(polygon, -1, axis=0).astype(float)
     y = places[:, 1, None]
     up = (a[:, 1] <= y).astype(int) - (b[:, 1] <= y)
     rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
@@ -57,10 +58,8 @@ def test_beyond_a_right_angle_each_arm_goes_on_by_half_its_width():
     outside at (1050, -50) and
     (1000, 0) - 50 (-0.6, 0.8) + 50 (0.8, 0.6)."""
     made = paths.path_outline(np.array([[0, 0], [1000, 0], [400, 800]]), 50.0)
-    left, right = (
-        [[0, 50], [900, 50], [360, 770]],
-        [[440, 830], [1070, -10], [1050, -50], [0, -50]],
-    )
+    left = [[0, 50], [900, 50], [360, 770]]
+    right = [[440, 830], [1070, -10], [1050, -50], [0, -50]]
     assert made.tolist() == left + right
     mirrored = paths.path_outline(np.array([[0, 0], [1000, 0], [400, -800]]), 50.0)
     assert mirrored.tolist() == [[x, -y] for x, y in (left + right)[::-1]]

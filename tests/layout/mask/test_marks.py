@@ -209,9 +209,7 @@ def test_a_die_just_wide_enough_keeps_its_structures_apart():
     assert len(plan.lattices) == 3
     for lattice in plan.lattices[1:]:
         left, top = lattice.x0, lattice.y0
-        right, bottom = (
-            left + (lattice.columns - 1) * lattice.pitch,
-            top - (lattice.rows - 1) * lattice.pitch,
-        )
+        right = left + (lattice.columns - 1) * lattice.pitch
+        bottom = top - (lattice.rows - 1) * lattice.pitch
         over = (low < (right, top)) & (high > (left, bottom))
         assert not over.all(1).any()

@@ -186,12 +186,10 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
         wide += [c.diameter_nm * 1e-3 for c in kinds]
         dose += [c.dose for c in kinds]
         goal += [c.goal for c in kinds]
-    centres, wide, dose, goal = (
-        np.concatenate(centres),
-        np.array(wide),
-        np.array(dose),
-        np.array(goal),
-    )
+    centres = np.concatenate(centres)
+    wide = np.array(wide)
+    dose = np.array(dose)
+    goal = np.array(goal)
     which = np.linspace(0, len(wide) - 1, 24).astype(int)
     beside = [f.polygons.items() for f in plan.figures if f.name in ("MARKS", "LABEL")]
     shapes = [

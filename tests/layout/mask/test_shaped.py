@@ -102,7 +102,8 @@ def axis_of(corners):
     """(turn of the long axis modulo pi, area, second moments) of a polygon, by Green's
     theorem.
     """
-    p, q = corners.astype(float), np.roll(corners, -1, axis=0).astype(float)
+    p = corners.astype(float)
+    q = np.roll(corners, -1, axis=0).astype(float)
     cross = p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]
     area = cross.sum() / 2
     xx, yy = (
@@ -173,10 +174,8 @@ def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(
 
 @pytest.mark.parametrize("shape", [Rectangle(), Ellipse()], ids=lambda s: s.kind)
 def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, shape):
-    rng, there = (
-        np.random.default_rng(8),
-        np.random.default_rng(4).random((9, 12)) < 0.8,
-    )
+    rng = np.random.default_rng(8)
+    there = np.random.default_rng(4).random((9, 12)) < 0.8
     size, length = (
         np.where(there, rng.integers(low, high, (9, 12)) * 2e-3, 0.0)
         for low, high in ((45, 140), (60, 150))

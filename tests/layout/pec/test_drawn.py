@@ -13,7 +13,9 @@ from layout.pec.drawn import DrawnDiscs, DrawnOutlines
 from layout.pec.psf import PointExposure
 
 POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))
-D, ONE, OFF = 0.231, np.array([False, True]), np.array([0.3517, -0.2109])
+D = 0.231
+ONE = np.array([False, True])
+OFF = np.array([0.3517, -0.2109])
 
 
 def round_ones(count=256):
@@ -49,7 +51,8 @@ def test_a_rectangle_and_its_hole_are_products_of_error_functions():
         return np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
 
     shape = DrawnOutlines([(), [box(0.13, 0.06), box(0.05, 0.021)[::-1]]])
-    at, width = np.array([[0.13, 0.03], [0.01, 0.02], [0.2, -0.07]]), 0.03
+    at = np.array([[0.13, 0.03], [0.01, 0.02], [0.2, -0.07]])
+    width = 0.03
 
     def plain(a, b):
         x, y = at.T
@@ -88,11 +91,13 @@ def level_of_a_rectangle(a, b):
         )
 
     def excess(level):
-        low, high = np.zeros_like(angle), np.full_like(angle, 2 * (a + b))
+        low = np.zeros_like(angle)
+        high = np.full_like(angle, 2 * (a + b))
         for _ in range(30):
             middle = (low + high) / 2
             above = exposure(middle) > level
-            low, high = np.where(above, middle, low), np.where(above, high, middle)
+            low = np.where(above, middle, low)
+            high = np.where(above, high, middle)
         return math.pi * float((low**2).mean()) - 4 * a * b
 
     return brentq(excess, 0.1, 0.6, xtol=1e-6)
@@ -108,7 +113,8 @@ def test_a_turn_leaves_the_level_of_a_shape_as_it_is(sides, turn_deg):
     promised to 1e-2. Pixels of a sixth and of a tenth of the core see the bend of the
     exposure: 5e-4 of the level."""
     a, b = sides
-    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    c = math.cos(math.radians(turn_deg))
+    s = math.sin(math.radians(turn_deg))
     corners = np.array([[-a, -b], [a, -b], [a, b], [-a, b]]) @ np.array(
         [[c, s], [-s, c]]
     )
@@ -142,10 +148,8 @@ def test_the_widest_reach_farthest_along_the_steps_of_those_used():
     """A long, a high and a large one that is not used; a small one behind."""
     boxes = [(0.3, 0.05), (0.04, 0.2), (0.9, 0.9), (0.1, 0.1)]
     outlines = [[np.array([[-a, -b], [a, -b], [a, b], [-a, b]])] for a, b in boxes]
-    used, steps = (
-        np.array([False, True, True, False, True]),
-        np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]]),
-    )
+    used = np.array([False, True, True, False, True])
+    steps = np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]])
     assert DrawnOutlines([(), *outlines]).widest(used, steps) == [1, 2]
     assert DrawnOutlines([(), *outlines]).widest(used, steps[:1]) == [1]
     assert DrawnDiscs(np.array([0.0, 0.2, 0.3, 0.4])).widest(

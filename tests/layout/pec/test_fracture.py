@@ -71,7 +71,8 @@ def test_the_background_hardly_changes_along_the_outer_side_of_a_piece():
     made, _ = fracture.fracture_boxes(
         CROSS, NOTHING, step_um=STEP_UM, point=point, tolerance=0.01
     )
-    box, far = made * STEP_UM, PointExposure(point.widths_um[1:], point.weights[1:])
+    box = made * STEP_UM
+    far = PointExposure(point.widths_um[1:], point.weights[1:])
     bottom = box[(made[:, 1] == 45_001) & (made[:, 0] < -500)]  # of the left arm
     ends = [by_boxes(bottom[:, [k, 1]], CROSS * STEP_UM, far) for k in (0, 2)]
     long = bottom[:, 2] - bottom[:, 0] > 2 * 8.0 / 64
@@ -147,10 +148,8 @@ def test_a_bar_drawn_as_two_is_not_cut_along_for_the_side_between_them(turn):
     """From its edge to its middle the background changes by more than a piece may have,
     but no edge is there.
     """
-    bars, point = (
-        np.array([[0, 0, 120_000, 6_000], [0, 6_000, 120_000, 13_000]]),
-        beam(16.0),
-    )
+    bars = np.array([[0, 0, 120_000, 6_000], [0, 6_000, 120_000, 13_000]])
+    point = beam(16.0)
     far = PointExposure(point.widths_um[1:], point.weights[1:])
     ends = by_boxes(
         np.array([[60.0, 0.0], [60.0, 6.0], [60.0, 13.0]]), bars * STEP_UM, far

@@ -58,10 +58,8 @@ def hyperbolic(n=161, distance_um=150.0, source_um=1500.0):
     path = np.sqrt(r**2 + distance_um**2) + np.sqrt(r**2 + source_um**2)
     table = np.arange(0.1, 0.3, 0.002)
     phase = PROXY.phase_rad(table, 0.85)
-    table, phase = (
-        table[phase < phase[0] + 2 * np.pi],
-        phase[phase < phase[0] + 2 * np.pi],
-    )
+    table = table[phase < phase[0] + 2 * np.pi]
+    phase = phase[phase < phase[0] + 2 * np.pi]
     wanted = np.remainder(-2 * np.pi / 0.85 * path - phase[0], 2 * np.pi)
     diameter = table[
         np.clip(np.searchsorted(phase - phase[0], wanted), 0, len(table) - 1)
@@ -74,7 +72,8 @@ def hexagonal():
     """The hyperbolic lens with its pillars on the sites of a hexagonal lattice,
     squares.
     """
-    made, cell = hyperbolic(), Cell(0.44, lattice=Lattice("hexagonal"), shape=Square())
+    made = hyperbolic()
+    cell = Cell(0.44, lattice=Lattice("hexagonal"), shape=Square())
     d = made.diameters.diameter_um.copy()
     d[np.add.outer(*map(np.arange, d.shape)) % 2 == 1] = 0
     return dataclasses.replace(
@@ -319,7 +318,8 @@ def test_a_turned_lens_has_its_study(monkeypatch):
         monkeypatch.setattr(
             module, name, functools.partial(_drawn, getattr(module, name), most)
         )
-    lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
+    lens = turned(51)
+    process = Process(write_field=WriteField(size_um=10.0))
     made = study_page.study_sections(
         lens, process, fields.split_write_fields(lens.diameters, process), {"": SENS}
     )
@@ -341,11 +341,9 @@ def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
         "analyse_tolerance",
         functools.partial(_drawn, tolerance.analyse_tolerance, 10),
     )
-    lens, process = (
-        hyperbolic(31),
-        Process(
-            etch=EtchProfile(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)
-        ),
+    lens = hyperbolic(31)
+    process = Process(
+        etch=EtchProfile(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)
     )
     lens = dataclasses.replace(
         lens,
@@ -358,7 +356,8 @@ def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
 
 
 def test_fields_of_a_turned_lens_add_up_to_its_light():
-    lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
+    lens = turned(51)
+    process = Process(write_field=WriteField(size_um=10.0))
     where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )

@@ -122,7 +122,8 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
     )
     wide, long = lens.diameters.diameter_um, lens.diameters.length_um
     for draw, seen in zip(lenses, fast, strict=True):
-        a, along = draw.amounts, x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
+        a = draw.amounts
+        along = x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
         bias_um = 1e-3 * (
             a["bias_nm"]
             + a["gradient_nm"] / 2 * along
@@ -216,7 +217,8 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
 
 
 def test_fields_of_pairs_add_up_to_their_light():
-    lens, process = two_sizes(51), Process(write_field=WriteField(size_um=10.0))
+    lens = two_sizes(51)
+    process = Process(write_field=WriteField(size_um=10.0))
     where = focus.FocusWindow(
         np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
     )
@@ -235,7 +237,8 @@ def test_fields_of_pairs_add_up_to_their_light():
 
 
 def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
-    lens, process = two_sizes(31), Process(write_field=WriteField(size_um=6.0))
+    lens = two_sizes(31)
+    process = Process(write_field=WriteField(size_um=6.0))
     monkeypatch.setattr(
         page, "pair_sensitivities", lambda lens: {light: told(lens) for light in "xy"}
     )

@@ -68,7 +68,8 @@ def test_exposures_are_those_of_the_direct_sum(third):
     centres = np.stack([found.x_um, found.y_um], -1)
     which = np.linspace(0, len(centres) - 1, 12).astype(int)
     point = psf.point_exposure(process.exposure)
-    wide, dose = found.drawn_nm * 1e-3, np.full(len(centres), table[1, 0])
+    wide = found.drawn_nm * 1e-3
+    dose = np.full(len(centres), table[1, 0])
     exact = rims.at_edges(centres, wide, dose, point, which=which)
     # interpolation on nodes and Gaussians of second moments: 5e-4; where a Gaussian is
     # about as wide as pillars, the error that the report states at its own samples

@@ -63,10 +63,8 @@ def lens(shape, lattice, sizes, turned, empty=0.25):
     )  # each turn has its own polygon
     row_um = 0.346 if lattice.centred else None
     d = np.rint(1e3 * rng.uniform(*sizes, (rows, columns))) * 1e-3
-    y, x = (
-        np.arange(rows)[:, None] - (rows - 1) / 2,
-        np.arange(columns) - (columns - 1) / 2,
-    )
+    y = np.arange(rows)[:, None] - (rows - 1) / 2
+    x = np.arange(columns) - (columns - 1) / 2
     outside = (x / columns - 0.03) ** 2 + (y / rows + 0.02) ** 2 > 0.22
     d[outside | (rng.random(d.shape) < empty)] = 0
     if lattice.centred:
@@ -115,7 +113,8 @@ def test_every_shape_comes_out_with_its_area_and_the_certificate_says_how_nearly
     ]
     for x, y, number in sites[some].tolist():
         cls = plan.classes[int(number) - 1]
-        area, around = cls.twice_area / 2e6, sum(length(c) for c in cls.contours) / 1e3
+        area = cls.twice_area / 2e6
+        around = sum(length(c) for c in cls.contours) / 1e3
         got = resist.cleared_um2(
             np.array([x, y]), 0.2, 0.002 if beam[0] < 0.016 else 0.004
         )
@@ -148,7 +147,8 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
         process,
         keep=rows.take,
     )
-    made, want = rows.lens(source).diameters.diameter_um, source.diameters.diameter_um
+    made = rows.lens(source).diameters.diameter_um
+    want = source.diameters.diameter_um
     assert np.array_equal(made > 0, want > 0)
     assert (
         np.abs(made - want).max() < 2.1e-3
@@ -169,7 +169,8 @@ def places(plan):
     """(n, 3) x, y in um and class number of every pillar of the lens."""
     l = plan.lattices[0]
     rows, columns = np.nonzero(l.whole())
-    x, y = (l.x0 + columns * l.pitch) / 1e3, (l.y0 - rows * l.down) / 1e3
+    x = (l.x0 + columns * l.pitch) / 1e3
+    y = (l.y0 - rows * l.down) / 1e3
     return np.column_stack([x, y, l.whole()[rows, columns]])
 
 
@@ -193,16 +194,12 @@ def test_lone_pillars_of_any_shape_and_lattice_come_out_as_designed(tmp_path, ca
     plan = corrected(source, process, furnished=False)
     layout.write_gdsii(plan, tmp_path / "m.gds")
     handover.write_dose_table(plan, process, tmp_path / "doses.csv")
-    content, table = (
-        layout.read_gdsii(tmp_path / "m.gds"),
-        handover.read_dose_table(tmp_path / "doses.csv"),
-    )
+    content = layout.read_gdsii(tmp_path / "m.gds")
+    table = handover.read_dose_table(tmp_path / "doses.csv")
     found, d = verify(plan, content, table, process), source.diameters
     x, y, size = found.x_um, found.y_um, found.made_nm
-    row, column = (
-        np.rint(y / d.steps_um[1] + (len(d.y_um) - 1) / 2),
-        np.rint(x / d.steps_um[0] + (len(d.x_um) - 1) / 2),
-    )
+    row = np.rint(y / d.steps_um[1] + (len(d.y_um) - 1) / 2)
+    column = np.rint(x / d.steps_um[0] + (len(d.x_um) - 1) / 2)
     off = size - 1e3 * d.diameter_um[row.astype(int), column.astype(int)]
     # 1 nm of the step, 1 nm of the exposure, 0.3 nm between pixels and sums
     assert np.abs(off).max() < 2.3, (np.abs(off).max(), np.abs(off).mean())

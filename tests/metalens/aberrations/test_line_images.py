@@ -31,7 +31,8 @@ def _squared(case, angle, sensor_um, frequencies):
     (2,) sharpness of the line images; in air, without a stop."""
     rays, depth = CASES[case]
     lens = made(case)
-    phase, level = lens.phase_rad(), (lens.diameters.diameter_um > 0).astype(float)
+    phase = lens.phase_rad()
+    level = (lens.diameters.diameter_um > 0).astype(float)
     place, n = lens.diameters.x_um, 3 * len(lens.diameters.x_um)
     x, y = np.meshgrid(place, place)
     if math.isinf(depth):

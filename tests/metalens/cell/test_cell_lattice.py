@@ -38,7 +38,8 @@ def test_sites_around_one_fill_every_shell_that_is_near(lattice):
     within two of the shorter.
     """
     pitch = 0.43
-    along, up = np.array([pitch, 0.0]), np.array([0.0, lattice.ratio * pitch])
+    along = np.array([pitch, 0.0])
+    up = np.array([0.0, lattice.ratio * pitch])
     if lattice.kind == "hexagonal":
         up = np.array([pitch / 2, math.sqrt(0.75) * pitch])
     every = [
@@ -185,7 +186,8 @@ def test_the_pitch_named_for_light_aslant_in_azimuth_is_the_limit():
     - ky²), 4 % under n + kx.
     """
     angle, azimuth, wave, n = math.radians(60), 0.6, 0.85, 1.45
-    kx, ky = math.sin(angle) * math.cos(azimuth), math.sin(angle) * math.sin(azimuth)
+    kx = math.sin(angle) * math.cos(azimuth)
+    ky = math.sin(angle) * math.sin(azimuth)
     true = wave / (kx + math.sqrt(n**2 - ky**2))
 
     def cell(pitch_um):

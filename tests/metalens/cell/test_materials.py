@@ -508,7 +508,8 @@ def test_blends_and_offsets():
     """Bruggeman's equation holds for what comes out; ends of the share are the
     materials themselves.
     """
-    a, b = materials.index("TiO2", 0.6) ** 2, materials.index("SiO2", 0.6) ** 2
+    a = materials.index("TiO2", 0.6) ** 2
+    b = materials.index("SiO2", 0.6) ** 2
     e = materials.index(Blend("TiO2", "SiO2", 0.3), 0.6) ** 2
     assert abs(0.7 * (a - e) / (a + 2 * e) + 0.3 * (b - e) / (b + 2 * e)) < 1e-12
     assert abs(materials.index(Blend("TiO2", "SiO2", 1.0), 0.6) ** 2 - b) < 1e-12

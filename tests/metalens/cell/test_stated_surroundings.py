@@ -26,7 +26,8 @@ def slab_amplitude(n_in, n_slab, n_out, height_um, wavelength_um):
     """Power-normalised t of a slab at normal incidence (Born and Wolf, 1.6 (58))."""
     phase = 2 * math.pi / wavelength_um * n_slab * height_um
     t1, t2 = 2 * n_in / (n_in + n_slab), 2 * n_slab / (n_slab + n_out)
-    r1, r2 = (n_in - n_slab) / (n_in + n_slab), (n_slab - n_out) / (n_slab + n_out)
+    r1 = (n_in - n_slab) / (n_in + n_slab)
+    r2 = (n_slab - n_out) / (n_slab + n_out)
     t = t1 * t2 * cmath.exp(1j * phase) / (1 + r1 * r2 * cmath.exp(2j * phase))
     return math.sqrt(n_out / n_in) * t
 

@@ -52,10 +52,8 @@ def folder(tmp_path_factory):
     turned = GeometricPhase(
         0.23, 0.94, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None]
     )
-    cell, sweep = (
-        Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5)),
-        library.Sweep((0.94,), light="circular"),
-    )
+    cell = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))
+    sweep = library.Sweep((0.94,), light="circular")
     small = np.full(t.shape, 1e-3)
     about = (t, t * 0, small, small, np.empty((0, 5)), "rcwa", 1, proxy)
     made = library.PillarLibrary(

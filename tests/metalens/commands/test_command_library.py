@@ -260,11 +260,9 @@ substrate = "sapphire"
 
 
 def test_study_of_any_cell_within_a_process(tmp_path, capsys):
-    path, process, out = (
-        tmp_path / "study.toml",
-        tmp_path / "process.toml",
-        tmp_path / "study",
-    )
+    path = tmp_path / "study.toml"
+    process = tmp_path / "process.toml"
+    out = tmp_path / "study"
     path.write_text(ANY_CELL)
     process.write_text(
         "[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n"

@@ -189,10 +189,8 @@ def test_the_height_that_is_named_covers_a_turn_of_an_index_that_is_the_pillars_
         phase = 2 * np.pi / 0.85 * height_um * np.array([[1.72, 0.31]])
         return Proxy(phase, np.array([[0.9]]), (0.09, 0.32), (0.85, 0.85), 0.0, 0.0)
 
-    printed, cell = (
-        Limits(min_diameter_nm=90, min_gap_nm=80),
-        Cell(pitch_um=0.4, height_um=0.52, pillar=Index(3.2)),
-    )
+    printed = Limits(min_diameter_nm=90, min_gap_nm=80)
+    cell = Cell(pitch_um=0.4, height_um=0.52, pillar=Index(3.2))
     with pytest.raises(
         LensError,
         match=r"reach 0\.379 of a turn.*; take pillars of about 1\.37 um \(0\.52 um now",

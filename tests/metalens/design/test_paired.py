@@ -17,9 +17,12 @@ from metalens.library import Sweep
 from metalens.library.axes import AxesLibrary
 from metalens.view import standing
 
-X, Y, WAVELENGTH = np.linspace(0.1, 0.3, 81), np.linspace(0.12, 0.28, 65), 0.94
+X = np.linspace(0.1, 0.3, 81)
+Y = np.linspace(0.12, 0.28, 65)
+WAVELENGTH = 0.94
 CELL = Cell(0.4, 0.5, Index(3.6), shape=Rectangle())
-NEAR, FAR = Focus(WAVELENGTH, 37.0, math.inf), Focus(WAVELENGTH, 52.0, math.inf)
+NEAR = Focus(WAVELENGTH, 37.0, math.inf)
+FAR = Focus(WAVELENGTH, 52.0, math.inf)
 LEVELS = 0.95, 0.88
 LEAK = 0.11
 

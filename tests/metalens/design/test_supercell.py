@@ -247,10 +247,8 @@ def steep():
         phase.coef[None], np.array([[0.95]]), (NARROW, WIDE), (GREEN, GREEN), 0.0, 0.0
     )
     focus = Focus(GREEN, 7.5)
-    wanted, limits = (
-        design.phase_of(None, focus, radius_um=10.0),
-        design.Limits(1e3 * NARROW, 10.0),
-    )
+    wanted = design.phase_of(None, focus, radius_um=10.0)
+    limits = design.Limits(1e3 * NARROW, 10.0)
     return design.make(
         wanted, focus, aperture_um=20.0, cell=TITANIA, proxy=proxy, limits=limits
     )[0]
@@ -260,11 +258,9 @@ def _solved_whole(lens, polarization, *, count=12, aperture=0.8, harmonics=2):
     """Amplitude in the focus of a cylinder lens of ``count`` unlike pillars over what
     they give one by one, and the
     sines by which it turns light."""
-    cell, wave, place = (
-        lens.cell,
-        lens.wavelength_um,
-        np.arange(count) - (count - 1) / 2,
-    )
+    cell = lens.cell
+    wave = lens.wavelength_um
+    place = np.arange(count) - (count - 1) / 2
     width = count * cell.pitch_um
     focal = width / 2 / np.tan(np.arcsin(aperture))
     x = place * cell.pitch_um
@@ -298,7 +294,8 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     solved = [_solved_whole(steep, polarization) for polarization in ("x", "y")]
     cosine = np.sqrt(1 - solved[0][1] ** 2)
     fields = found.at(solved[0][1]) * np.stack([cosine**0.5, cosine**-0.5])
-    whole, predicted = np.mean([ratio for ratio, _ in solved]), fields.mean()
+    whole = np.mean([ratio for ratio, _ in solved])
+    predicted = fields.mean()
     assert np.angle(predicted) < -0.3  # late, not early
     assert np.angle(whole) == pytest.approx(np.angle(predicted), abs=0.06)
     assert abs(whole) == pytest.approx(abs(predicted), abs=0.12)

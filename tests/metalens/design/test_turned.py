@@ -17,7 +17,10 @@ from metalens.library import GeometricPhase, PillarLibrary, Proxy, Sweep
 from tests.referees.turned_pillar import isolated
 
 CELL = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5))
-T_X, T_Y, SIZE, WAVELENGTH = 0.97 * np.exp(0.7j), 0.95 * np.exp(-2.2j), 0.23, 0.94
+T_X = 0.97 * np.exp(0.7j)
+T_Y = 0.95 * np.exp(-2.2j)
+SIZE = 0.23
+WAVELENGTH = 0.94
 FOCUS = Focus(WAVELENGTH, 31.0, math.inf)
 
 

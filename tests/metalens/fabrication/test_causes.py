@@ -66,8 +66,11 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
         np.array(want), rel=1e-9
     )
     x, w = np.polynomial.legendre.leggauss(8)
-    r, turn = np.sqrt((x + 1) / 2)[:, None], np.arange(16) * math.pi / 8 + 0.1
-    u, v, weight = r * np.cos(turn), r * np.sin(turn), np.repeat(w / 2 / 16, 16)
+    r = np.sqrt((x + 1) / 2)[:, None]
+    turn = np.arange(16) * math.pi / 8 + 0.1
+    u = r * np.cos(turn)
+    v = r * np.sin(turn)
+    weight = np.repeat(w / 2 / 16, 16)
     basis = np.concatenate(
         [
             np.stack([np.ones_like(u), 2 * u, 2 * v]),
@@ -120,13 +123,11 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
     """By differences of exp(i k n_eff h): height, index (b of D √(n² - n0²)), a wall
     about half height.
     """
-    d, h, n, wall, k = (
-        np.array([0.11, 0.17, 0.23]),
-        0.62,
-        3.1,
-        math.radians(2.5),
-        2 * math.pi / 0.85,
-    )
+    d = np.array([0.11, 0.17, 0.23])
+    h = 0.62
+    n = 3.1
+    wall = math.radians(2.5)
+    k = 2 * math.pi / 0.85
     step = 1e-4
     up, down = effective(d + step, n), effective(d - step, n)
     here = effective(d, n)

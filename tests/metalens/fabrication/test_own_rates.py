@@ -36,11 +36,9 @@ ROWS = names_of_kind(ResponseError)
 
 
 def lens(cell=CELL, *, hand="", tilted_light=False):
-    phase, level, most = (
-        np.array([[4.6, 4.2, 0.5]]),
-        np.array([[0.83, 0.02]]),
-        0.2 if tilted_light else 0.0,
-    )
+    phase = np.array([[4.6, 4.2, 0.5]])
+    level = np.array([[0.83, 0.02]])
+    most = 0.2 if tilted_light else 0.0
     phase, level = (table[None] if tilted_light else table for table in (phase, level))
     proxy = Proxy(phase, level, (0.1, 0.3), (0.85, 0.85), 0.0, 0.0, max_angle_rad=most)
     sizes = np.full((3, 4), 0.2)
@@ -71,10 +69,8 @@ def changed(name, x):
         return dataclasses.replace(CELL, pillar=Index(2.6 + x)), SIZE
     if name == "turn_deg":
         return dataclasses.replace(CELL, shape=Rectangle(RATIO, ANGLE + x)), SIZE
-    width, length = (
-        SIZE + (name == "width_nm") * x,
-        RATIO * SIZE + (name == "length_nm") * x,
-    )
+    width = SIZE + (name == "width_nm") * x
+    length = RATIO * SIZE + (name == "length_nm") * x
     return dataclasses.replace(CELL, shape=Rectangle(length / width, ANGLE)), width
 
 

@@ -80,7 +80,8 @@ def _rest(plane):
     """Peak to peak of what a 5th-order polynomial leaves, over the mean."""
     y, x = np.mgrid[-1 : 1 : plane.shape[0] * 1j, -1 : 1 : plane.shape[1] * 1j]
     terms = np.stack([x**i * y**j for i in range(6) for j in range(6 - i)], -1)
-    terms, values = terms.reshape(-1, 21), plane.numpy().astype(float).ravel()
+    terms = terms.reshape(-1, 21)
+    values = plane.numpy().astype(float).ravel()
     left = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
     return np.ptp(left) / values.mean()
 
@@ -135,7 +136,8 @@ def _eye(seed):
     y, x = np.mgrid[-1 : 1 : FRAME * 1j, -1 : 1 : FRAME * 1j]
     f = np.hypot(np.fft.fftfreq(FRAME)[:, None], np.fft.fftfreq(FRAME)) + 0.3 / FRAME
     rough = np.fft.ifft2(np.fft.fft2(draw.standard_normal(x.shape)) / f).real
-    r, light = np.hypot(x - 0.15, y + 0.1), 0.55 + 0.12 * rough / rough.std()
+    r = np.hypot(x - 0.15, y + 0.1)
+    light = 0.55 + 0.12 * rough / rough.std()
     for radius, level in ((0.62, 0.9), (0.34, 0.45), (0.14, 0.05)):
         share = 1 / (1 + np.exp((r - radius) * FRAME / 3))
         light = light * (1 - share) + level * share

@@ -325,10 +325,8 @@ def test_information_is_formed_on_the_device_of_the_image():
     """A device without numbers stands for any that is not the processor: nothing may be
     brought from there.
     """
-    near, far = (
-        torch.empty(2, 30, 24, device="meta"),
-        torch.empty(2, 30, 24, device="meta"),
-    )
+    near = torch.empty(2, 30, 24, device="meta")
+    far = torch.empty(2, 30, 24, device="meta")
     setting = dict(step_um=5.0, sample_um=1.0, pixel_um=3.0)
     found = [
         fisher.axial_information(near, far, **setting),

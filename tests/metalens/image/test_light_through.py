@@ -30,10 +30,8 @@ def test_a_window_holds_what_a_round_aperture_sends_there(period, within):
     last three.
     """
     wave = SmoothWave(Focus(0.85, 2200.0, 20e3), 150.0)
-    at, depth = (
-        torch.zeros(1, 2, dtype=torch.float64),
-        torch.tensor([20e3], dtype=torch.float64),
-    )
+    at = torch.zeros(1, 2, dtype=torch.float64)
+    depth = torch.tensor([20e3], dtype=torch.float64)
     window = Window(7, 9.6, period=period)
     light = psfs(
         Optics(wave, Layers(), 2200.0),
@@ -83,10 +81,8 @@ def test_relative_illumination_is_that_of_light_on_the_stop(
     layers = Layers(front=front, stop=Stop(70.0, thick_um))
     optics = Optics(SmoothWave(Focus(0.85, 400.0, 2e3, layers), 300.0), layers, 400.0)
     slope = math.tan(math.radians(25))
-    x_um, depths = (
-        torch.tensor([4.0, 400 * slope], dtype=torch.float64),
-        torch.tensor([depth_um], dtype=torch.float64),
-    )
+    x_um = torch.tensor([4.0, 400 * slope], dtype=torch.float64)
+    depths = torch.tensor([depth_um], dtype=torch.float64)
     at = torch.stack([x_um, torch.zeros(2, dtype=torch.float64)], -1)
     window = Window(81, 4.0)
     light = psfs(optics, at, depths_um=depths, wavelength_um=0.85, window=window)

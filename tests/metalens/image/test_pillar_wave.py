@@ -103,7 +103,8 @@ def test_the_image_holds_the_neighbours_that_the_lens_holds(lens):
     test_psfs_of_gathered_pillars_are_those_of_all_pillars(
         replace(lens, neighbours=ROWS), 9.0
     )
-    at, few = torch.tensor([[31.0, -7.0]], dtype=torch.float64), torch.tensor([4e3])
+    at = torch.tensor([[31.0, -7.0]], dtype=torch.float64)
+    few = torch.tensor([4e3])
     with_, without = (
         psfs(
             Optics(PillarWave(one), Layers(), DISTANCE),
@@ -129,7 +130,8 @@ def test_the_gradient_to_a_pillar_is_that_of_differences(lens):
 def _differentiates(lens):
     diameter = torch.from_numpy(lens.diameters.diameter_um).clone()
     diameter = torch.where(diameter > 0, diameter.clamp(0.082, 0.318), 0.0)
-    at, window = torch.tensor([[12.0, -7.0]], dtype=torch.float64), Window(9, STEP)
+    at = torch.tensor([[12.0, -7.0]], dtype=torch.float64)
+    window = Window(9, STEP)
     weight = torch.linspace(0.3, 1.9, 81).reshape(9, 9)
     step = torch.zeros_like(diameter)
     step[150:200, 90:170] = (

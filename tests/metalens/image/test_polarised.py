@@ -52,7 +52,8 @@ MIDDLE = (8.0, -4.5)
 
 
 def _psf(optics, place, depth, components, *, flux):
-    at, depths = torch.tensor([place], dtype=torch.float64), torch.tensor([depth])
+    at = torch.tensor([place], dtype=torch.float64)
+    depths = torch.tensor([depth])
     window = Window(WINDOW, STEP, True, components, flux)
     light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[
         0, 0
@@ -110,7 +111,8 @@ def test_what_the_flux_adds_to_a_scalar_is_that_of_plane_waves():
     optics = Optics(
         SmoothWave(Focus(WAVE, distance, FOCUS), RADIUS), Layers(), distance
     )
-    at, depths = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([4000.0])
+    at = torch.zeros(1, 2, dtype=torch.float64)
+    depths = torch.tensor([4000.0])
 
     def seen(components):
         window = Window(count, step, True, components)
@@ -165,10 +167,8 @@ def test_the_flux_of_two_rays_is_poyntings():
     b = np.stack([p, q, np.sqrt(1 - p**2 - q**2)])
     a = torch.tensor([0.2, -0.1, math.sqrt(0.95)], dtype=torch.float64)
     electric = transmitted_polarization(a, torch.from_numpy(b)).numpy().reshape(2, 3, 4)
-    level, places = (
-        draw.normal(size=4) + 1j * draw.normal(size=4),
-        draw.uniform(-3, 3, (7, 2)),
-    )
+    level = draw.normal(size=4) + 1j * draw.normal(size=4)
+    places = draw.uniform(-3, 3, (7, 2))
     fields = of_flux(torch.from_numpy(electric.reshape(6, 4)), torch.from_numpy(b))
     made = dominant_components(fields, torch.from_numpy(np.abs(level)), 4)
     for place in places:
@@ -265,10 +265,8 @@ def test_turned_light_keeps_its_power_and_is_across_its_ray():
     """|E|² b_z of both polarisations adds up to 2, E·b to 0; straight on it is the
     light that came.
     """
-    a, b = (
-        torch.tensor([0.3, -0.2, math.sqrt(0.87)]),
-        torch.tensor([-0.1, 0.4, math.sqrt(0.83)]),
-    )
+    a = torch.tensor([0.3, -0.2, math.sqrt(0.87)])
+    b = torch.tensor([-0.1, 0.4, math.sqrt(0.83)])
     found = transmitted_polarization(a.double(), b.double()).reshape(2, 3)
     assert float((found**2).sum() * b[2]) == pytest.approx(2, rel=1e-6)
     assert float((found @ b.double()).abs().max()) < 1e-6
@@ -291,10 +289,8 @@ def test_the_gradient_of_both_polarisations_is_that_of_differences():
             LENS,
             added_rad=lambda x, y: c[0] * (x / RADIUS) ** 3 + c[1] * x * y / RADIUS**2,
         )
-        at, depths = (
-            torch.tensor([[0.7, -0.5]], dtype=torch.float64),
-            torch.tensor([4000.0]),
-        )
+        at = torch.tensor([[0.7, -0.5]], dtype=torch.float64)
+        depths = torch.tensor([4000.0])
         light = psfs(
             Optics(added, Layers(), DISTANCE),
             at,
@@ -359,10 +355,8 @@ def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
     a flux of 1 a polarisation,
     near the normal, where s and p are alike to p²."""
     none = torch.zeros(0)
-    aside, middle = (
-        torch.linspace(-1.4, 1.4, 29, dtype=torch.float64),
-        torch.tensor([0.2, -0.1], dtype=torch.float64),
-    )
+    aside = torch.linspace(-1.4, 1.4, 29, dtype=torch.float64)
+    middle = torch.tensor([0.2, -0.1], dtype=torch.float64)
     rays = Rays(none, none, none, none, none, none, aside, middle, none, none)
     found = polarisation_factors(
         rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True

@@ -64,7 +64,8 @@ def test_the_light_of_the_aperture_is_its_area_from_every_side(angle_deg):
     """Nodes across the rim count by the share of them that is inside: dx dy = d² dq /
     (1 - q²)² sums to π R².
     """
-    pupil, slope = Pupil(150.0, 2200.0, 0.85, 128), math.tan(math.radians(angle_deg))
+    pupil = Pupil(150.0, 2200.0, 0.85, 128)
+    slope = math.tan(math.radians(angle_deg))
     seen = pupils.view_pupil(pupil, pupils.Field(math.radians(angle_deg), 0.4), 20e3)
     away2 = (seen.x_um - 2200 * slope * math.cos(0.4)) ** 2 + (
         seen.y_um - 2200 * slope * math.sin(0.4)

@@ -97,7 +97,8 @@ def _traced(field_um, order, rng):
     """(x, y) places on the sensor of rays that pass a hole before the lens, over those
     that are on the hole.
     """
-    tangents, across = [a / D for a in field_um], rng.uniform(-1, 1, (2, 200_000))
+    tangents = [a / D for a in field_um]
+    across = rng.uniform(-1, 1, (2, 200_000))
     across = across[:, np.hypot(*across) < 1] * HOLE + np.array(MIDDLE)[:, None]
     source = -DEPTH * np.array(tangents)[:, None]
     pillar = source + (across - source) * DEPTH / (DEPTH - THICK)

@@ -49,7 +49,8 @@ REFEREE = Referee(
 
 def _depths():
     rows, columns = (n + 2 * GRID.margin for n in GRID.samples)
-    down, across = np.linspace(0, 1, rows)[:, None], np.linspace(0, 1, columns)
+    down = np.linspace(0, 1, rows)[:, None]
+    across = np.linspace(0, 1, columns)
     return 1 / (1 / 3000 + (1 / 9000 - 1 / 3000) * (0.1 + 0.5 * down + 0.3 * across))
 
 
@@ -195,15 +196,11 @@ def test_wide_psfs_to_second_order_of_their_width():
     """Far out of focus 25° off the axis the light is 80 um wide, a third of the
     distance to the lens: the flux of the
     second order takes what the first leaves down to rim and fold, 3e-3."""
-    wave, place, depth = (
-        SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS),
-        (100.0, -52.0),
-        300.0,
-    )
-    optics, at = (
-        Optics(wave, Layers(), DISTANCE),
-        torch.tensor([place], dtype=torch.float64),
-    )
+    wave = SmoothWave(Focus(0.85, DISTANCE, FOCUS), RADIUS)
+    place = (100.0, -52.0)
+    depth = 300.0
+    optics = Optics(wave, Layers(), DISTANCE)
+    at = torch.tensor([place], dtype=torch.float64)
     wide = Referee(
         radius=RADIUS,
         distance=DISTANCE,
@@ -345,10 +342,8 @@ def test_the_gradient_to_the_depth_of_sources_is_that_of_plane_waves(optics):
     0.06; through
     the eleven kernels of the image it was 0.10."""
     draw, size, step = np.random.default_rng(11), (23, 21), 2e-6
-    light, places = (
-        np.zeros(size),
-        list(zip(draw.integers(7, 16, 5), draw.integers(7, 14, 5), strict=True)),
-    )
+    light = np.zeros(size)
+    places = list(zip(draw.integers(7, 16, 5), draw.integers(7, 14, 5), strict=True))
     for place in places:
         light[place] = draw.uniform(0.5, 1.5)
     weight = draw.standard_normal((5, *GRID.samples))

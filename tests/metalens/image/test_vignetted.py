@@ -17,7 +17,12 @@ from metalens.optics import Layers, Stop
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
 
-WAVE, DISTANCE, RADIUS, DEPTH, STEP, WINDOW = 0.85, 240.0, 50.0, 5000.0, 9.6, 9
+WAVE = 0.85
+DISTANCE = 240.0
+RADIUS = 50.0
+DEPTH = 5000.0
+STEP = 9.6
+WINDOW = 9
 HOLE, GAP, MIDDLE = 25.0, 60.0, (3.0, -2.0)
 FIELD = (
     math.radians(35.0),
@@ -183,7 +188,10 @@ def test_derivatives_of_light_through_a_stop_from_the_side_are_differences_of_pl
     / N = 0.015 short behind the
     stop's edge, its shadow 0.009, second order about the light 0.01, differences 1e-5.
     """
-    place, depth, strengths, step = (105.0, -28.0), 3600.0, (0.7, -0.5), 1e-3
+    place = (105.0, -28.0)
+    depth = 3600.0
+    strengths = (0.7, -0.5)
+    step = 1e-3
 
     def added(a, b):
         return lambda x, y: (
@@ -253,15 +261,11 @@ def test_an_image_deep_in_the_shadow_is_prepared_to_its_own_light():
     light, samples more than half a
     window from where a PSF's light lands were dark, a third of this image's light, and
     it erred by 0.2."""
-    lens, layers = (
-        SmoothWave(Focus(WAVE, 120.0, 3000.0), 25.0),
-        Layers(stop=Stop(20.0, 30.0, (1.5, -1.0))),
-    )
-    grid, step, middle = (
-        Grid((1, 3), 4.8, (1500.0, 4500.0), margin=4, window=WINDOW),
-        4.8,
-        120.0,
-    )
+    lens = SmoothWave(Focus(WAVE, 120.0, 3000.0), 25.0)
+    layers = Layers(stop=Stop(20.0, 30.0, (1.5, -1.0)))
+    grid = Grid((1, 3), 4.8, (1500.0, 4500.0), margin=4, window=WINDOW)
+    step = 4.8
+    middle = 120.0
     made = imager(
         lens, grid, field=(math.radians(45.0), 0.0), tolerance=0.1, layers=layers
     )

@@ -14,12 +14,11 @@ from metalens.core.errors import LensError
 from metalens.lens import DiameterMap, Lens, NeighbourRows
 from metalens.library import Proxy
 
-SINE, ASIDE = np.array([0.5, 0.25, 0.6, 0.35]), np.array([False, False, True, True])
+SINE = np.array([0.5, 0.25, 0.6, 0.35])
+ASIDE = np.array([False, False, True, True])
 COVER = 1.3
-A, B = (
-    np.array([[0.2 - 0.3j, 0.1j], [0.05 - 0.2j, -0.1]]),
-    np.array([[-0.4, 0.3], [-0.2j, 0.1 + 0.2j]]),
-)
+A = np.array([[0.2 - 0.3j, 0.1j], [0.05 - 0.2j, -0.1]])
+B = np.array([[-0.4, 0.3], [-0.2j, 0.1 + 0.2j]])
 # (along the lattice and its diagonal, field along and across the slope)
 
 

@@ -13,11 +13,9 @@ from metalens.lens import DiameterMap, Lens, TwoSizeTable
 from metalens.library import Proxy
 
 DRAW = np.random.default_rng(23)
-X, Y, WAVES = (
-    0.1 + 0.02 * np.arange(4),
-    0.15 + 0.05 * np.arange(3),
-    np.array([0.78, 0.85]),
-)
+X = 0.1 + 0.02 * np.arange(4)
+Y = 0.15 + 0.05 * np.arange(3)
+WAVES = np.array([0.78, 0.85])
 T = DRAW.uniform(0.3, 1.6, (2, 4, 3, 2)) * np.exp(
     1j * DRAW.uniform(-3, 3, (2, 4, 3, 2))
 )
@@ -52,7 +50,8 @@ def test_pillars_of_two_sizes_have_phase_and_level_of_their_entries(
     """Some entries are above 1 by what a table may err: no pillar sends on more light
     than it gets.
     """
-    lens, t = two_sizes(light), T[number, ROW, COLUMN, "xy".index(light)]
+    lens = two_sizes(light)
+    t = T[number, ROW, COLUMN, "xy".index(light)]
     t[GAP] = 0
     assert (np.abs(t) > 1).any()
     level = lens.transmission(wave)
@@ -95,7 +94,8 @@ def test_a_turned_pillar_adds_twice_its_turn_by_the_hand_of_the_light(hand, turn
         0.01,
         0.01,
     )
-    size, turn = DRAW.uniform(0.08, 0.3, (5, 6)), DRAW.uniform(0, math.pi, (5, 6))
+    size = DRAW.uniform(0.08, 0.3, (5, 6))
+    turn = DRAW.uniform(0, math.pi, (5, 6))
     size[GAP] = 0
     cell = Cell(0.4, shape=Rectangle(0.6))
     lens = Lens(

@@ -94,17 +94,16 @@ def test_turned_pillars_add_twice_their_turn():
 
 
 def test_pillars_of_two_sizes_have_the_entries_of_their_table():
-    draw, x, y = (
-        np.random.default_rng(4),
-        np.array([0.12, 0.16, 0.2]),
-        np.array([0.11, 0.19]),
-    )
+    draw = np.random.default_rng(4)
+    x = np.array([0.12, 0.16, 0.2])
+    y = np.array([0.11, 0.19])
     t = (
         0.9
         * np.exp(1j * draw.uniform(-3, 3, (1, 3, 2, 2)))
         * draw.uniform(0.5, 1, (1, 3, 2, 2))
     )
-    row, column = draw.integers(0, 3, (4, 5)), draw.integers(0, 2, (4, 5))
+    row = draw.integers(0, 3, (4, 5))
+    column = draw.integers(0, 2, (4, 5))
     sizes, lengths = x[row], y[column]
     sizes[2, 1] = lengths[2, 1] = 0
     table = TwoSizeTable(np.array([WAVE]), x, y, t, (210.0, 900.0))

@@ -60,10 +60,8 @@ def test_a_pillar_between_the_sites_and_turns_that_do_not_fit_are_refused():
 
 def turned(hand="left"):
     rng = np.random.default_rng(8)
-    d, angle = (
-        np.where(rng.random((6, 9)) < 0.8, 0.21, 0.0),
-        rng.uniform(0, np.pi, (6, 9)),
-    )
+    d = np.where(rng.random((6, 9)) < 0.8, 0.21, 0.0)
+    angle = rng.uniform(0, np.pi, (6, 9))
     cell = Cell(PITCH, shape=Rectangle(0.6))
     return Lens(
         DiameterMap(d, PITCH, angle_rad=angle),

@@ -10,11 +10,9 @@ from metalens.core.errors import DomainError, LensError
 from metalens.lens.record import TwoSizeTable
 
 DRAW = np.random.default_rng(19)
-WAVES, X, Y = (
-    np.array([0.78, 0.85]),
-    0.1 + 0.02 * np.arange(5),
-    0.15 + 0.05 * np.arange(3),
-)
+WAVES = np.array([0.78, 0.85])
+X = 0.1 + 0.02 * np.arange(5)
+Y = 0.15 + 0.05 * np.arange(3)
 T = DRAW.normal(size=(2, 5, 3, 2)) + 1j * DRAW.normal(size=(2, 5, 3, 2))
 
 
@@ -24,7 +22,8 @@ def pairs():
 
 @pytest.mark.parametrize("light", ["x", "y"])
 def test_every_pillar_has_its_entry_and_no_pillar_has_none(light):
-    row, column = DRAW.integers(0, 5, (4, 6)), DRAW.integers(0, 3, (4, 6))
+    row = DRAW.integers(0, 5, (4, 6))
+    column = DRAW.integers(0, 3, (4, 6))
     x, y = (
         X[row] + 0.04 * 0.02,
         Y[column] - 0.04 * 0.05,

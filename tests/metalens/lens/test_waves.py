@@ -42,7 +42,8 @@ def ray(behind, wavelength, p):
     """(field of the ray alone, its reach, kL) by Snell's law and Fresnel's power."""
     k, layers = 2 * math.pi / wavelength, behind.layers
     length = sum(n * n * t / math.sqrt(n * n - p * p) for n, t in layers)
-    out, area = media.lateral_reach(behind, p), media.area_spreading(behind, p)
+    out = media.lateral_reach(behind, p)
+    area = media.area_spreading(behind, p)
     alone = (
         -1j
         * k
@@ -90,10 +91,8 @@ def test_one_medium_needs_no_series():
 
 def test_faces_between_equal_indices_change_nothing():
     k, w = 2 * math.pi / 0.85, np.array([0.1, 0.4])
-    one, other = (
-        Media((1.3, 1.6), (10.0, 20.0)),
-        Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0)),
-    )
+    one = Media((1.3, 1.6), (10.0, 20.0))
+    other = Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0))
     assert plane_wave_correction(one, k, w) == pytest.approx(
         plane_wave_correction(other, k, w), rel=1e-13
     )
@@ -103,7 +102,8 @@ def test_the_error_is_told_where_films_are_too_thin_for_it():
     """A steep ray through two um: the error is 1e-6 there and the estimate above it, by
     less than a thousand.
     """
-    behind, wavelength = Media((1.0, 2.1, 1.72, 1.4), (1.0, 0.2, 0.6, 0.2)), 0.85
+    behind = Media((1.0, 2.1, 1.72, 1.4), (1.0, 0.2, 0.6, 0.2))
+    wavelength = 0.85
     p = 0.6
     alone, out, turns = ray(behind, wavelength, p)
     found = saddle_correction(behind, 2 * math.pi / wavelength, 1.2 * out)

@@ -115,7 +115,9 @@ def test_weak_pillars_are_a_film_of_the_mean_permittivity(shape):
     """Beyond it terms of second order in the contrast, depolarisation among them: a
     quarter at half the contrast.
     """
-    x, y, share = 0.21, 0.13, {"rectangle": 1.0, "ellipse": math.pi / 4}[shape.kind]
+    x = 0.21
+    y = 0.13
+    share = {"rectangle": 1.0, "ellipse": math.pi / 4}[shape.kind]
     filled, off = share * x * y / 0.35**2, []
     for contrast in (0.2, 0.1):
         cell = dataclasses.replace(

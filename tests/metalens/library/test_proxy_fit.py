@@ -44,7 +44,8 @@ def synthetic(
     bar=1e-4,
 ) -> PillarLibrary:
     d = np.unique([*np.linspace(0.06, 0.22, samples), *beside])
-    w, a = np.array(waves)[None, :, None], np.radians(angles)[:, None, None]
+    w = np.array(waves)[None, :, None]
+    a = np.radians(angles)[:, None, None]
     t = level_of(d, w, a) * np.exp(1j * phase_of(d, w, a))
     t = t if factor is None else t * factor(d)
     t = np.stack([t]) if angles == (0.0,) else np.stack([t, t])
@@ -333,11 +334,9 @@ def test_phase_is_continuous_over_wavelength_and_angle():
     stretch = proxy_fit.longest_monotonic_branch(
         synthetic(waves, angles), ProxyTolerances()
     )
-    d, w, a = (
-        stretch.diameter_um,
-        np.array(waves)[None, :, None],
-        np.radians(angles)[:, None, None],
-    )
+    d = stretch.diameter_um
+    w = np.array(waves)[None, :, None]
+    a = np.radians(angles)[:, None, None]
     off = stretch.phase - phase_of(d, w, a)
     assert np.abs(off - off[0, 0, 0]).max() < 1e-9
 

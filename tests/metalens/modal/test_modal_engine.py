@@ -147,13 +147,15 @@ def test_homogeneous_layer_of_any_permittivity(n, k):
 def test_oblique_homogeneous_layer_is_fresnel(polarization):
     angle = math.radians(20)
     layer = cell(0.7, n=2.0, between=2.0)
-    k0, kx = 2 * math.pi / WAVELENGTH, 2 * math.pi / WAVELENGTH * math.sin(angle)
+    k0 = 2 * math.pi / WAVELENGTH
+    kx = 2 * math.pi / WAVELENGTH * math.sin(angle)
     kz = [np.sqrt((k0 * n) ** 2 - kx**2 + 0j) for n in (1.4525, 2.0, 1.0)]
     y = [
         k / n**2 if polarization == "p" else k
         for k, n in zip(kz, (1.4525, 2.0, 1.0), strict=True)
     ]
-    r1, r2 = (y[0] - y[1]) / (y[0] + y[1]), (y[1] - y[2]) / (y[1] + y[2])
+    r1 = (y[0] - y[1]) / (y[0] + y[1])
+    r2 = (y[1] - y[2]) / (y[1] + y[2])
     t12 = (
         4 * np.sqrt(y[0] * y[1]) / (y[0] + y[1]) * np.sqrt(y[1] * y[2]) / (y[1] + y[2])
     )
@@ -224,7 +226,8 @@ def test_polarisations_are_equal_at_normal_incidence():
 def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
     rng = np.random.default_rng(2)
     a = np.linalg.qr(rng.normal(size=(2, 2)) + 1j * rng.normal(size=(2, 2)))[0]
-    u, v = a @ a.T, a @ np.diag(np.exp(1j * np.array([0.02, -0.05]))) @ a.T
+    u = a @ a.T
+    v = a @ np.diag(np.exp(1j * np.array([0.02, -0.05]))) @ a.T
     mean = geometric_mean(u, v)
     assert np.abs(mean.conj().T @ mean - np.eye(2)).max() < 1e-14
     assert (

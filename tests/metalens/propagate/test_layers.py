@@ -178,10 +178,8 @@ def test_the_error_of_a_scalar_behind_films_is_told(
     incident = case.wavenumber * from_source(case, x, y[:, None], case.tangents, 0.0)
     middle = case.centre_um[0] - offset[0], case.centre_um[1] - offset[1]
     phase = -incident - 0.9 * case.wavenumber * to_sensor(case, x, y[:, None], middle)
-    light, at = (
-        (level * np.exp(1j * (phase + incident))).ravel(),
-        np.stack(np.meshgrid(x, y), -1).reshape(-1, 2),
-    )
+    light = (level * np.exp(1j * (phase + incident))).ravel()
+    at = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     wy, wx = case.window_um
     points = np.stack(
         np.meshgrid(wx + case.centre_um[0], wy + case.centre_um[1]), -1
@@ -210,7 +208,8 @@ def test_a_source_behind_a_film_has_the_phase_of_its_plane_waves():
         * np.array(tangents)
         / np.hypot(*tangents)
     )
-    x, y = np.array([0.4, -7.0, 12.0, 3.0]), np.array([1.2, 5.5, -9.0, 14.0])
+    x = np.array([0.4, -7.0, 12.0, 3.0])
+    y = np.array([1.2, 5.5, -9.0, 14.0])
     radii = np.hypot(x + foot[0], y + foot[1])
     want = referee.source_phase(
         [(1.0, 0.0), (1.45, 120.0)], depth, np.hypot(*foot), radii, WAVELENGTH
@@ -275,7 +274,8 @@ def test_derivatives_in_distance_and_window_centre(step):
     x, y, X, Y = 6.0, -9.0, 3.1, -4.7
 
     def log_kernel(change):
-        thickness, centre = list(case.behind.thickness_um), list(case.centre_um)
+        thickness = list(case.behind.thickness_um)
+        centre = list(case.centre_um)
         if step == 0:
             thickness[0] += change
         else:

@@ -43,7 +43,8 @@ def test_one_pillar_is_a_spherical_wavelet():
 
 def test_sum_agrees_with_a_plain_loop_off_axis():
     random = np.random.default_rng(1)
-    phase, level = random.uniform(-9, 9, (4, 7)), random.uniform(0, 1, (4, 7))
+    phase = random.uniform(-9, 9, (4, 7))
+    level = random.uniform(0, 1, (4, 7))
     ax, ay, z = 0.3, -0.2, 900.0
     got = propagate.exact(phase, level, depths_um=z, angle_rad=(ax, ay), **GEOMETRY)
     source = np.array([-z * np.tan(ax), -z * np.tan(ay), -z])
@@ -54,7 +55,8 @@ def test_sum_agrees_with_a_plain_loop_off_axis():
         )
         for j, i in np.ndindex(4, 7):
             pillar = np.array([(i - 3) * PITCH, (j - 1.5) * PITCH, 0])
-            s, r = np.linalg.norm(pillar - source), np.linalg.norm(X - pillar)
+            s = np.linalg.norm(pillar - source)
+            r = np.linalg.norm(X - pillar)
             light = level[j, i] * np.exp(
                 1j * (phase[j, i] + K * (s - np.linalg.norm(source)))
             )

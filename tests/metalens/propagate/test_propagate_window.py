@@ -39,10 +39,8 @@ def lens(shape, *, kind="focus", distance=120.0, source=1300.0, pitch=PITCH, see
     )
     level = (r2 <= max(x[-1], y[-1], pitch) ** 2).astype(float)
     if kind == "noisy":
-        phase, level = (
-            phase + random.normal(0, 0.3, shape),
-            level * random.uniform(0.7, 1, shape),
-        )
+        phase = phase + random.normal(0, 0.3, shape)
+        level = level * random.uniform(0.7, 1, shape)
     if kind == "random":
         phase = random.uniform(-np.pi, np.pi, shape)
     if kind == "helix":

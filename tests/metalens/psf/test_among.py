@@ -178,10 +178,8 @@ def test_the_flux_of_a_psf_is_poyntings_of_plane_waves():
     axis = (np.arange(count) - (count - 1) / 2) * PITCH
     x, y = axis, axis[:, None]
     path = np.sqrt(x**2 + y**2 + distance**2)
-    level, phase = (
-        (np.hypot(x + 0.7, y) < 18.0) * 1.0,
-        -2 * np.pi / WAVE * (path - distance) + 1.5 * x * y**2 / 18**3,
-    )
+    level = (np.hypot(x + 0.7, y) < 18.0) * 1.0
+    phase = -2 * np.pi / WAVE * (path - distance) + 1.5 * x * y**2 / 18**3
     light = level * np.exp(1j * phase) * vectorial.turned(x, y, distance)
     want = vectorial.flux(
         light, step=PITCH, wavelength=WAVE, distance=distance, count=480
@@ -260,7 +258,8 @@ def test_factors_made_once_serve_as_the_rows_do():
 
 
 def test_the_factor_is_one_formula_for_numpy_and_torch():
-    sine, aside = np.array([0.0, 0.2, 0.55, 0.9]), np.array([0.3, 0.0, 1.0, 0.5])
+    sine = np.array([0.0, 0.2, 0.55, 0.9])
+    aside = np.array([0.3, 0.0, 1.0, 0.5])
     for field in (0, 1):
         got = ROWS.of_field(field, torch.tensor(sine), torch.tensor(aside))
         assert got.numpy() == pytest.approx(

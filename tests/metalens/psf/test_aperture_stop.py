@@ -105,10 +105,8 @@ def _lit(
     across, down = np.arange(41)[::2] - 20.0, np.arange(41)[::4] - 20.0
     out = np.empty((11, 21))
     for row, below in enumerate(down):
-        dx, dy = (
-            (SENSOR * math.tan(window[0]) + across)[:, None] - x,
-            SENSOR * math.tan(window[1]) + below - y,
-        )
+        dx = (SENSOR * math.tan(window[0]) + across)[:, None] - x
+        dy = SENSOR * math.tan(window[1]) + below - y
         r = np.sqrt(dx * dx + dy * dy + SENSOR**2)
         out[row] = np.abs((light * np.exp(1j * K * r) / r**2).sum(1)) ** 2
     return out
@@ -216,10 +214,8 @@ def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(
         np.rint(np.mod(phase / (2 * np.pi), 1.0) * steps).astype(int) % steps
         for phase in (PHASE, beside)
     ]
-    axis, turn = (
-        0.1 + 0.005 * np.arange(steps),
-        np.exp(2j * np.pi * np.arange(steps) / steps),
-    )
+    axis = 0.1 + 0.005 * np.arange(steps)
+    turn = np.exp(2j * np.pi * np.arange(steps) / steps)
     table = np.stack([turn[:, None] + 0 * turn, 0.8 * turn + 0 * turn[:, None]], -1)[
         None
     ]
@@ -322,10 +318,8 @@ def test_the_middle_of_a_blur_knows_how_wide_it_is(
     )
     assert found.budget is not None
     assert found.budget.outside > 0.75
-    light, want = (
-        found.intensity[0, ::4, ::2],
-        _summed(angle, depth_um, stop_um, thick_um)[3:8, 6:15],
-    )
+    light = found.intensity[0, ::4, ::2]
+    want = _summed(angle, depth_um, stop_um, thick_um)[3:8, 6:15]
     error = _apart(light / light.sum(), want / want.sum())
     assert found.budget.stop / 5 < error < found.budget.stop
 

@@ -17,16 +17,12 @@ def summed(phase, level, case):
     """
     y, x = (v.astype(LONG) for v in case.pillars_um)
     x, y = (g[level != 0] for g in np.meshgrid(x, y))
-    k, d, inverse = (
-        LONG(case.wavenumber),
-        LONG(case.sensor_distance_um),
-        LONG(case.inverse_depths_per_um[0]),
-    )
+    k = LONG(case.wavenumber)
+    d = LONG(case.sensor_distance_um)
+    inverse = LONG(case.inverse_depths_per_um[0])
     tx, ty = (LONG(t) for t in case.tangents)
-    top, steep = (
-        (x * x + y * y) * inverse + 2 * (x * tx + y * ty),
-        1 + tx * tx + ty * ty,
-    )
+    top = (x * x + y * y) * inverse + 2 * (x * tx + y * ty)
+    steep = 1 + tx * tx + ty * ty
     given = phase[level != 0].astype(LONG) + k * top / (
         np.sqrt(top * inverse + steep) + np.sqrt(steep)
     )

@@ -143,7 +143,8 @@ def test_light_is_kept(kind):
     """Parseval over one period of the lattice; a coarse lattice tells no direction
     beyond its own diffraction.
     """
-    phase, inside = RNG.uniform(0, 6.28, (60, 84)), np.ones((60, 84), bool)
+    phase = RNG.uniform(0, 6.28, (60, 84))
+    inside = np.ones((60, 84), bool)
     if kind == "hexagonal":
         inside = (np.arange(60)[:, None] + np.arange(84)) % 2 == 0
     found = far_field(

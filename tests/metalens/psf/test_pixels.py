@@ -72,7 +72,8 @@ def test_light_in_pixels_is_of_sum_one_and_its_energy_what_falls_on_them():
 
 
 def test_a_pitch_that_is_trained_keeps_its_derivative():
-    stack, pitch = made(), torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
+    stack = made()
+    pitch = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
 
     def weighed(pitch_um):
         found = on_pixels(stack, pitch_um=pitch_um, count=9)

@@ -47,10 +47,8 @@ def test_a_coarse_window_gives_the_light_on_its_cells():
     """NA 0.55 on steps of 0.75 um: against 9 x 9 samples of the exact sum in every cell
     (midpoint rule: 3e-3).
     """
-    maps, about = (
-        lens(32.0, bend=4.0),
-        geometry(32.0, tolerance=1e-3, window_um=6.0, samples=8),
-    )
+    maps = lens(32.0, bend=4.0)
+    about = geometry(32.0, tolerance=1e-3, window_um=6.0, samples=8)
     stack = psf.psf_stack(*maps, **about)
     exact_about = {n: v for n, v in about.items() if n != "tolerance"} | dict(
         samples=8 * 9

@@ -35,7 +35,8 @@ def stack():
 
 def test_tiff_pages_are_the_psfs_and_the_description_says_which(stack):
     with tifffile.TiffFile(io.BytesIO(psf_export.write_tiff(stack))) as file:
-        pages, about = file.asarray(), json.loads(file.pages[0].description)
+        pages = file.asarray()
+        about = json.loads(file.pages[0].description)
     assert pages.dtype == np.float32
     assert about["axes"] == "angle depth y x"
     assert np.array_equal(pages.reshape(about["shape"]), stack.intensity.astype("f4"))

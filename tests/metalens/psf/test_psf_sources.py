@@ -91,7 +91,10 @@ def test_plane_waves_land_where_their_direction_points_in_a_rectangle_beside_the
     """Steps of 0.6 um are within Nyquist's 1/(2·0.26/0.85) um; the window: 95
     tan(angle) off axis, and the offset.
     """
-    angle, offset, window, samples = (0.21, -0.13), (1.7, -0.9), (18.0, 10.8), (30, 18)
+    angle = (0.21, -0.13)
+    offset = (1.7, -0.9)
+    window = (18.0, 10.8)
+    samples = (30, 18)
     stack = psf.psf_stack(
         *lens(),
         **GEOMETRY,

@@ -34,10 +34,8 @@ def plain(phase, level, kind, *, middle=False):
     """(y, x) light of sum 1 of both polarisations; middle: rays all as they go to the
     window's middle.
     """
-    k, unit = (
-        2 * np.pi / WAVE,
-        np.array([*TANGENTS, 1]) / np.sqrt(1 + TANGENTS @ TANGENTS),
-    )
+    k = 2 * np.pi / WAVE
+    unit = np.array([*TANGENTS, 1]) / np.sqrt(1 + TANGENTS @ TANGENTS)
     y, x = (
         g.ravel()
         for g in np.meshgrid(
@@ -105,7 +103,8 @@ def test_what_rays_to_the_middle_leave_out_is_in_the_budget(kind, method):
         tolerance=1e-6,
     ).numpy()
     assert made.reason.startswith(method)
-    held, true = plain(phase, level, kind, middle=True), plain(phase, level, kind)
+    held = plain(phase, level, kind, middle=True)
+    true = plain(phase, level, kind)
     assert (
         np.linalg.norm(made.intensity[0] - held) / np.linalg.norm(held) < 1e-6
     )  # what was asked for

@@ -130,5 +130,6 @@ def test_paths_to_a_window_differ_as_those_from_the_nearest_and_the_farthest_pil
     assert found[found.shape[0] // 2, found.shape[1] // 2] == pytest.approx(
         want, rel=0.03
     )
-    down, across = np.ptp(found, axis=0).mean(), np.ptp(found, axis=1).mean()
+    down = np.ptp(found, axis=0).mean()
+    across = np.ptp(found, axis=1).mean()
     assert bool(down > across) is (abs(offset[1]) > abs(offset[0]))

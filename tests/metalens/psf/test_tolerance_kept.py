@@ -13,13 +13,12 @@ def drawn(rng):
     """(maps, arguments) of a small lens of any aperture: windows from the side, coarse,
     of sources of finite size.
     """
-    count, pitch, wave = (
-        int(rng.integers(60, 140)),
-        rng.uniform(0.25, 0.5),
-        rng.uniform(0.5, 1.1),
-    )
+    count = int(rng.integers(60, 140))
+    pitch = rng.uniform(0.25, 0.5)
+    wave = rng.uniform(0.5, 1.1)
     half = count * pitch / 2
-    distance, depths = half * rng.uniform(1.5, 8), half * 10 ** rng.uniform(1, 2, 2)
+    distance = half * rng.uniform(1.5, 8)
+    depths = half * 10 ** rng.uniform(1, 2, 2)
     y, x = (np.indices((count, count)) - (count - 1) / 2) * pitch
     path = np.sqrt(x**2 + y**2 + distance**2) + rng.normal(0, 0.05 * wave, x.shape)
     phase = np.remainder(-2 * np.pi / wave * path, 2 * np.pi)

@@ -31,11 +31,9 @@ def _airy(indices, heights, light, z):
     Four unknowns an interface: tangential E and H are continuous. H = k x E with
     lengths over k0.
     """
-    sine, c, s = (
-        math.sin(light.angle_rad),
-        math.cos(light.azimuth_rad),
-        math.sin(light.azimuth_rad),
-    )
+    sine = math.sin(light.angle_rad)
+    c = math.cos(light.azimuth_rad)
+    s = math.sin(light.azimuth_rad)
     kz = [np.sqrt(n * n - sine**2 + 0j) for n in indices]
 
     def wave(n, q):
@@ -54,7 +52,8 @@ def _airy(indices, heights, light, z):
     count = (
         2 * (len(indices) - 1)
     )  # that of the substrate at the top of it; unknowns: down in 0, both, ..., up in last
-    system, right = np.zeros((2 * count, count), complex), np.zeros(2 * count, complex)
+    system = np.zeros((2 * count, count), complex)
+    right = np.zeros(2 * count, complex)
     for i in range(len(indices) - 1):
         rows = slice(4 * i, 4 * i + 4)
         for medium, sign in ((i, 1), (i + 1, -1)):
@@ -221,7 +220,8 @@ def test_fields_keep_maxwells_equations_away_from_the_wall():
     """Central differences over 4 nm, inside and outside; derivatives of ten orders are
     seven per cent off.
     """
-    step, middles = 2e-3, ((0.01, 0.02, 0.2), (-0.12, 0.13, 0.1), (0.16, 0.02, 0.3))
+    step = 2e-3
+    middles = ((0.01, 0.02, 0.2), (-0.12, 0.13, 0.1), (0.16, 0.02, 0.3))
     grids = [
         FieldGrid(*(c + step * np.arange(-1, 2) for c in middle)) for middle in middles
     ]
@@ -282,7 +282,9 @@ def test_fields_repeat_from_site_to_site_with_the_phase_of_the_light(lattice):
     cell = dataclasses.replace(ROUND, lattice=lattice, shape=Ring(0.4))
     light = Incidence(WAVELENGTH, 0.4, "s", 0.3)
     step = np.array((0.18, 0.18 * math.sqrt(3)) if lattice.centred else (0.36, 0.432))
-    x, y, z = np.array([0.02, 0.11]), np.array([-0.08, 0.05]), [-0.1, 0.2, 0.6]
+    x = np.array([0.02, 0.11])
+    y = np.array([-0.08, 0.05])
+    z = [-0.1, 0.2, 0.6]
     here = FieldGrid(x, y, z)
     there = FieldGrid(x + step[0], y + step[1], z)
     one, other = near_fields(cell, SIZE, light, [here, there], harmonics=4)
@@ -298,7 +300,9 @@ def test_a_cell_turned_by_a_quarter_has_the_field_turned():
     """Other mirrors, other signs of the orders: (x, y) -> (-y, x), in light that keeps
     one mirror and the other one.
     """
-    x, y, z = np.array([-0.13, 0.02, 0.1]), np.array([0.04, 0.12]), [0.1, 0.3]
+    x = np.array([-0.13, 0.02, 0.1])
+    y = np.array([0.04, 0.12])
+    z = [0.1, 0.3]
     flat, upright = (
         dataclasses.replace(ROUND, shape=Rectangle(0.55, turn))
         for turn in (0.0, math.pi / 2)
@@ -345,10 +349,8 @@ def test_a_leaning_wall_is_wide_at_its_foot_in_twelve_steps(tilt):
     """Width at half height, less twice the height above it times the tangent: each step
     that of its middle.
     """
-    cell, x = (
-        dataclasses.replace(ROUND, sidewall_rad=tilt),
-        np.linspace(-0.17, 0.17, 341),
-    )
+    cell = dataclasses.replace(ROUND, sidewall_rad=tilt)
+    x = np.linspace(-0.17, 0.17, 341)
     z = (np.arange(12) + 0.3) / 12 * 0.45
     got = near_field(
         cell, SIZE, Incidence(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1

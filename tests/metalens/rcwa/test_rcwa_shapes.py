@@ -239,10 +239,8 @@ def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():
     """
     n, pitch, size, grow, coat, off = 1.5, 0.35, 0.2, 0.03, 0.012, []
     for contrast in (0.08, 0.04):
-        inside, film = (
-            Index(math.sqrt(n**2 + contrast)),
-            Index(math.sqrt(n**2 + contrast / 2)),
-        )
+        inside = Index(math.sqrt(n**2 + contrast))
+        film = Index(math.sqrt(n**2 + contrast / 2))
         layers = (
             Layer(0.11, grow_um=grow, material=film),
             Layer(0.4, coat_um=coat, coat=film),

@@ -116,10 +116,8 @@ def test_a_map_far_away_is_the_mean_over_its_sites_and_shows_no_false_lenses(tmp
     )
     high, wide = drawn.shape[:2]
     scale = min(wide, high) / n * 0.98
-    rows, columns = (
-        np.arange(high // 2 - 60, high // 2 + 60),
-        np.arange(wide // 2 + 60, wide // 2 + 220),
-    )
+    rows = np.arange(high // 2 - 60, high // 2 + 60)
+    columns = np.arange(wide // 2 + 60, wide // 2 + 220)
     values = np.where(index > 0, sizes[np.maximum(index, 1).astype(int) - 1], 0)
     assert 0.25 <= scale < 0.5
     for _ in range(

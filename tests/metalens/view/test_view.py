@@ -79,7 +79,8 @@ def test_every_pillar_is_in_the_page(folder):
     panel = _content(page.page_html("lens", artefacts.lens_panels(folder / "lens.h5")))[
         "panels"
     ][0]
-    index, sizes = _unpacked(panel["index"]), np.array([0.0, *panel["sizes"]])
+    index = _unpacked(panel["index"])
+    sizes = np.array([0.0, *panel["sizes"]])
     # sizes have six digits: half of the last one is 5e-4 nm
     assert np.abs(sizes[index] - 1e3 * design.diameters.diameter_um).max() < 5.1e-4
     assert panel["pitch_um"] == 0.3

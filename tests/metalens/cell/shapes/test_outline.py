@@ -152,6 +152,7 @@ def test_symmetries_are_those_of_the_section():
 
 
 def test_a_hole_is_not_inside():
-    x, y = np.array([0.0, 0.1, 0.4, -0.12]), np.array([0.0, -0.05, 0.0, -0.1])
+    x = np.array([0.0, 0.1, 0.4, -0.12])
+    y = np.array([0.0, -0.05, 0.0, -0.1])
     assert BENT.inside(x, y).tolist() == [False, True, False, True]
     assert [sign for sign, _ in BENT.polygons()] == [1, -1]
