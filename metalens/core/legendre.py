@@ -23,7 +23,8 @@ def legendre_values(count: int, t: Array) -> Array:
     the stable recurrence.
     """
     scale = np.sqrt(np.arange(count) + 0.5)
-    values = np.ascontiguousarray(legvander(np.asarray(t, float), count - 1))
+    t = np.asarray(t, float)  # legvander takes a number for an array of one
+    values = legvander(t, count - 1).reshape(*t.shape, count)
     return np.asarray(values * scale)
 
 
