@@ -82,6 +82,14 @@ def _site():
     return module
 
 
+def test_the_reference_of_the_checkout_is_that_of_the_code():
+    for name, text in _site().reference_pages().items():
+        page = ROOT / "docs" / "reference" / name
+        assert page.read_text(encoding="utf-8") == text, (
+            f"{name}: run python docs/site/reference.py"
+        )
+
+
 @pytest.mark.parametrize(
     ("name", "row"),
     [

@@ -1,9 +1,8 @@
-"""Pages that the site makes from the code: every command with its options, every
-settings file with its keys.
+"""Reference pages of commands, settings, presets, materials and parameters of the fit.
 
-An mkdocs hook (``hooks`` in mkdocs.yml). The texts come from the docstrings of the
-records, so that they cannot go
-stale; a key without a text fails a test.
+``python docs/site/reference.py`` writes them to docs/reference from the docstrings of
+the records; a test compares the committed pages with the code. As an mkdocs hook it
+brings the pages of the root into the site.
 """
 
 import dataclasses
@@ -12,6 +11,7 @@ import inspect
 import re
 import types
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,7 @@ def _table_of(kind: Any) -> type[Any] | None:
 
 def keys(record: type[Any], path: str = "") -> list[str]:
     """Markdown of a record's keys, then of the tables below it."""
-    hints, told = (
+    hints, texts = (
         typing.get_type_hints(record, include_extras=True),
         config.describe_fields(record),
     )
@@ -153,7 +153,7 @@ def keys(record: type[Any], path: str = "") -> list[str]:
             else _word(kind)
         )
         lines.append(
-            f"| `{field.name}` | {word} | {_default(field)} | {told.get(field.name, '')} |"
+            f"| `{field.name}` | {word} | {_default(field)} | {texts.get(field.name, '')} |"
         )
         if inner is not None:
             below += ["", *keys(inner, f"{path}.{field.name}" if path else field.name)]
@@ -163,14 +163,15 @@ def keys(record: type[Any], path: str = "") -> list[str]:
 def settings_page(name: str) -> str:
     """Every key of one settings file."""
     module, record, verb = SETTINGS[name]
-    made = keys(getattr(importlib.import_module(module), record))
+    tables = keys(getattr(importlib.import_module(module), record))
     return "\n".join(
         [
             f"# {name}",
             "",
-            f"Read by `metalens {verb}`. An unknown key is refused.",
+            f"Read by `metalens {verb}`. An unknown key is refused."
+            + (" [Presets](presets.md) side by side." * (name == "RUN.toml")),
             "",
-            *made,
+            *tables,
             "",
         ]
     )
@@ -186,13 +187,13 @@ def _options(verb: str, module: str) -> list[str]:
             for line in _options(f"{verb} {part}", where)
         ]
     record = loaded.Options
-    told, hints = (
+    texts, hints = (
         config.describe_fields(record),
         typing.get_type_hints(record, include_extras=True),
     )
     for base in reversed(record.__mro__[1:-1]):
         if dataclasses.is_dataclass(base):
-            told = config.describe_fields(base) | told
+            texts = config.describe_fields(base) | texts
     lines = [
         f"## metalens {verb}",
         "",
@@ -205,7 +206,7 @@ def _options(verb: str, module: str) -> list[str]:
         flag = _flag(field.name, hints[field.name])
         if flag is None:
             continue
-        row = f"| {flag} | {_word(hints[field.name])} | {_default(field)} | {told.get(field.name, '')} |"
+        row = f"| {flag} | {_word(hints[field.name])} | {_default(field)} | {texts.get(field.name, '')} |"
         lines.append(row)
     return [*lines, ""]
 
@@ -223,6 +224,106 @@ def commands_page() -> str:
     return "\n".join(lines)
 
 
+def presets_page() -> str:
+    """Values of every preset of RUN.toml, side by side."""
+    run = importlib.import_module("codesign.train.run")
+    names = [n for n in typing.get_args(run.Preset) if n != "none"]
+    flat = [dict(_flatten(run.preset_table(name))) for name in names]
+    rows = [
+        f"| `{key}` | " + " | ".join(_value(values.get(key)) for values in flat) + " |"
+        for key in dict.fromkeys(key for values in flat for key in values)
+        if key != "preset"
+    ]
+    return "\n".join(
+        [
+            "# Presets of RUN.toml",
+            "",
+            "A preset gives every value that the file leaves out; an empty cell is the "
+            "default of [RUN.toml](run.md).",
+            "",
+            "| key | " + " | ".join(f"`{name}`" for name in names) + " |",
+            "|---" * (1 + len(names)) + "|",
+            *rows,
+            "",
+        ]
+    )
+
+
+def _flatten(table: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{path}{key}.")
+        else:
+            yield path + key, value
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def materials_page() -> str:
+    """Names of the built-in materials, the wavelengths they cover and their source."""
+    materials = importlib.import_module("metalens.materials")
+    lines = [
+        "# Materials",
+        "",
+        "Names for `pillar`, `substrate`, `cover` and films; a CSV file (wavelength in "
+        "um, n, k) or a page of refractiveindex.info (.yml) serves as well.",
+        "",
+        "| name | wavelengths / um | source |",
+        "|---|---|---|",
+    ]
+    for name in materials.NAMES:
+        material = materials.find_material(name)
+        low, high = material.range_um
+        span = "all" if high == float("inf") else f"{low:g} to {high:g}"
+        source = " ".join(material.source.replace("|", "\\|").split())
+        lines.append(f"| `{name}` | {span} | {source} |")
+    return "\n".join([*lines, ""])
+
+
+def fit_page() -> str:
+    """Parameters of the fit: meaning, prior, bounds, and when each is fitted."""
+    parameters = importlib.import_module("characterize.model.parameters")
+    lines = [
+        "# Parameters of the fit",
+        "",
+        "The last part of a name is its unit. [METROLOGY.toml](metrology.md) states "
+        "values and asks for more of them to be fitted. Prior: standard deviation "
+        "where nothing is stated.",
+        "",
+        "| name | meaning | prior | bounds | fitted |",
+        "|---|---|---|---|---|",
+    ]
+    for row in parameters.PARAMETERS:
+        bounds = "–" if row.high == float("inf") else f"{row.low:g} to {row.high:g}"
+        prior = "none" if row.unstated == float("inf") else f"{row.unstated:g}"
+        fitted = "yes" if row.free else "where needed" if row.extra else "on request"
+        meaning = row.meaning.replace("|", "\\|")
+        lines.append(f"| `{row.name}` | {meaning} | {prior} | {bounds} | {fitted} |")
+    return "\n".join([*lines, ""])
+
+
+def reference_pages() -> dict[str, str]:
+    """Text of every reference page by its file name in docs/reference."""
+    settings = {
+        f"{name.removesuffix('.toml').lower()}.md": settings_page(name)
+        for name in SETTINGS
+    }
+    pages = settings | {
+        "commands.md": commands_page(),
+        "presets.md": presets_page(),
+        "materials.md": materials_page(),
+        "fit.md": fit_page(),
+    }
+    return {
+        name: re.sub(r":\w+:`~?([\w.]+)`", r"`\1`", text)
+        for name, text in pages.items()
+    }
+
+
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Links from docs/ to the pages of the root, as the site has them."""
     return re.sub(
@@ -231,13 +332,9 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the made pages to the site."""
+    """Add the pages of the root to the site."""
     root = Path(config.config_file_path).parent
-    pages = {
-        f"reference/{name.removesuffix('.toml').lower()}.md": settings_page(name)
-        for name in SETTINGS
-    }
-    pages["reference/commands.md"] = commands_page()
+    pages = {}
     for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG"):
         text = (root / f"{name}.md").read_text(encoding="utf-8")
         text = re.sub(r"\]\(docs/(\w[^)]*)\)", r"](\1)", text)
@@ -250,3 +347,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for where, text in pages.items():
         files.append(File.generated(config, where, content=text))
     return files
+
+
+if __name__ == "__main__":
+    folder = Path(__file__).resolve().parents[1] / "reference"
+    for file_name, page_text in reference_pages().items():
+        (folder / file_name).write_text(page_text, encoding="utf-8")
