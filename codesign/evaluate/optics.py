@@ -261,10 +261,7 @@ class SceneEnergy:
     summed over pixels.
 
     gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
-    light: least share of the light through the lens that the PSFs' window holds, over
-    the depths of the scenes; of the
-    true image, of its mean over the field.
-    image_error: of the images, relative L2 of a texture; nan where it is not known.
+    image_error: of the images, relative L2 of a texture.
     maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared
     difference of gaze and slip (Fig. 5).
     above: why the error of the true image is above what it aims at; empty where it is
@@ -274,7 +271,6 @@ class SceneEnergy:
     gaze: Tensor
     slip: Tensor
     separability: Tensor
-    light: float
     image_error: float
     maps: Tensor
     above: str = ""
@@ -321,9 +317,7 @@ def scene_energies(
     out = []
     for lens in lenses:
         whole = imager(lens, grid, tolerance=settings.image_tolerance)
-        found = energies_of(
-            whole, views, light=1 - whole.parts["outside"], image_error=whole.error
-        )
+        found = energies_of(whole, views)
         out.append(replace(found, above=whole.above(settings.image_tolerance)))
     return out
 
@@ -361,19 +355,11 @@ def scene_views(
     ]
 
 
-def energies_of(
-    optics: Imager,
-    views: Sequence[RenderedFrames],
-    *,
-    light: float = 1.0,
-    image_error: float = math.nan,
-) -> SceneEnergy:
+def energies_of(optics: Imager, views: Sequence[RenderedFrames]) -> SceneEnergy:
     """Table 1 of any PSFs, see :func:`scene_energies`.
 
     Args:
         optics: what forms the images. views: anchor, gaze and slip views.
-        light: share of the light that the PSFs' windows hold.
-        image_error: relative L2 error of the images.
     """
     images = [optics(view.frames) for view in views]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
@@ -383,8 +369,7 @@ def energies_of(
         sums[0],
         sums[1],
         sums[2],
-        light,
-        image_error,
+        optics.error,
         torch.stack([anchor[0], maps[0][0], maps[2][0]]),
     )
 
@@ -437,10 +422,7 @@ def table_values(
                 kind: list(interval) for kind, interval in compared[name].items()
             },
             "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
-            "light_in_window": energy.light,
-            "image_error": None
-            if math.isnan(energy.image_error)
-            else energy.image_error,
+            "image_error": energy.image_error,
         }
     return out
 
@@ -532,15 +514,5 @@ def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
             for value, low, high in found.values()
         ]
         angle = float(torch.rad2deg(one.angle_rad).mean())
-        rows.append(
-            (
-                name,
-                *parts,
-                f"{angle:.1f}°",
-                f"{one.light:.2f}",
-                f"{one.image_error:.3f}",
-            )
-        )
-    return Table(
-        ("lens", *KINDS, "span angle", "light in window", "image error"), rows, caption
-    )
+        rows.append((name, *parts, f"{angle:.1f}°", f"{one.image_error:.3f}"))
+    return Table(("lens", *KINDS, "span angle", "image error"), rows, caption)

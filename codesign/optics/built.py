@@ -131,9 +131,8 @@ class PillarCells:
             torch.complex(*found.reshape(2, *x_um.shape).unbind(0)), x_um, y_um
         )
 
-    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, by which the error of gathering them is
-        told.
+    def pillar_transmission(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex t of every pillar, for the error of averaging over cells.
 
         Args:
             wavelength_um: of the light.

@@ -17,7 +17,7 @@ from torch import Tensor
 from metalens import propagate
 from metalens.image.points import Optics, Window, psfs, sampling
 from metalens.image.texture import texture_error, weigh_by_light
-from metalens.image.waves import PillarWave
+from metalens.image.waves import PillarPlane
 from metalens.psf import Polarisation, SpectralNodes, blur_um, psf_stack
 
 
@@ -145,7 +145,7 @@ def gathering_error(
         wavelength_um: vacuum wavelength, um.
     """
     wave = optics.wave
-    if not isinstance(wave, PillarWave):
+    if not isinstance(wave, PillarPlane):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
     # points of a sample, half of Nyquist's step apart: triangles of a sample are then
@@ -198,7 +198,7 @@ def _triangles(count: int, finer: int) -> Tensor:
 
 def _of_pillars(
     optics: Optics,
-    wave: PillarWave,
+    wave: PillarPlane,
     wavelength_um: float,
     at: tuple[Tensor, Tensor],
     sampled: tuple[float, int, int],

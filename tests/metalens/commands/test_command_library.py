@@ -116,7 +116,7 @@ def known_within(d, bars):
     t = (0.95 * np.exp(1j * (40 * d + 3e-3 * np.sin(900 * d))))[None, None, None]
 
     def swept(cell, settings=None, *, wavelengths_um=(0.6,), **_):
-        settings = (settings or library.Sweep(wavelengths_um)).settled(cell)
+        settings = (settings or library.Sweep(wavelengths_um)).with_tolerance(cell)
         about = {"resonances": np.zeros((0, 5)), "engine": "rcwa", "solves": 13}
         one = np.array([0.6]), d, t, 0 * t, bars[None, None, None], np.abs(t) ** 2
         return library.PillarLibrary(cell, settings, ("x",), np.zeros(1), *one, **about)
@@ -202,11 +202,11 @@ def test_the_example_is_the_default_cell(request):
     example = request.config.rootpath / "examples" / "cell.toml"
     assert config.load(example, CellFile).cell == DEFAULT_CELL
     assert (
-        config.loads("", CellFile).sweep.settled(DEFAULT_CELL)
+        config.loads("", CellFile).sweep.with_tolerance(DEFAULT_CELL)
         == config.load(example, CellFile).sweep
     )
     assert (
-        config.loads("", CellFile).proxy.settled(0.0)
+        config.loads("", CellFile).proxy.with_defaults(0.0)
         == config.load(example, CellFile).proxy
     )
 
