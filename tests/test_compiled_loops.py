@@ -56,5 +56,5 @@ def test_what_a_cached_loop_calls_is_put_into_it(module):
 
 
 def test_the_loops_are_found():
-    assert len(MODULES) >= 9
+    assert MODULES
     assert "frames" in dict(loops("codesign.eye.kernel"))
