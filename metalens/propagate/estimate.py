@@ -102,8 +102,8 @@ def pupil_error(
     window's middle, for all points.
 
     Args:
-        windows, intensity: as :func:`relative_error`; light without ``pupils`` counts as
-            |U|² in place of them.
+        windows, intensity: as :func:`relative_error`; light without ``pupils`` counts
+            as |U|² in place of them.
         pupils: mixing for the middle of a case's window.
 
     Accuracy: 1 to 2 times the true difference.

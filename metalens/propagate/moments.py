@@ -1,4 +1,5 @@
-"""From millions of pillars to a few thousand moments, by blocks of neighbouring pillars.
+"""From millions of pillars to a few thousand moments, by blocks of neighbouring
+pillars.
 
 The geometric phase (the carrier) is a polynomial over each block and is removed. A few
 interpolation nodes then stand for the pillars of the block.
@@ -396,7 +397,8 @@ def plan_moments(
     nodes: int = NODES,
     more: int = 0,
 ) -> PillarMoments:
-    """Plan the reduction of a lens to moments: blocks, carrier and weights of the nodes.
+    """Plan the reduction of a lens to moments: blocks, carrier and weights of the
+    nodes.
 
     Args:
         case, reference: geometry, and inverse depth (1/um) of the carrier.
@@ -829,7 +831,8 @@ def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _add_rows(rows, shares, first, sums):  # type: ignore[no-untyped-def]
-    """Add four rows of light to the row nodes: sums[a] += Σ_q shares[a, first + q] rows[q].
+    """Add four rows of light to the row nodes: sums[a] += Σ_q shares[a, first + q]
+    rows[q].
 
     rows: (4, re/im, column). shares: (node, row). sums: (node, re/im, column).
     """

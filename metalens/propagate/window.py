@@ -76,8 +76,8 @@ class NodeCounts:
 class WindowLayout:
     """Nodes and tiles of a windowed propagation.
 
-    nodes: (y, x) over the lens for the whole window. parts: tiles along each axis. sizes:
-    counts of every tile.
+    nodes: (y, x) over the lens for the whole window. parts: tiles along each axis.
+    sizes: counts of every tile.
     """
 
     nodes: tuple[int, int]
@@ -87,10 +87,11 @@ class WindowLayout:
 
 @functools.lru_cache(maxsize=1024)
 def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """Nodes over the lens and tiles of the window; None if the tables would exceed 100 MB.
+    """Nodes over the lens and tiles of the window; None if the tables would exceed 100
+    MB.
 
-    With more tiles along an axis the work on the window falls, and that of passing light
-    to the tiles rises. Their sum is least for about √nodes / 4 tiles.
+    With more tiles along an axis the work on the window falls, and that of passing
+    light to the tiles rises. Their sum is least for about √nodes / 4 tiles.
 
     Args:
         case: geometry of the propagation.
@@ -118,8 +119,8 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
 
 
 def _mirrored(tile: PropagationCase) -> PropagationCase:
-    """The tile with its centre mirrored to positive coordinates, along every axis without
-    a source tangent.
+    """The tile with its centre mirrored to positive coordinates, along every axis
+    without a source tangent.
 
     By symmetry the mirror image needs the same counts.
     """
@@ -281,8 +282,8 @@ def _over_directions(case: PropagationCase, p: Array) -> Array:
 def _over_window(
     case: PropagationCase, span: tuple[float, float], **line: Array
 ) -> Array:
-    """(line, node) residual of the plane waves along one of X, Y (window), p (direction),
-    e (lens row).
+    """(line, node) residual of the plane waves along one of X, Y (window), p
+    (direction), e (lens row).
 
     Args:
         case: geometry of the propagation.
@@ -361,8 +362,8 @@ def depth_basis(
     """Orthonormal basis of the lens fields exp(i k (s_z - s_ref)) of all depths, by a
     truncated SVD.
 
-    Orthonormal under the quadrature of the nodes. With ``moving`` the basis also spans the
-    derivatives in inverse depth and tangents.
+    Orthonormal under the quadrature of the nodes. With ``moving`` the basis also spans
+    the derivatives in inverse depth and tangents.
 
     Args:
         case: geometry of the propagation.
@@ -418,8 +419,8 @@ def depth_basis(
 def _depth_derivatives(
     case: PropagationCase, e: Array, x: Array, inverse: Array, fields: Array
 ) -> list[Array]:
-    """Derivatives of the depth fields in inverse depth and both tangents, by the complex
-    step.
+    """Derivatives of the depth fields in inverse depth and both tangents, by the
+    complex step.
 
     Each is scaled to the norm of the fields; those that vanish are left out.
 
@@ -448,7 +449,8 @@ def _depth_derivatives(
 
 
 def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
-    """(2, n) pairs (correction term, depth field) with a significant product of strengths.
+    """(2, n) pairs (correction term, depth field) with a significant product of
+    strengths.
 
     The omitted pairs sum to less than the tolerance, root mean square.
 
@@ -637,8 +639,8 @@ class WindowPlan:
 class MovingGeometry:
     """Geometry that carries gradients, float64 tensors.
 
-    tangents: (2,). inverse_depths: (depth,), 1/um. distance: (), um. centre: (2,) of the
-    window, um. Values must equal those of the plan's case.
+    tangents: (2,). inverse_depths: (depth,), 1/um. distance: (), um. centre: (2,) of
+    the window, um. Values must equal those of the plan's case.
     """
 
     tangents: torch.Tensor
@@ -753,8 +755,8 @@ def _tile_tensors(
 ) -> dict[str, torch.Tensor]:
     """Operators of all tiles, stacked (tile, …), for all significant pairs.
 
-    A pair is a correction term and a depth field. ``fields`` holds the depth field of each
-    pair.
+    A pair is a correction term and a depth field. ``fields`` holds the depth field of
+    each pair.
 
     Args:
         case: geometry of the propagation.
@@ -836,8 +838,8 @@ def light_windowed(
             |U|² of one map.
 
     Returns:
-        Irradiance (depth, y, x); light of every map on the nodes of the posterior error;
-        sums of squares of the transmissions.
+        Irradiance (depth, y, x); light of every map on the nodes of the posterior
+        error; sums of squares of the transmissions.
     """
     reduced = [
         reduce_to_moments(phase, transmission, plan.moments)
@@ -940,11 +942,11 @@ def _depth_coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tenso
 
 
 def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Propagate fields on the lens nodes to the window of their tile: (tile, b, e, x) to
-    (tile, X, Y, b).
+    """Propagate fields on the lens nodes to the window of their tile: (tile, b, e, x)
+    to (tile, X, Y, b).
 
-    Columns x are interpolated to directions p. Then each pair of a correction term and a
-    depth field is summed over p and e with its plane waves.
+    Columns x are interpolated to directions p. Then each pair of a correction term and
+    a depth field is summed over p and e with its plane waves.
 
     Args:
         light: (tile, b, e, x) complex; b counts the depth fields.
