@@ -51,15 +51,20 @@ def wall_sections(
             width = grow_um + (share - 0.5) * width_slope(cell) * layer.height_um
             if shift:
                 width += float(shift(size_um + width))
-            here = pillar_section(cell, layer, size_um, wavelength_um, grow_um=width)
-            return operators(here, i)
+            cross_section = pillar_section(
+                cell, layer, size_um, wavelength_um, grow_um=width
+            )
+            return operators(cross_section, i)
 
         height = layer.height_um * 2 * math.pi / wavelength_um
         return WallSection(
             _interpolated(sample) if cell.sidewall_rad else sample, height
         )
 
-    return [section(i, *one) for i, one in enumerate(sections_with_growth(cell))]
+    return [
+        section(i, *layer_and_growth)
+        for i, layer_and_growth in enumerate(sections_with_growth(cell))
+    ]
 
 
 def _interpolated(sample: Sample) -> Sample:
@@ -87,14 +92,14 @@ def width_slope(cell: Cell) -> float:
 
 
 def sections_with_growth(cell: Cell) -> list[tuple[Layer, float]]:
-    """Sections of a ``cell``, foot first, with the widening at the middle of each by the
-    tilted wall, um.
+    """Sections of a ``cell``, foot first, with the widening at the middle of each by
+    the tilted wall, um.
     """
-    found, foot = [], -cell.height_um / 2
+    sections, foot = [], -cell.height_um / 2
     for layer in cell.sections:
-        found.append((layer, width_slope(cell) * (foot + layer.height_um / 2)))
+        sections.append((layer, width_slope(cell) * (foot + layer.height_um / 2)))
         foot += layer.height_um
-    return found
+    return sections
 
 
 def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
@@ -102,14 +107,14 @@ def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
     into ``steps`` upright ones of equal height.
     """
     count = steps if cell.sidewall_rad else 1
-    found = []
+    layers = []
     for layer, grow in sections_with_growth(cell):
         step_um = layer.height_um / count
         for i in range(count):
-            lift = (i + 0.5 - count / 2) * step_um * width_slope(cell)
-            width = layer.grow_um + grow + lift
-            found.append(replace(layer, height_um=step_um, grow_um=width))
-    return found
+            step_growth = (i + 0.5 - count / 2) * step_um * width_slope(cell)
+            width = layer.grow_um + grow + step_growth
+            layers.append(replace(layer, height_um=step_um, grow_um=width))
+    return layers
 
 
 @functools.lru_cache(maxsize=8)
@@ -133,25 +138,25 @@ def panel_transfer(section: WallSection, low: float, high: float, stages: int) -
     """
     c, b, a = gauss_collocation(stages)
     samples = [section.sample(float(high - x * (high - low))) for x in c]
-    P, Q = (np.stack(part) for part in zip(*samples, strict=True))
+    P, Q = (np.stack(matrices) for matrices in zip(*samples, strict=True))
     step = -1j * section.reduced_height * (high - low)
     n = P.shape[-1]
 
-    def integrated(part: Array) -> Array:
-        blocks = a[:, None, :, None] * part.transpose(1, 0, 2)[None]
+    def stage_integrals(matrices: Array) -> Array:
+        blocks = a[:, None, :, None] * matrices.transpose(1, 0, 2)[None]
         return np.asarray(blocks.reshape(stages * n, stages * n))
 
-    p, q = integrated(P), integrated(Q)
-    start = np.tile(np.eye(n), (stages, 1))
-    # u = u_0 + step p w with w = w_0 + step q u put in
-    given = np.concatenate([start, step * (p @ start)], axis=1)
-    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), given)
-    w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
+    p, q = stage_integrals(P), stage_integrals(Q)
+    identities = np.tile(np.eye(n), (stages, 1))
+    # u = u_0 + step p w, with w = w_0 + step q u inserted
+    right_side = np.concatenate([identities, step * (p @ identities)], axis=1)
+    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), right_side)
+    w = np.concatenate([np.zeros_like(identities), identities], axis=1) + step * (q @ u)
     transfer = np.eye(2 * n, dtype=complex)
-    for rows, part, field in ((slice(n), P, w), (slice(n, None), Q, u)):
-        inner = field.reshape(stages, n, -1)
+    for rows, matrices, field in ((slice(n), P, w), (slice(n, None), Q, u)):
+        stage_fields = field.reshape(stages, n, -1)
         transfer[rows] += step * np.einsum(
-            "k,kij,kjl->il", b, part, inner, optimize=True
+            "k,kij,kjl->il", b, matrices, stage_fields, optimize=True
         )
     return transfer
 
@@ -189,16 +194,17 @@ def match_walls(
 def choose_stage_count(
     respond_at: Callable[[int], Array], tolerance: float
 ) -> tuple[int, float]:
-    """Gauss points that leave less than a tenth of the tolerance, and the error they
-    leave: the change by the last one.
+    """Fewest Gauss points with an error below a tenth of the tolerance, and that error.
+
+    The error is the change of t and r by the last point added.
 
     Args:
         respond_at: t and r with this many points. tolerance: of t and r.
     """
-    stages, t = FEWEST, respond_at(FEWEST)
+    stages, amplitudes = FEWEST, respond_at(FEWEST)
     while True:
         finer = respond_at(stages + 1)
-        left = float(np.abs(finer - t).max())
-        stages, t = stages + 1, finer
-        if left <= tolerance / 10 or stages >= MOST:
-            return stages, left
+        change = float(np.abs(finer - amplitudes).max())
+        stages, amplitudes = stages + 1, finer
+        if change <= tolerance / 10 or stages >= MOST:
+            return stages, change
