@@ -240,8 +240,8 @@ def read_csv(path: str | Path) -> Material:
     path: of the CSV file.
 
     Raises:
-        MaterialError: no such file, a missing column, or a bad row; the message gives the
-            line.
+        MaterialError: no such file, a missing column, or a bad row; the message gives
+            the line.
     """
     try:
         stat = Path(path).stat()

@@ -35,21 +35,33 @@ def parse_table(text: str, where: str) -> tuple[Array, str]:
         raise MaterialError(
             f"{where}: empty; need columns {COLUMNS}, and at least two rows"
         )
-    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), ",")
-    plain = [
-        (i, line if mark == "," else line.replace(",", ".").replace(mark, ","))
-        for i, line in body
-    ]
-    body = _unstacked(plain, where)
+    separator = next(
+        (mark for mark in ";\t" if mark in body[0][1] and "," not in body[0][1]), ","
+    )
+    if separator != ",":
+        body = [(i, line.replace(",", ".").replace(separator, ",")) for i, line in body]
+    body = _unstacked(body, where)
     names = [_column(field) for field in next(csv.reader([body[0][1]]))]
-    place = next((names.index(column) for column in _SCALES if column in names), -1)
-    if place < 0 or "n" not in names:
+    wavelength_column = next(
+        (names.index(column) for column in _SCALES if column in names), -1
+    )
+    if wavelength_column < 0 or "n" not in names:
         raise MaterialError(
             f"{where}, line {body[0][0]}: columns {', '.join(names)}; need {COLUMNS}"
         )
-    order = [place, names.index("n"), names.index("k") if "k" in names else -1]
+    order = [
+        wavelength_column,
+        names.index("n"),
+        names.index("k") if "k" in names else -1,
+    ]
     rows = [
-        _row(line, order, len(names), f"{where}, line {i}", _SCALES[names[place]])
+        _row(
+            line,
+            order,
+            len(names),
+            f"{where}, line {i}",
+            _SCALES[names[wavelength_column]],
+        )
         for i, line in body[1:]
     ]
     return np.array(_rising(rows, [i for i, _ in body[1:]], where)).T, " ".join(

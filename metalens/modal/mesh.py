@@ -123,30 +123,40 @@ class FunctionNumbering:
         return self.scalars[key]
 
     def number_element(
-        self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
+        self, corners: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
     ) -> tuple[list[int], list[int]]:
-        """Numbers of the vector and scalar functions of the element with corners v00,
-        v10, v01, v11.
+        """Global numbers of the vector and scalar functions of one element.
+
+        Functions on an edge or a vertex are shared with the neighbours; interior
+        functions belong to the element.
+
+        Args:
+            corners: v00, v10, v01, v11.
+            px, py: polynomial degrees along both parameters.
         """
-        walls = [self.wall_bits(vertex) for vertex in v]
+        walls = [self.wall_bits(vertex) for vertex in corners]
         x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 
         def on_edge(ends: tuple[int, int], i: int) -> int:
             return self.number_vector(
-                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
+                walls[ends[0]] & walls[ends[1]], corners[ends[0]], corners[ends[1]], i
             )
 
         def scalar_on_edge(ends: tuple[int, int], i: int) -> int:
             return self.number_scalar(
-                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
+                walls[ends[0]] & walls[ends[1]], corners[ends[0]], corners[ends[1]], i
             )
 
         vectors = [
-            on_edge(x_ends[j], i) if j < 2 else self.number_vector(0, "x", v, i, j)
+            on_edge(x_ends[j], i)
+            if j < 2
+            else self.number_vector(0, "x", corners, i, j)
             for i in range(px)
             for j in range(py + 1)
         ] + [
-            on_edge(y_ends[i], j) if i < 2 else self.number_vector(0, "y", v, i, j)
+            on_edge(y_ends[i], j)
+            if i < 2
+            else self.number_vector(0, "y", corners, i, j)
             for i in range(px + 1)
             for j in range(py)
         ]
@@ -154,13 +164,15 @@ class FunctionNumbering:
         for i in range(px + 1):
             for j in range(py + 1):
                 if i < 2 and j < 2:
-                    scalars.append(self.number_scalar(walls[i + 2 * j], v[i + 2 * j]))
+                    scalars.append(
+                        self.number_scalar(walls[i + 2 * j], corners[i + 2 * j])
+                    )
                 elif j < 2:
                     scalars.append(scalar_on_edge(x_ends[j], i))
                 elif i < 2:
                     scalars.append(scalar_on_edge(y_ends[i], j))
                 else:
-                    scalars.append(self.number_scalar(0, "z", v, i, j))
+                    scalars.append(self.number_scalar(0, "z", corners, i, j))
         return vectors, scalars
 
 
@@ -189,22 +201,24 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
     Args:
         plan: of the mesh. numbers: hands out global numbers.
     """
-    a = plan.core
-    excess = 0.8 * a - a
-    cuts = np.concatenate([[0.0], plan.sectors])
+    half_width = plan.core
+    excess = 0.8 * half_width - half_width
+    ends = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
     line = polynomial_interval(plan.angular, plan.angular + 4)
-    s = line.point
+    points = line.point
     along_u, along_v, vectors, scalars = [], [], [], []
     for i in range(n):
         for j in range(n):
-            du, dv = cuts[i + 1] - cuts[i], cuts[j + 1] - cuts[j]
-            u, v = np.meshgrid(cuts[i] + du * s, cuts[j] + dv * s, indexing="ij")
+            du, dv = ends[i + 1] - ends[i], ends[j + 1] - ends[j]
+            u, v = np.meshgrid(
+                ends[i] + du * points, ends[j] + dv * points, indexing="ij"
+            )
             along_u.append(
-                du * np.stack([a + excess * v, excess * v], -1).reshape(-1, 2)
+                du * np.stack([half_width + excess * v, excess * v], -1).reshape(-1, 2)
             )
             along_v.append(
-                dv * np.stack([excess * u, a + excess * u], -1).reshape(-1, 2)
+                dv * np.stack([excess * u, half_width + excess * u], -1).reshape(-1, 2)
             )
             corners = tuple(
                 core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1)
@@ -227,8 +241,8 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
 
 
 def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as parts P
-    and Q of rho P + Q, each with its derivative.
+    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as
+    parts P and Q of rho P + Q, each with its derivative.
 
     Args:
         plan: of the mesh. inside: whether the rings lie in the disc.
@@ -254,28 +268,33 @@ def ring_patch(
     inside: bool,
     radial: IntervalBasis,
 ) -> MeshPatch:
-    """Elements of some rings, both sides; the Jacobians are those of side A.
+    """Elements of some rings on both sides of the diagonal.
+
+    An element maps (g, v) to (1 - g) start(v) + g end(v). Its Jacobian is stored as the
+    parts P and Q of rho P + Q, for side A; side B is its mirror image.
 
     Args:
         plan: of the mesh. numbers: hands out global numbers.
         rings: counted from the core. inside: whether they lie in the disc.
         radial: basis along the radius.
     """
-    ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
+    ring_ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
     first = 0 if inside else len(plan.inner)
-    cuts = np.concatenate([[0.0], plan.sectors])
+    sector_ends = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
     angular = polynomial_interval(plan.angular, plan.angular + 5)
     jacobians: list[tuple[np.ndarray, ...]] = []
     vectors: list[list[list[int]]] = [[], []]
     scalars: list[list[list[int]]] = [[], []]
     for ring in rings:
-        g0 = ends[ring - first]
-        dg = ends[ring - first + 1] - ends[ring - first]
+        g0 = ring_ends[ring - first]
+        dg = ring_ends[ring - first + 1] - ring_ends[ring - first]
         for j in range(n):
-            dv = cuts[j + 1] - cuts[j]
+            dv = sector_ends[j + 1] - sector_ends[j]
             g, v = np.meshgrid(
-                g0 + dg * radial.point, cuts[j] + dv * angular.point, indexing="ij"
+                g0 + dg * radial.point,
+                sector_ends[j] + dv * angular.point,
+                indexing="ij",
             )
             start, d_start, end, d_end = ring_curves(plan, inside, v.ravel())
             g = g.reshape(-1, 1)
@@ -321,25 +340,35 @@ def build_mesh(plan: MeshPlan) -> DiscMesh:
     inner, outer = len(plan.inner), len(plan.outer)
     numbers = FunctionNumbering(inner + outer, len(plan.sectors))
     points = plan.radial + 24  # of the graded rule: masses to 1e-13
-    smooth = polynomial_interval(plan.radial, plan.radial + 5)
+    plain_inside = polynomial_interval(plan.radial, plan.radial + 5)
     patches = [core_patch(plan, numbers)]
     if inner > 1:
         patches.append(
-            ring_patch(plan, numbers, range(inner - 1), inside=True, radial=smooth)
+            ring_patch(
+                plan, numbers, range(inner - 1), inside=True, radial=plain_inside
+            )
         )
-    towards = rim_interval(plan.radial, points, plan.exponents, True)
+    graded_inside = rim_interval(plan.radial, points, plan.exponents, True)
     patches.append(
-        ring_patch(plan, numbers, range(inner - 1, inner), inside=True, radial=towards)
+        ring_patch(
+            plan, numbers, range(inner - 1, inner), inside=True, radial=graded_inside
+        )
     )
-    away = rim_interval(plan.outside, points, plan.exponents, False)
+    graded_outside = rim_interval(plan.outside, points, plan.exponents, False)
     patches.append(
-        ring_patch(plan, numbers, range(inner, inner + 1), inside=False, radial=away)
+        ring_patch(
+            plan, numbers, range(inner, inner + 1), inside=False, radial=graded_outside
+        )
     )
     if outer > 1:
-        far = polynomial_interval(plan.outside, plan.outside + 5)
+        plain_outside = polynomial_interval(plan.outside, plan.outside + 5)
         patches.append(
             ring_patch(
-                plan, numbers, range(inner + 1, inner + outer), inside=False, radial=far
+                plan,
+                numbers,
+                range(inner + 1, inner + outer),
+                inside=False,
+                radial=plain_outside,
             )
         )
     return DiscMesh(

@@ -73,8 +73,8 @@ def rim_interval(
     """Polynomials and singular functions ``d**tau - d``, d the distance to s = 0, or to
     s = 1 if ``at_end``.
 
-    The slope of each singular function is made orthonormal to the slopes before it, which
-    keeps the matrices well conditioned.
+    The slope of each singular function is made orthonormal to the slopes before it,
+    which keeps the matrices well conditioned.
 
     Args:
         degree: of the polynomials. points: of the graded rule.

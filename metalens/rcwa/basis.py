@@ -146,8 +146,15 @@ def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
 def _reduced(
     m: Array, n: Array, operations: tuple[Operation, ...], field: int
 ) -> OrderSet:
-    """One order of each orbit, without those that an operation maps to themselves with
-    the field reversed: they vanish.
+    """One order of each orbit under the symmetry operations.
+
+    Orders vanish, and are left out, if an operation maps them to themselves with the
+    field reversed.
+
+    Args:
+        m, n: (k,) all orders.
+        operations: symmetries.
+        field: 0 to 3 for Ex, Ey, Ez, Hz.
     """
     images = np.stack([(sx * m) * 4096 + sy * n for sx, sy, _ in operations])
     codes = images[0]
@@ -165,7 +172,12 @@ def _link(
     operations: tuple[Operation, ...],
     reach: tuple[int, int],
 ) -> tuple[Array, Array]:
-    """How a function that all operations leave as it is couples two sets."""
+    """Coupling of two order sets by a function with all symmetries.
+
+    Returns:
+        (k, l, operations) places in the flat table of its Fourier coefficients, and
+        their weights.
+    """
     dm, dn = (
         np.stack([row[:, None] - s * column for s in flips], axis=-1)
         for row, column, flips in (
@@ -267,8 +279,7 @@ def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> Plan
 
 
 def normal_component(kappa: Array, index: complex) -> Array:
-    """kz / k0 = sqrt(n^2 - kappa^2) of outgoing or decaying waves (imaginary part >=
-    0).
+    """kz / k0 = sqrt(n^2 - kappa^2) of outgoing or decaying waves, Im(kz) >= 0.
 
     Args:
         kappa: (n,) |k| / k0. index: refractive index n of the medium.
@@ -279,8 +290,7 @@ def normal_component(kappa: Array, index: complex) -> Array:
 
 
 def half_space(waves: PlaneWaves, index: complex) -> tuple[Array, Array]:
-    """(u, w) of outgoing waves of unit electric amplitude; (u, -w) are the incoming
-    ones.
+    """(u, w) of outgoing waves of unit electric amplitude; incoming waves have (u, -w).
 
     Args:
         waves: p and s waves. index: refractive index of the half-space.

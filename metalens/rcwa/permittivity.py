@@ -265,10 +265,10 @@ def _nearest(
         px, py: (...) points in the middle rectangle, um.
     """
     sites = _sites(cell)
-    parts = [arrays for outline in outlines for arrays in outline.parts]
+    parts = [part for outline in outlines for part in outline.parts]
     if all(isinstance(p, EllipseArc) and p.half_x_um == p.half_y_um for p in parts):
-        radii = np.repeat([arrays.half_x_um for arrays in parts], len(sites))  # type: ignore[union-attr]
-        centres = [arrays.centre_um + sites for arrays in parts]  # type: ignore[union-attr]
+        radii = np.repeat([part.half_x_um for part in parts], len(sites))  # type: ignore[union-attr]
+        centres = [part.centre_um + sites for part in parts]  # type: ignore[union-attr]
         return _nearest_circle(np.concatenate(centres), radii, px, py)
     from scipy.spatial import cKDTree
 

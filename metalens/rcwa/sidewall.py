@@ -62,8 +62,8 @@ def wall_sections(
         )
 
     return [
-        section(i, *layer_and_growth)
-        for i, layer_and_growth in enumerate(sections_with_growth(cell))
+        section(i, layer, grow_um)
+        for i, (layer, grow_um) in enumerate(sections_with_growth(cell))
     ]
 
 
@@ -131,6 +131,9 @@ def gauss_collocation(stages: int) -> tuple[Array, Array, Array]:
 
 def panel_transfer(section: WallSection, low: float, high: float, stages: int) -> Array:
     """(2 n, 2 n) transfer matrix of (u, w) from the upper to the lower end of a panel.
+
+    Gauss collocation of u' = i P w, w' = i Q u, with the stage values of u eliminated
+    from one linear system.
 
     Args:
         section: of the wall. low, high: ends of the panel, shares of the height.

@@ -518,9 +518,8 @@ def _refine(
             error = max(error, float(np.abs(truncation.both - film.both).max()))
         if len(history) > sequence.compared and error <= tolerance:
             break
-    largest = 1 + max(
-        1.0, float(np.abs(truncation.both).max())
-    )  # exact ones are passive
+    # the exact response is passive
+    largest = 1 + max(1.0, float(np.abs(truncation.both).max()))
     error = min(error, largest)
     met = error <= tolerance
     reason = (
@@ -668,10 +667,9 @@ def _film_response(problem: CellProblem) -> Truncation:
     for column in problem.columns:
         incident, _ = waves.zero[column]
         scattered = scatter_zero_order(waves, media, [], incident)
-        both[:, column, column] = scattered.t[incident], scattered.r[incident]
-        energy[column] = (
-            abs(scattered.t[incident]) ** 2 + abs(scattered.r[incident]) ** 2
-        )
+        t, r = scattered.t[incident], scattered.r[incident]
+        both[:, column, column] = t, r
+        energy[column] = abs(t) ** 2 + abs(r) ** 2
     return Truncation(both, energy)
 
 
