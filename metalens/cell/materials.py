@@ -289,17 +289,22 @@ def _parse(text: str, *, name: str, where: str) -> Material:
 
 
 def _index_and_slope(
-    wanted: cell.Material | Material, wavelength_um: float
+    material: cell.Material | Material, wavelength_um: float
 ) -> tuple[complex, complex]:
+    """n + ik of a material and its derivative in wavelength, 1/um.
+
+    Raises:
+        MaterialError: a wavelength outside the material's range.
+    """
     if not (math.isfinite(wavelength_um) and wavelength_um > 0):
         raise MaterialError(
             f"wavelength {wavelength_um:.7g} um: need a finite length above 0"
         )
-    if isinstance(wanted, cell.Index):
-        return complex(wanted.n, wanted.k), 0j
-    if isinstance(wanted, cell.Blend):
-        return _blended(wanted, wavelength_um)
-    record = find_material(wanted) if isinstance(wanted, str) else wanted
+    if isinstance(material, cell.Index):
+        return complex(material.n, material.k), 0j
+    if isinstance(material, cell.Blend):
+        return _blended(material, wavelength_um)
+    record = find_material(material) if isinstance(material, str) else material
     low, high = record.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(
@@ -315,17 +320,19 @@ def _index_and_slope(
     return _from_sellmeier(record, wavelength_um)
 
 
-def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
-    """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) /
-    (a + 2 e) + (1 - f) (b - e) /
-    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b,
-    the root that absorbs (of two
-    media that emit no light one does, Im e >= 0); then the offsets."""
-    base, base_rate = _index_and_slope(wanted.base, wavelength_um)
+def _blended(blend: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
+    """Index of a Bruggeman mixture and its slope in wavelength, 1/um.
+
+    f (a - e) / (a + 2 e) + (1 - f) (b - e) / (b + 2 e) = 0 (D. A. G. Bruggeman, Ann.
+    Phys. 416, 636 (1935)) for permittivities a, b. The solution is e = (h + sqrt(h² + 8
+    a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b, the root with Im e >= 0. The offsets
+    of the blend are added to n and k.
+    """
+    base, base_rate = _index_and_slope(blend.base, wavelength_um)
     n, rate = base, base_rate
-    if wanted.other:
-        other, other_rate = _index_and_slope(wanted.other, wavelength_um)
-        f = 1 - wanted.share
+    if blend.other:
+        other, other_rate = _index_and_slope(blend.other, wavelength_um)
+        f = 1 - blend.share
         a = base**2
         b = other**2
         da = 2 * base * base_rate
@@ -338,10 +345,10 @@ def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex
         de = (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
         n = complex(np.sqrt(complex(e.real, max(e.imag, 0.0))))  # below 0 is rounding
         rate = complex(de / (2 * n))
-    n += complex(wanted.n_offset, wanted.k_offset)
+    n += complex(blend.n_offset, blend.k_offset)
     if n.real <= 0 or n.imag < 0:
         raise MaterialError(
-            f"blend of {wanted.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0"
+            f"blend of {blend.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0"
         )
     return n, rate
 
@@ -359,10 +366,10 @@ def _from_sellmeier(record: Material, wavelength_um: float) -> tuple[complex, co
 
 
 def _from_table(record: Material, wavelength_um: float) -> tuple[complex, complex]:
+    """n + ik and its slope by linear interpolation in the table."""
     x, n, k = record.table
     i = min(max(bisect.bisect_right(x, wavelength_um) - 1, 0), len(x) - 2)
     rate = complex(n[i + 1] - n[i], k[i + 1] - k[i]) / (x[i + 1] - x[i])
     share = (wavelength_um - x[i]) / (x[i + 1] - x[i])
-    return complex(
-        n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]
-    ), rate
+    real = n[i] + share * (n[i + 1] - n[i])
+    return complex(real, (1 - share) * k[i] + share * k[i + 1]), rate

@@ -716,9 +716,10 @@ def legendre_bases(
 
 def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Array]:
     """(e,), (x,) positions of Legendre nodes on the lens, um; counts: (y, x)."""
-    hy, hx = case.half_size_um
-    e = np.asarray(legendre.mapped_nodes(counts[0], -hy, hy))
-    x = np.asarray(legendre.mapped_nodes(counts[1], -hx, hx))
+    e, x = (
+        np.asarray(legendre.mapped_nodes(count, -half_um, half_um))
+        for count, half_um in zip(counts, case.half_size_um, strict=True)
+    )
     return e, x
 
 

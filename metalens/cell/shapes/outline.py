@@ -206,10 +206,10 @@ class Outline:
         by its Fourier factors).
         """
         gx, gy = (_PROBES / self.radius_um).T
-        apart = np.abs(
+        difference = np.abs(
             self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)
         ).max()
-        return bool(apart <= _ALIKE * self.area_um2)
+        return bool(difference <= _ALIKE * self.area_um2)
 
     def repeats(self, turn_rad: float) -> bool:
         """Whether a turn in the plane leaves it as it is (judged by its Fourier
@@ -217,10 +217,10 @@ class Outline:
         """
         gx, gy = (_PROBES / self.radius_um).T
         c, s = math.cos(turn_rad), math.sin(turn_rad)
-        apart = np.abs(
+        difference = np.abs(
             self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)
         ).max()
-        return bool(apart <= _ALIKE * self.area_um2)
+        return bool(difference <= _ALIKE * self.area_um2)
 
     @property
     def narrowest_um(self) -> float:
@@ -231,42 +231,46 @@ class Outline:
 
     @property
     def spans_um(self) -> tuple[float, float]:
-        """Least width of what is solid (walls of rings, bars of crosses) and least
-        space within (holes, hollows; inf).
+        """Least solid width (walls of rings, bars of crosses) and least space within
+        (holes, hollows; inf), um.
 
-        Convex outlines and holes between parallel lines, all else edge to edge, where
-        one lies before the other (edges
-        that share a corner do not). Curves are taken as 64 edges of the same area: 1e-3
-        of their radius.
+        Convex outlines and holes are measured between parallel lines. All else is
+        measured between opposite edges without a common corner. Curves are taken as 64
+        edges of the same area: 1e-3 of their radius.
         """
         parts = [corners[::sign] for sign, corners in self.polygons()]
-        bends = [
+        hollow = [
             _bends(corners[:: part.sign])
             for corners, part in zip(parts, self.parts, strict=True)
         ]
         start = np.concatenate(parts)
         end = np.concatenate([np.roll(c, -1, axis=0) for c in parts])
-        of = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
+        part_number = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
         along = (end - start) / np.hypot(*(end - start).T)[:, None]
-        i, j = np.nonzero(
-            along @ along.T < -_ALIKE
-        )  # those that run against each other
-        counted = (of[i] != of[j]) | np.array(bends)[of[i]]
+        # pairs of edges that run against each other
+        i, j = np.nonzero(along @ along.T < -_ALIKE)
+        counted = (part_number[i] != part_number[j]) | np.array(hollow)[part_number[i]]
         counted &= (start[i] != end[j]).any(axis=1) & (end[i] != start[j]).any(axis=1)
         i, j = i[counted], j[counted]
         holes = [
-            _across(c) for c, bent in zip(parts[1:], bends[1:], strict=True) if not bent
+            _across(c)
+            for c, is_hollow in zip(parts[1:], hollow[1:], strict=True)
+            if not is_hollow
         ]
         solid, space = self.narrowest_um, min(holes, default=math.inf)
         for tip in (
             start[i] + _ASIDE * (end - start)[i],
             end[i] - _ASIDE * (end - start)[i],
         ):
-            foot, before = _foot(tip, start[j], end[j])
+            foot, is_opposite = _foot(tip, start[j], end[j])
             within = self.inside(*((tip + foot) / 2).T)
-            away = np.hypot(*(tip - foot).T)
-            solid = min(solid, float(away[before & within].min(initial=math.inf)))
-            space = min(space, float(away[before & ~within].min(initial=math.inf)))
+            distance = np.hypot(*(tip - foot).T)
+            solid = min(
+                solid, float(distance[is_opposite & within].min(initial=math.inf))
+            )
+            space = min(
+                space, float(distance[is_opposite & ~within].min(initial=math.inf))
+            )
         return solid, space
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
@@ -280,10 +284,10 @@ class Outline:
         for x, y in steps:
             if math.hypot(x, y) - 2 * self.radius_um >= gap:
                 continue
-            there = points + np.array([x, y])
-            if self.inside(*there.T).any():
+            copy = points + np.array([x, y])
+            if self.inside(*copy.T).any():
                 return 0.0
-            gap = min(gap, float(tree.query(there)[0].min()))
+            gap = min(gap, float(tree.query(copy)[0].min()))
         return gap
 
 
@@ -295,15 +299,15 @@ def offset_corners(corners: Array, grow_um: float) -> tuple[Point, ...]:
     """
     points = _anticlockwise(corners)
     edge = np.roll(points, -1, axis=0) - points
-    out = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-    before = np.roll(out, 1, axis=0)
-    mitre = (out + before) / (1 + (out * before).sum(axis=1))[:, None]
-    made = points + grow_um / 2 * mitre
-    if ((np.roll(made, -1, axis=0) - made) * edge).sum(axis=1).min() <= 0:
+    normals = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    previous = np.roll(normals, 1, axis=0)
+    mitre = (normals + previous) / (1 + (normals * previous).sum(axis=1))[:, None]
+    moved = points + grow_um / 2 * mitre
+    if ((np.roll(moved, -1, axis=0) - moved) * edge).sum(axis=1).min() <= 0:
         raise CellError(
             f"an outline moved in by {-grow_um / 2:.4g} um loses an edge; need a larger size or less bias"
         )
-    return tuple((float(x), float(y)) for x, y in made)
+    return tuple((float(x), float(y)) for x, y in moved)
 
 
 def rotate_corners(corners: Array, angle_rad: float) -> Array:
@@ -313,19 +317,19 @@ def rotate_corners(corners: Array, angle_rad: float) -> Array:
 
 
 def _across(corners: Array) -> float:
-    """Least distance of parallel lines with a polygon between them."""
+    """Least width of a polygon: distance of the closest parallel lines around it."""
     edge = np.roll(corners, -1, axis=0) - corners
-    across = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-    reach = corners @ np.concatenate([across, _DIRECTIONS]).T
+    normals = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    reach = corners @ np.concatenate([normals, _DIRECTIONS]).T
     return float(np.ptp(reach, axis=0).min())
 
 
 def _bends(corners: Array) -> bool:
-    """Whether an anticlockwise polygon has hollows."""
+    """Whether an anticlockwise polygon is not convex."""
     edge = np.roll(corners, -1, axis=0) - corners
-    after = np.roll(edge, -1, axis=0)
+    next_edge = np.roll(edge, -1, axis=0)
     return bool(
-        (edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]).min()
+        (edge[:, 0] * next_edge[:, 1] - edge[:, 1] * next_edge[:, 0]).min()
         < -_ALIKE * np.abs(edge).max() ** 2
     )
 
@@ -340,15 +344,18 @@ def _foot(tip: Array, start: Array, end: Array) -> tuple[Array, Array]:
 
 
 def _anticlockwise(points: Array) -> Array:
+    """(n, 2) corners in anticlockwise order."""
     return points if _signed_area(points) > 0 else points[::-1]
 
 
 def _signed_area(points: Array) -> float:
+    """Area of a polygon, positive if anticlockwise (shoelace formula)."""
     x, y = points.T
     return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
 
 
 def _centroid(points: Array, area: float) -> Array:
-    after = np.roll(points, -1, axis=0)
-    cross = points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]
-    return np.asarray(((points + after) * cross[:, None]).sum(axis=0) / (6 * area))
+    """(2,) centroid of a polygon of this signed area."""
+    following = np.roll(points, -1, axis=0)
+    cross = points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]
+    return np.asarray(((points + following) * cross[:, None]).sum(axis=0) / (6 * area))
