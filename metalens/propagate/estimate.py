@@ -226,7 +226,8 @@ def _direct_fields(
     node_light: NodeLight, components: Array, depths: Array, row: Array, column: Array
 ) -> Array:
     """(component, depth, point) fields at window pixels, summed over the nodes."""
-    case, (e, x) = node_light.case, node_light.nodes_um
+    case = node_light.case
+    e, x = node_light.nodes_um
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
     phase_rad = depth_factors(case, e[:, None], x, case.tangents, inverse)
     phase_rad = phase_rad - case.wavenumber * np.asarray(to_sensor(case, x, e[:, None]))
@@ -256,14 +257,16 @@ def _own_mixing(
         depths: indices. pixel: (row, column) of the window.
         pupils: mixing for the middle of a case's window.
     """
-    case, (e, x) = node_light.case, node_light.nodes_um
+    case = node_light.case
+    e, x = node_light.nodes_um
     Y, X = (
         float(positions[index])
         for positions, index in zip(case.window_um, pixel, strict=True)
     )
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
     kernel = rayleigh_sommerfeld_kernel(case, x, e[:, None], X, Y, inverse)
-    (few_e, weights_e), (few_x, weights_x) = _fewer_nodes(e), _fewer_nodes(x)
+    few_e, weights_e = _fewer_nodes(e)
+    few_x, weights_x = _fewer_nodes(x)
     waves = weights_e @ (node_light.light[:, None] * kernel) @ weights_x.T
 
     def intensity(centre: PropagationCase) -> Array:

@@ -205,7 +205,8 @@ def _part(
     case: PropagationCase, row_span: tuple[int, int], column_span: tuple[int, int]
 ) -> PropagationCase:
     """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
-    (my, mx), (x, y) = case.samples, case.centre_um
+    my, mx = case.samples
+    x, y = case.centre_um
     centre = (
         x + (sum(column_span) - mx) / 2 * case.step_um,
         y + (sum(row_span) - my) / 2 * case.step_um,
@@ -357,7 +358,8 @@ def _check_rays(case: PropagationCase) -> None:
     if case.behind is None or case.behind.thickness_um[0] > 0:
         return
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    (lens_y, lens_x), (half_y, half_x) = case.half_size_um, case.half_window_um
+    lens_y, lens_x = case.half_size_um
+    half_y, half_x = case.half_window_um
     x = np.abs(
         np.abs(case.centre_um[0]) + half_x + lens_x * np.cos(angles)
     )  # the rim of a round lens, the far corner
@@ -401,10 +403,8 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
         raise PropagationError(
             f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each, samples whole"
         )
-    (width, height), (columns, rows) = (
-        np.resize(widths, 2).tolist(),
-        np.resize(counts.astype(int), 2).tolist(),
-    )
+    width, height = np.resize(widths, 2).tolist()
+    columns, rows = np.resize(counts.astype(int), 2).tolist()
     step = width / max(columns, 1)
     if abs(height / max(rows, 1) - step) > 1e-6 * abs(step):
         raise PropagationError(

@@ -580,7 +580,8 @@ def _gather(
         plan: blocks and weights.
     """
     maps = phase.detach().numpy(), level.detach().numpy()
-    (rows, columns), (m, n) = plan.blocks, plan.counts
+    rows, columns = plan.blocks
+    m, n = plan.counts
     moments = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
     compiled_loop: Any = grid_pillars
     tile_powers: list[float] = []
@@ -671,7 +672,8 @@ def _spread(
     targets = tuple(
         empty if gradient is None else gradient.numpy() for gradient in gradients
     )
-    rows, (m, n) = plan.blocks[0], plan.counts
+    rows = plan.blocks[0]
+    m, n = plan.counts
     moment_gradient = grad.movedim(0, 1).reshape(m, 2 * n)
     compiled_loop: Any = interpolate_to_pillars
     fixed = _block_arrays(plan, phase.dtype)
@@ -710,7 +712,8 @@ def _node_gradients(
         panel: block rows.
         moment_gradient: (m, re/im · n) gradients of the moments.
     """
-    (rows, columns), n = plan.blocks, plan.counts[1]
+    rows, columns = plan.blocks
+    n = plan.counts[1]
     first_node, last_node = panel.start * rows.nodes, panel.stop * rows.nodes
     sums = torch.cat(
         [
@@ -886,7 +889,9 @@ def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ig
     the column nodes. Returns the sum of squares of the transmission, NaN where a phase
     of a closed tile is not finite.
     """
-    (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
+    ny, nx = phase.shape
+    nodes, length = shares[0].shape
+    chunk = table.shape[3]
     rows = np.zeros((4, 2, chunk), out.dtype)
     sums = np.empty((nodes, 2, chunk), out.dtype)
     padded = np.zeros((nodes, length + 4), out.dtype)
@@ -993,7 +998,9 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
     grad: as ``out`` there. out_phase, out_level: (y, x), written in place; an empty
     array asks for no gradient.
     """
-    (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
+    ny, nx = phase.shape
+    nodes, length = shares[0].shape
+    chunk = table.shape[3]
     row = np.empty((2, chunk), grad.dtype)
     re, im = np.empty(chunk, grad.dtype), np.empty(chunk, grad.dtype)
     sums = np.zeros(((nodes + 3) // 4 * 4, 2, chunk), grad.dtype)

@@ -148,10 +148,8 @@ def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]
     if behind is None:
         return np.ones_like(w), np.ones_like(w)
     powers = media.passed_apart(behind.order, w)
-    inverse_phase, (mean_real, mean_imaginary) = (
-        1 / (k * media.whole_path(behind.layers, w)),
-        saddle_correction(behind, k, case.reach_um).at(w),
-    )
+    inverse_phase = 1 / (k * media.whole_path(behind.layers, w))
+    mean_real, mean_imaginary = saddle_correction(behind, k, case.reach_um).at(w)
     amplitudes = []
     saddles = (
         saddle_correction(behind, k, case.reach_um, "s"),

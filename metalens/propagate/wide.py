@@ -328,7 +328,8 @@ def _band(case: PropagationCase, i: int, extra: float) -> float:
         i: 0 for y, 1 for x.
         extra: enlargement of the window along the axis, um.
     """
-    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, hx = case.half_size_um
+    wy, wx = case.half_window_um
     ends = np.array([-1.0, 0.0, 1.0])
     y, x, Y, X = np.meshgrid(ends * hy, ends * hx, ends * wy, ends * wx, indexing="ij")
     if i == 0:
@@ -728,7 +729,8 @@ def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tenso
         fields: (b, y, x) complex.
         coefficients: (depth, b).
     """
-    depths, (count, my, mx) = len(coefficients), fields.shape
+    depths = len(coefficients)
+    count, my, mx = fields.shape
     step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
     bands = []
     out = None if fields.requires_grad else fields.real.new_empty((depths, my, mx))

@@ -242,7 +242,8 @@ def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array
         case: geometry of the propagation.
         x, y: (node,) positions on the lens, um; one of them None.
     """
-    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, hx = case.half_size_um
+    wy, wx = case.half_window_um
     inverse = np.array(
         [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
     )
@@ -266,7 +267,8 @@ def _over_directions(case: PropagationCase, p: Array) -> Array:
 
     The lines cover three lens rows and the window probes.
     """
-    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, _ = case.half_size_um
+    wy, wx = case.half_window_um
     grid = np.meshgrid(
         np.array([-0.9, 0.0, 0.9]) * hy,
         probe_positions() * wx,
@@ -290,7 +292,8 @@ def _over_window(
         span: lowest and highest p.
         line: (node,) values of the one variable; the others take a few probe values.
     """
-    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, _ = case.half_size_um
+    wy, wx = case.half_window_um
     low, high = span
     middle, half_range = (low + high) / 2, (high - low) / 2
     probes = {
@@ -481,7 +484,8 @@ def build_operators(
         chosen: counts of nodes and directions.
         tolerance: relative error of the field.
     """
-    (ny, nx), directions = chosen.nodes, chosen.directions
+    ny, nx = chosen.nodes
+    directions = chosen.directions
     high_y, high_x = case.half_size_um
     e = legendre.mapped_nodes(ny, -high_y, high_y)
     x = legendre.mapped_nodes(nx, -high_x, high_x)
@@ -529,8 +533,10 @@ def _low_rank(
     Returns:
         lens_terms (p, e, r), window_terms (X, Y, r) and strengths (r,).
     """
-    (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
-    (my, mx), (me, mp) = chosen.window, chosen.lens
+    wy, wx = case.half_window_um
+    hy, _ = case.half_size_um
+    my, mx = chosen.window
+    me, mp = chosen.lens
     Y = legendre.mapped_nodes(my, -wy, wy)
     X = legendre.mapped_nodes(mx, -wx, wx)
     e = legendre.mapped_nodes(me, -hy, hy)
@@ -913,7 +919,8 @@ def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     Each tile is cut where the next one begins.
     """
     (rows, columns), _ = window_tiles(plan.case, plan.layout.parts)
-    (my, mx), n = plan.case.samples, len(columns)
+    my, mx = plan.case.samples
+    n = len(columns)
     heights = np.diff([*rows, my]).tolist()
     widths = np.diff([*columns, mx]).tolist()
     bands = [
@@ -954,7 +961,8 @@ def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tens
         t: tensors of the tiles.
     """
     tiles, b, e, _ = light.shape
-    p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]
+    p = t["to_directions"].shape[2]
+    X, Y = t["window_terms"].shape[1:3]
     parts = (
         torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(tiles * e, 2 * b, -1)
     )
