@@ -93,11 +93,11 @@ class DispersionFormula:
         c = (*self.coefficients, *(0.0,) * 6)
         w2 = w * w
         if self.number == 7:
-            near = 1 / (w2 - 0.028)
+            inverse = 1 / (w2 - 0.028)
             return (
                 c[0]
-                + c[1] * near
-                + c[2] * near**2
+                + c[1] * inverse
+                + c[2] * inverse**2
                 + c[3] * w2
                 + c[4] * w2**2
                 + c[5] * w2**3

@@ -167,30 +167,37 @@ def find_material(name: str) -> Material:
 def _hint(name: str) -> str:
     """What the word means, the same name in another case, or the nearest."""
     lower = name.lower().strip().replace("_", "-")
-    same = [known for known in NAMES if known.lower() == lower.replace(" ", "")]
-    meant = next(iter(same), SPOKEN.get("-".join(lower.split())))
-    return f"; did you mean {meant!r}?" if meant else nearest_name_hint(name, NAMES)
+    same_name = [
+        material for material in NAMES if material.lower() == lower.replace(" ", "")
+    ]
+    suggestion = next(iter(same_name), SPOKEN.get("-".join(lower.split())))
+    return (
+        f"; did you mean {suggestion!r}?"
+        if suggestion
+        else nearest_name_hint(name, NAMES)
+    )
 
 
-def _kin(name: str, wavelength_um: float) -> str:
+def _table_hint(name: str, wavelength_um: float) -> str:
     """Shipped tables of the same substance that hold at a wavelength, in the words of a
     message.
     """
-    alike = [
-        known
-        for known in NAMES
-        if known != name and _substance(known) == _substance(name)
+    same_substance = [
+        material
+        for material in NAMES
+        if material != name and _substance(material) == _substance(name)
     ]
-    ranges = {known: find_material(known).range_um for known in alike}
-    held = [
-        repr(known)
-        for known, (low, high) in ranges.items()
+    ranges = {material: find_material(material).range_um for material in same_substance}
+    in_range = [
+        repr(material)
+        for material, (low, high) in ranges.items()
         if low <= wavelength_um <= high
     ]
-    return f" ({' or '.join(held)} holds there)" if held else ""
+    return f" ({' or '.join(in_range)} holds there)" if in_range else ""
 
 
 def _substance(name: str) -> list[str]:
+    """Words of a material's name without phase, axis and process."""
     return [
         word
         for word in name.split("-")
@@ -303,13 +310,13 @@ def _index_and_slope(
     if isinstance(material, cell.Index):
         return complex(material.n, material.k), 0j
     if isinstance(material, cell.Blend):
-        return _blended(material, wavelength_um)
+        return _bruggeman(material, wavelength_um)
     record = find_material(material) if isinstance(material, str) else material
     low, high = record.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(
             f"{record.name} at {wavelength_um} um: its source holds from {low:.6g} to {high:.6g} um ({record.source}); "
-            f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
+            f"choose a wavelength inside, another material{_table_hint(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:
         n = record.page[0].at(wavelength_um)
@@ -320,7 +327,7 @@ def _index_and_slope(
     return _from_sellmeier(record, wavelength_um)
 
 
-def _blended(blend: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
+def _bruggeman(blend: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
     """Index of a Bruggeman mixture and its slope in wavelength, 1/um.
 
     f (a - e) / (a + 2 e) + (1 - f) (b - e) / (b + 2 e) = 0 (D. A. G. Bruggeman, Ann.

@@ -152,10 +152,11 @@ def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMa
         total[1] += sum_blocks(patch.vector, curl, nv)
         total[2] += sum_blocks(patch.scalar, scalar, ns)
     disc = CellMatrices(*sums[True])
-    rest = sums[False]
-    return CellMatrices(
-        disc.mass + rest[0], disc.curl + rest[1], disc.scalar + rest[2]
-    ), disc
+    outside = sums[False]
+    whole = CellMatrices(
+        disc.mass + outside[0], disc.curl + outside[1], disc.scalar + outside[2]
+    )
+    return whole, disc
 
 
 def assemble_disc(rho: float, plan: MeshPlan) -> AssembledDisc:

@@ -66,8 +66,8 @@ def congruence_product(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     have no diagonal, are left out.
     """
     rows = np.flatnonzero(inner.diagonal())
-    few = outer[rows]
-    product: np.ndarray = few.T @ (inner.take(rows, 0).take(rows, 1) @ few)
+    reduced = outer[rows]
+    product: np.ndarray = reduced.T @ (inner.take(rows, 0).take(rows, 1) @ reduced)
     return product
 
 

@@ -151,7 +151,7 @@ def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
     te_block = add_diagonal(
         -k2 * contrast * basis.disc_mass[:te_count, :te_count], basis.te - k2 * around
     )
-    te, te_low, rest = low_levels(te_block, basis.te, k2 * abs(contrast))
+    te, te_low, te_coupling = low_levels(te_block, basis.te, k2 * abs(contrast))
     tm_block = add_diagonal(
         k2 * contrast * basis.disc_mass[te_count:, te_count:], k2 * around
     )
@@ -170,7 +170,7 @@ def electric_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
         coupling,
         turn,
         CoordinateTurn(tm_turn, tm_count),
-        rest,
+        te_coupling,
         None,
         dual=False,
     )
@@ -184,24 +184,26 @@ def magnetic_pencil(basis: HomogeneousBasis, medium: LayerMedium) -> LayerPencil
         basis: homogeneous modes. medium: wavenumber and permittivities, lossless.
     """
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
-    a, b, k2 = len(basis.te), len(basis.tm), medium.k0**2
+    te_count, tm_count, k2 = len(basis.te), len(basis.tm), medium.k0**2
     weighted = definite_inverse(add_diagonal((disc - around) * basis.disc_mass, around))
     curl = add_diagonal((disc - around) * basis.disc_curl, around * basis.te - k2)
-    te, te_turn = whitened_levels(weighted[:a, :a], curl)
-    tm_block = add_diagonal(-k2 * weighted[a:, a:], basis.tm)
-    tm, tm_low, rest = low_levels(tm_block, basis.tm, k2 * abs(1 / disc - 1 / around))
-    turn = CoordinateTurn(tm_low * medium.k0, b, medium.k0)
-    coupling = turn.apply_transposed(weighted[a:, :a] @ te_turn).T
+    te, te_turn = whitened_levels(weighted[:te_count, :te_count], curl)
+    tm_block = add_diagonal(-k2 * weighted[te_count:, te_count:], basis.tm)
+    tm, tm_low, tm_coupling = low_levels(
+        tm_block, basis.tm, k2 * abs(1 / disc - 1 / around)
+    )
+    turn = CoordinateTurn(tm_low * medium.k0, tm_count, medium.k0)
+    coupling = turn.apply_transposed(weighted[te_count:, :te_count] @ te_turn).T
     return LayerPencil(
         te,
         tm,
         np.sign(te),
-        -np.ones(b),
+        -np.ones(tm_count),
         coupling,
-        CoordinateTurn(te_turn, a),
+        CoordinateTurn(te_turn, te_count),
         turn,
         None,
-        rest,
+        tm_coupling,
         dual=True,
     )
 

@@ -19,12 +19,10 @@ from metalens.propagate.moments import Pupils
 from metalens.propagate.paths import rayleigh_sommerfeld_kernel, to_sensor
 from metalens.propagate.window import depth_factors
 
-POINTS, EVERY = (
-    128,
-    32,
-)  # least number of points, and pixels to a point in a large window
+# least number of points, and pixels to a point in a large window
+POINTS, EVERY = 128, 32
 FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed WORK
-DEPTHS = 8  # judged at most
+DEPTHS = 8  # largest number of depths that are sampled
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
 NEAR = 9  # pixels along a side of the neighbourhood of a pixel
@@ -164,7 +162,7 @@ def draw_pixels(
 
 
 def _sample(
-    windows: list[list[NodeLight]], intensity: list[Array], count: int, most: int
+    windows: list[list[NodeLight]], intensity: list[Array], count: int, most_depths: int
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Sample of depths and pixels at which the PSFs are computed directly.
 
@@ -173,15 +171,19 @@ def _sample(
 
     Args:
         windows, intensity: as :func:`relative_error`.
-        count: of pixels. most: of depths.
+        count: of pixels. most_depths: largest number of depths.
 
     Returns:
         (depth, pixel) light of sum 1, (depth,) sums, indices of depths, and sampled
         pixels with their chances.
     """
-    number = len(intensity[0])
-    depths = np.linspace(0, number - 1, min(number, most)).round().astype(int)
-    parts = [part.reshape(number, -1)[depths] for part in intensity]
+    depth_count = len(intensity[0])
+    depths = (
+        np.linspace(0, depth_count - 1, min(depth_count, most_depths))
+        .round()
+        .astype(int)
+    )
+    parts = [part.reshape(depth_count, -1)[depths] for part in intensity]
     light = np.concatenate(parts, axis=1, dtype=float)
     energy = light.sum(1)
     light /= energy[:, None]

@@ -84,20 +84,19 @@ def ray_to_offset(
         case: geometry of the propagation.
     """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
-    more = X * X + Y * Y + 2 * (X * dx + Y * dy)
+    change = X * X + Y * Y + 2 * (X * dx + Y * dy)
     behind, reach2 = case.media, dx * dx + dy * dy
     w0 = media.solve_direction_square(behind.layers, reach2)
-    w, away = media.path_difference(behind.layers, w0, reach2, more)
-    return ray_amplitude(behind, case.wavenumber, w, case.reach_um), away
+    w, difference = media.path_difference(behind.layers, w0, reach2, change)
+    return ray_amplitude(behind, case.wavenumber, w, case.reach_um), difference
 
 
 def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> Any:
-    """Complex amplitude of the module's heading for the ray of w = p², the phase kL
-    taken off.
+    """Complex amplitude of the ray of w = p² without its phase kL (see the module).
 
     Args:
         behind: media from lens to sensor. wavenumber: in vacuum, rad/um.
-        w: squared p of the rays. reach_um: largest lateral way of any ray.
+        w: squared p of the rays. reach_um: largest lateral distance of any ray.
     """
     magnitude, in_phase, quadrature = ray_amplitude_parts(
         behind, wavenumber, behind.layers, w, reach_um

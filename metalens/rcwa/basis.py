@@ -229,7 +229,10 @@ class PlaneWaves:
 
 
 def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> PlaneWaves:
-    """p and s waves around the zero order.
+    """p and s waves of the reduced orders, around the zero order.
+
+    k = k_tangential + (m λ / px, n λ / py) over k0. A p wave has its electric field
+    along k, an s wave across it. ``fold`` maps their amplitudes to Ex and Ey.
 
     Args:
         space: reduced orders. cell: its lattice gives the steps of k.

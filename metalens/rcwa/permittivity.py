@@ -183,17 +183,17 @@ def _disc_normal_tables(
 
 
 @lru_cache(maxsize=32)
-def _radial_field(most: int) -> tuple[Array, Array]:
+def _radial_field(largest_order: int) -> tuple[Array, Array]:
     """Fourier coefficients of x^2/r^2 and x y/r^2 over the unit cell, orders 0 to
-    ``most`` on both axes.
+    ``largest_order`` on both axes.
 
     Each eighth of the cell is mapped to a square (x = s, y = s v), where the field
     depends on v alone and the integrand is smooth: Gauss-Legendre is exact to rounding.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(3 * most // 2 + 30)
+    nodes, weights = np.polynomial.legendre.leggauss(3 * largest_order // 2 + 30)
     s, ws = (nodes + 1) / 4, weights / 4
     v, wv = (nodes + 1) / 2, weights / 2
-    angle = 2 * np.pi * np.arange(most + 1)
+    angle = 2 * np.pi * np.arange(largest_order + 1)
     along = angle[:, None] * s
     across = angle[:, None, None] * (s[:, None] * v)
     area = 4 * ws * s
@@ -290,14 +290,14 @@ def _nearest_circle(
     centres: Array, radii: Array, px: Array, py: Array
 ) -> tuple[Array, Array]:
     """As :func:`_nearest`, for circles (k, 2) and (k,): normals lie on their radii."""
-    least = np.full(px.shape, np.inf)
+    least_distance = np.full(px.shape, np.inf)
     products_sum, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
     for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True):
         dx, dy = px - x, py - y
         square = dx**2 + dy**2
         distance = np.abs(np.sqrt(square) - radius)
-        nearer = distance < least - _TIE * radius
-        nearest = distance < least + _TIE * radius
+        nearer = distance < least_distance - _TIE * radius
+        nearest = distance < least_distance + _TIE * radius
         products_sum = np.where(nearer, 0.0, products_sum)
         count = np.where(nearer, 0.0, count)
         at_centre = square < (_TIE * radius) ** 2  # no direction is preferred there
@@ -305,8 +305,8 @@ def _nearest_circle(
         products = np.stack([dx * dx, dy * dy, dx * dy]) / scale
         products[:2, at_centre] = 0.5
         products_sum, count = products_sum + nearest * products, count + nearest
-        least = np.minimum(least, distance)
-    return products_sum / count, least
+        least_distance = np.minimum(least_distance, distance)
+    return products_sum / count, least_distance
 
 
 def _sites(cell: Cell) -> Array:
@@ -314,8 +314,8 @@ def _sites(cell: Cell) -> Array:
     rectangle.
     """
     steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
-    most = 1.6 * max(cell.lattice.periods_um(cell.pitch_um))
-    return np.asarray(steps[np.abs(steps).max(axis=1) < most])
+    largest = 1.6 * max(cell.lattice.periods_um(cell.pitch_um))
+    return np.asarray(steps[np.abs(steps).max(axis=1) < largest])
 
 
 def _wrapped(cell: Cell, x_um: Array, y_um: Array) -> tuple[Array, Array]:

@@ -222,10 +222,10 @@ def _layer_reflection(
     if not modes.symmetric:
         # up + down = W^-1 U a and up - down = V^-1 V' a of the pair (U, V') above
         U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
-        sum_part = np.linalg.solve(modes.W, U)
+        total = np.linalg.solve(modes.W, U)
         difference = np.linalg.solve(modes.V, V)
-        back = (sum_part - difference) @ np.linalg.inv(sum_part + difference)
-        return back[:, :reaching] * fade, fade
+        reflection = (total - difference) @ np.linalg.inv(total + difference)
+        return reflection[:, :reaching] * fade, fade
     wv = _transposed_product(pair[0], modes.V)
     vw = _transposed_product(pair[1], modes.W)
     return np.linalg.solve(wv + vw, (wv - vw)[:, :reaching] * fade), fade

@@ -90,9 +90,9 @@ class Ring:
         """
         outer = _half(size_um + grow_um)
         inner = self.ratio * size_um / 2 - grow_um / 2
-        whole = EllipseArc(outer, outer)
+        rim = EllipseArc(outer, outer)
         return Outline(
-            (whole, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (whole,)
+            (rim, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (rim,)
         )
 
 
