@@ -199,7 +199,7 @@ def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
 
 
 def _parts(block: dict[str, Any], where: str) -> tuple[Part | None, Part | None]:
-    """n and k of an entry, None for what it does not hold."""
+    """n and k of an entry, None for each that it lacks."""
     kind = _words(block, "type")
     if kind.startswith("formula"):
         return _formula(block, kind, where), None
@@ -335,7 +335,13 @@ def _numbers(line: str) -> list[float]:
 def _merge_rows(
     rows: list[list[float]], where: str
 ) -> tuple[list[list[float]], list[tuple[float, float, str]]]:
-    """Rows with at most two at one wavelength, and a fault at each such step."""
+    """Rows with at most two at one wavelength, and a fault at each such step.
+
+    Of three or more rows at one wavelength the first and the last remain.
+
+    Args:
+        rows: sorted by wavelength. where: name for messages.
+    """
     distinct: list[list[float]] = []
     faults = []
     for row in rows:

@@ -272,6 +272,7 @@ def _read_csv(path: Path, stamp: tuple[int, int]) -> Material:
 
 @lru_cache(maxsize=64)
 def _shipped(name: str) -> Material:
+    """Material of a name in the tables and pages of the package."""
     if name in _PAGES:
         file = (
             importlib.resources.files("metalens")

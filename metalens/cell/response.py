@@ -21,7 +21,7 @@ class Response:
         substrate that absorbs, powers of light that comes and that is reflected do not
         add, and it may exceed 1.
     engine: ``rcwa``, ``modal`` or ``film``.
-    converged: whether ``t_error`` meets the tolerance that was asked for.
+    converged: whether ``t_error`` meets the requested tolerance.
     reason: why the solver stopped, in words.
     """
 

@@ -21,8 +21,8 @@ from metalens.modal.dense import (
 from metalens.modal.homogeneous import HomogeneousBasis
 from metalens.modal.layer import LayerMedium, axial_wavenumber
 
-# levels up to this many times the most that permittivities add to a diagonal are
-# diagonalised
+# levels are diagonalised up to this multiple of the largest contribution of the
+# permittivities to the diagonal
 LOW = 32.0
 SPARE = (
     3.0  # low levels reach this many times the level of the weakest mode that carries
@@ -30,16 +30,16 @@ SPARE = (
 EXTRA = 60.0  # and this much further
 ROUNDS = 6  # of enlarging the low levels, at most
 STEPS = 80  # of the fixed point, at most
-WHOLE = 1  # of them on all rows, before
+WHOLE = 1  # of them on all rows, at the start
 ROUNDING = 1e-14  # of the largest element
-# change of the slow rows, in that of the last whole step, at which all rows move again
+# change of the slow rows, over that of the last full step, below which a full step
+# follows
 SETTLED = 0.03
 SLOW = 8  # the rows of the lowest eighth of the levels go on alone
-# of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of
-# it
+# accuracy in single precision, relative to the lowest level; rounding is 1e-7 of it
 ROUGH = 3e-7
-# accuracies from it on are met by that: answers move by 7e-8 on coarse meshes, 4e-3 of
-# a bar on good
+# single precision suffices from this accuracy on: results change by 7e-8 on coarse
+# meshes, by 4e-3 of the error bar on fine ones
 SINGLE = 3e-8
 STRIPS = 4  # of rows of a product whose other half is a mirror image
 
@@ -89,8 +89,8 @@ class LayerPencil:
     te (a,), tm (b,): levels. te_sign, tm_sign: of growth. coupling: (a, b).
     te_turn, tm_turn: fields of the y in the homogeneous basis. dual: the unknown is the
     partner.
-    te_rest (a, a) or tm_rest (b, b): of growth⁻¹ stiffness beside the levels, zero
-    among the low ones; the other None.
+    te_rest (a, a) or tm_rest (b, b): off-diagonal part of growth⁻¹ stiffness, zero
+    between the low levels; the other None.
     """
 
     te: np.ndarray
@@ -480,7 +480,7 @@ def few_modes(pencil: LayerPencil, height: float, *, weak: float) -> FewModes | 
 
     Args:
         pencil: of the layer. height: in half pitches.
-        weak: the accuracy asked for, relative; weaker modes are left out.
+        weak: relative accuracy; modes weaker than this are left out.
     """
     carrying = carrying_modes(pencil, height, weak, 0.1 * math.sqrt(weak))
     if carrying is None:

@@ -22,7 +22,7 @@ CARRY = 1e-13
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfSpace:
-    """A homogeneous half-space seen through its films, in the homogeneous modes.
+    """A homogeneous half-space behind its films, in the homogeneous modes.
 
     Waves that go away have p = Y u. Of the orders that propagate (``ports``), incoming
     power-normalised amplitudes a add -2 T a to p, and leaving ones are b = T u + R a.

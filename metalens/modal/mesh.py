@@ -105,18 +105,14 @@ class FunctionNumbering:
         return (start if j == 0 else 0) | (end if last else 0)
 
     def number_vector(self, wall: int, *key: object) -> int:
-        """Number of the vector function ``key``; a key seen for the first time takes
-        the next one.
-        """
+        """Number of the vector function ``key``; a new key takes the next number."""
         if key not in self.vectors:
             self.vectors[key] = len(self.vectors)
             self.vector_wall.append(wall)
         return self.vectors[key]
 
     def number_scalar(self, wall: int, *key: object) -> int:
-        """Number of the scalar function ``key``; a key seen for the first time takes
-        the next one.
-        """
+        """Number of the scalar function ``key``; a new key takes the next number."""
         if key not in self.scalars:
             self.scalars[key] = len(self.scalars)
             self.scalar_wall.append(wall)
@@ -336,7 +332,11 @@ def ring_patch(
 
 @lru_cache(maxsize=32)
 def build_mesh(plan: MeshPlan) -> DiscMesh:
-    """All patches of a plan; cached, as they do not depend on the diameter."""
+    """All patches of a mesh plan; cached, as they do not depend on the diameter.
+
+    From the centre: the core, the plain rings of the disc, the ring at the rim inside
+    and the one outside with graded rules, and the plain rings around them.
+    """
     inner, outer = len(plan.inner), len(plan.outer)
     numbers = FunctionNumbering(inner + outer, len(plan.sectors))
     points = plan.radial + 24  # of the graded rule: masses to 1e-13

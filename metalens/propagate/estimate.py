@@ -32,7 +32,7 @@ FACTORS = 12  # nodes along an axis of the lens on which it is formed
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NodeLight:
-    """Light of one wavelength on nodes of the lens, its carrier taken off.
+    """Light of one wavelength on nodes of the lens, without its carrier.
 
     case: geometry of the window. weight: of the wavelength.
     light: (map, e, x) complex amplitudes. nodes_um: (e,), (x,) positions.

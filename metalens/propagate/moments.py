@@ -37,7 +37,7 @@ ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
 ACCURACY = {
     4: 2e-8,
     8: 1e-11,
-}  # of the carrier in turns, beside the rounding of the path itself
+}  # of the carrier in turns, in addition to the rounding of the path
 
 
 # rounding of path and polynomial in float64, relative to the longest path (largest
@@ -103,7 +103,7 @@ class AxisBlocks:
 
     @property
     def weights(self) -> Array:
-        """(nodes, length): share of a pillar's light that each node gets."""
+        """(nodes, length): share of each node in a pillar's light."""
         if self.nodes == self.length:
             return np.eye(self.length)
         return np.ascontiguousarray(
@@ -139,7 +139,7 @@ def choose_blocks(
 
     Args:
         case: geometry of the propagation.
-        reference: inverse depth whose phase is taken off, 1/um.
+        reference: inverse depth of the carrier, 1/um.
         itemsize: bytes of a number of the maps.
         kernel: (y, x) in um to (line, …) values, broadcasting; their variation over a
             block must be met.
@@ -936,8 +936,11 @@ def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ig
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped-def]
-    """Adjoint of :func:`_add_columns`: column nodes to the columns of a tile, written
-    to sums (row node, re/im, column).
+    """Adjoint of :func:`_add_columns`: column nodes to the columns of a tile.
+
+    grad: (row node, re/im, column node). span: first and last column. shares: (node,
+    column of a block). bases: (block,) first columns. sums: (row node, re/im, column),
+    written in place.
     """
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
@@ -955,8 +958,10 @@ def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
-    """Adjoint of :func:`_add_rows` for one row: row (re/im, column); nodes are taken
-    four at a time.
+    """Adjoint of :func:`_add_rows` for one row: row = Σ_a shares[a, i] sums[a].
+
+    Nodes are taken four at a time. sums: (node, re/im, column). shares: (node, row). i:
+    index of the row. row: (re/im, column), written in place.
     """
     row[:] = 0
     for a in range(0, sums.shape[0], 4):
@@ -996,7 +1001,7 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
     :func:`grid_pillars`, which has the other arguments.
 
     grad: as ``out`` there. out_phase, out_level: (y, x), written in place; an empty
-    array asks for no gradient.
+    array: no gradient is computed.
     """
     ny, nx = phase.shape
     nodes, length = shares[0].shape

@@ -16,7 +16,7 @@ SOME = 32  # pillars along an axis whose rays tell what films leave out
 
 
 def reference_depth(case: PropagationCase) -> float:
-    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the
+    """Inverse depth, 1/um, of the source whose phase is removed: the middle of the
     range.
 
     Args:
@@ -196,11 +196,14 @@ def films_error(case: PropagationCase, level: Array) -> float:
 
 
 def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
-    """p along x of the rays to the window centre from lens points ``across``, ``far``
-    beside it: n sin θ cos φ.
+    """Direction cosine p = n sin θ cos φ along x of rays from lens points to the window
+    centre.
+
+    p = across / (reach per direction), for the ray of this reach through the media.
 
     Args:
         case: geometry of the propagation.
+        across, far: offset along x, and along the other axis, um.
     """
     pairs = case.media.layers
     return across / media.reach_per_direction(
@@ -209,15 +212,17 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
 
 
 def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
-    """q along y of the ray from lens row e with p along x to the window centre.
+    """Direction cosine q along y of the ray from lens row e to the window centre.
 
     Args:
         case: geometry of the propagation.
+        p: direction cosine along x.
+        e: lens row, um.
     """
     row_offset = e - case.centre_um[1]
-    pairs = case.media.layers
+    layers = case.media.layers
     return row_offset / media.reach_per_direction(
-        pairs, media.solve_direction_square(pairs, row_offset * row_offset, p * p)
+        layers, media.solve_direction_square(layers, row_offset * row_offset, p * p)
     )
 
 

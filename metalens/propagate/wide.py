@@ -431,7 +431,7 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
         dtype: of the maps and of the transforms.
 
     Raises:
-        PropagationError: rays too steep, or too unlike a quadratic, for the method.
+        PropagationError: rays too steep, or too far from a quadratic, for the method.
     """
     with one_blas_thread():
         axes = wide_axes(case, tolerance)

@@ -208,7 +208,8 @@ def near_fields(
     Accuracy: ``error`` is 2.5 times the largest change from the four truncations before
         the last (six where something is narrow), more below seven harmonics. Within a
         few nm of an edge along z the field has no bound and no truncation is near. A
-        tilted wall is a staircase of twelve steps; half as many tell what it leaves.
+        tilted wall is a staircase of twelve steps; its error is the change from six
+        steps.
     """
     check_tolerance(tolerance)
     count = sum(math.prod(grid.shape) for grid in grids)
@@ -346,8 +347,16 @@ class _SolvedClass:
     fields: TangentialFields
 
     def orders_at(self, z_um: Array) -> tuple[Components, Components, Components]:
-        """Components of E, H (times the impedance of vacuum) and D (x and y), each an
-        order set with amplitudes (nz, k), by (1).
+        """Components of E, H (times the impedance of vacuum) and D (x and y), by (1).
+
+        u and w give the tangential fields. Ez follows from 1/eps of each medium times
+        the curl of H, Hz from the curl of E, D from Q of the slab.
+
+        Args:
+            z_um: (nz,) heights over the foot.
+
+        Returns:
+            For E, H and D a list of (order set, amplitudes (nz, k)).
         """
         waves = self.waves
         space = self.space
@@ -463,9 +472,7 @@ def _solve_class(
 
 
 def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
-    """Amplitudes of the incident wave along x and y at normal incidence, of s and p
-    else.
-    """
+    """Amplitudes of the incident wave along (x, y) at normal incidence, else of (s, p)."""
     c, s = math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
     polarization = light.polarization
     if light.angle_rad == 0:

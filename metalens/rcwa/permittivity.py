@@ -289,7 +289,15 @@ def _nearest(
 def _nearest_circle(
     centres: Array, radii: Array, px: Array, py: Array
 ) -> tuple[Array, Array]:
-    """As :func:`_nearest`, for circles (k, 2) and (k,): normals lie on their radii."""
+    """As :func:`_nearest`, for circles, whose normals are radial.
+
+    Circles at equal distance count with their mean. At a centre the products are those
+    of a random direction.
+
+    Args:
+        centres: (k, 2), um. radii: (k,), um.
+        px, py: (...) points, um.
+    """
     least_distance = np.full(px.shape, np.inf)
     products_sum, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
     for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True):

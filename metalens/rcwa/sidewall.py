@@ -16,7 +16,7 @@ Sample = Callable[[float], tuple[Array, Array]]
 # ends of the panels as shares of the height: shorter towards foot and top
 EDGES = (0.0, 0.025, 0.09, 0.26, 0.5, 0.74, 0.91, 0.975, 1.0)
 FEWEST, MOST = 4, 10  # Gauss points: 4 leave 2e-3 of t, each more a hundredth of that
-_NODES = 8  # cross-sections whose polynomial stands for a tilted section
+_NODES = 8  # cross-sections through which the polynomial of a tilted section runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,10 @@ def wall_sections(
 
 
 def _interpolated(sample: Sample) -> Sample:
-    """P and Q from polynomials through their values at Chebyshev points."""
+    """P and Q at any height, from polynomials through ``_NODES`` Chebyshev points.
+
+    The values at the points are computed on the first call and cached.
+    """
     chebvander = np.polynomial.chebyshev.chebvander
     nodes = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))

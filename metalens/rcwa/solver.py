@@ -301,9 +301,8 @@ def solve(
             sin(angle_rad).
         azimuth_rad: of the plane of incidence, from +x to +y.
         polarization: s or p; x and y where the plane of incidence contains an axis.
-        tolerance: wanted bound of |t - exact|; beyond what the largest truncation
-            reaches, the result comes with its larger ``t_error`` and ``converged``
-            False.
+        tolerance: bound of |t - exact|. If the largest truncation does not reach it,
+            the result has its larger ``t_error`` and ``converged`` False.
         harmonics: fix the largest truncation instead, and take the estimate there.
 
     Returns:
@@ -354,7 +353,7 @@ def jones(
         wavelength_um: in vacuum.
         angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of
             incidence, from +x to +y.
-        tolerance: wanted bound of |t - exact| and |r - exact|.
+        tolerance: bound of |t - exact| and |r - exact|.
         harmonics: fix the largest truncation instead (orders as on a square lattice of
             the same area).
 

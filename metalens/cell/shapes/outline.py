@@ -179,8 +179,8 @@ class Outline:
         return joined
 
     def boundary(self, step_um: float) -> tuple[Array, Array]:
-        """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit
-        normals there, out of the part.
+        """Points (n, 2) on the boundary, spaced by at most ``step_um``, and their unit
+        normals, out of the part.
         """
         points, normals = [], []
         for part in self.parts:

@@ -33,7 +33,7 @@ class Circle:
 class Ellipse:
     """Its size is the axis along x before the turn; ratio: of the other axis to it.
 
-    angle_rad: in the plane, from +x towards +y. grow_um moves both axes alike (not
+    angle_rad: in the plane, from +x towards +y. grow_um adds equally to both axes (not
     quite a parallel curve: the error
     is of second order in grow / axis).
     hole: an opening in a film. kind: of the shape.
@@ -97,6 +97,11 @@ class Ring:
 
 
 def _half(width_um: float) -> float:
+    """Half of a width, um.
+
+    Raises:
+        CellError: no width above 0.
+    """
     if not width_um > 0:
         raise CellError(
             f"an outline {width_um:.4g} um wide: nothing is left; need a larger size or less bias"

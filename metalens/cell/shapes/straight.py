@@ -20,12 +20,16 @@ from metalens.core.errors import CellError
 
 
 def _polygon_outline(corners: Array, angle_rad: float, grow_um: float) -> Outline:
+    """Outline of corners (n, 2) turned by an angle, every edge moved out by grow_um /
+    2.
+    """
     return Outline(
         (PolygonLoop(offset_corners(rotate_corners(corners, angle_rad), grow_um)),)
     )
 
 
 def _box(width_um: float, depth_um: float) -> Array:
+    """(4, 2) corners of a rectangle about the origin, um."""
     return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width_um / 2, depth_um / 2)
 
 
@@ -203,7 +207,11 @@ class Polygon:
 
 
 def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
-    """Whether the edges a-b and c-d meet."""
+    """Whether the edges a-b and c-d meet.
+
+    They do if their bounding boxes overlap, and each edge has the ends of the other on
+    different sides or on its line.
+    """
 
     def side(p: Array, q: Array, r: Array) -> float:
         return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
