@@ -410,7 +410,7 @@ def fixed_point(
     e: np.ndarray,
     fixed: tuple[np.ndarray, np.ndarray],
     signs: np.ndarray,
-    limit: float,
+    aim: float,
     *,
     whole: int,
 ) -> np.ndarray | None:
@@ -418,24 +418,24 @@ def fixed_point(
 
     The rows of the lowest levels converge last. After ``whole`` full steps they iterate
     alone; a full step follows when they move by less than a share of the last one's
-    change. The result is accepted when a full step moves them by less than ``limit``.
+    change. The result is accepted when a full step moves them by less than ``aim``.
 
     Args:
         e: start value. fixed: (offset, weight). signs: of growth.
-        limit: of the change. whole: full steps before the slow rows iterate alone.
+        aim: limit of the change. whole: full steps before the slow rows iterate alone.
     """
     offset, weight = fixed
     slow = max(1, len(e) // SLOW)
     mirror = (signs[:slow] * signs[:, None]).astype(e.dtype)
     change, first, last = np.inf, np.inf, np.inf
     for step in range(STEPS):
-        if step < whole or change < max(limit, SETTLED * last):
+        if step < whole or change < max(aim, SETTLED * last):
             new_e = symmetric_square(e, signs)
             new_e *= weight
             np.subtract(offset, new_e, out=new_e)
             last = change = float(np.abs(new_e[:slow] - e[:slow]).max())
             e = new_e
-            if change < limit:
+            if change < aim:
                 return symmetrize_by_signs(e, signs)
         else:
             rows = e[:slow] @ e

@@ -119,7 +119,7 @@ class FunctionNumbering:
         return self.scalars[key]
 
     def number_element(
-        self, corners: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
+        self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
     ) -> tuple[list[int], list[int]]:
         """Global numbers of the vector and scalar functions of one element.
 
@@ -127,32 +127,28 @@ class FunctionNumbering:
         functions belong to the element.
 
         Args:
-            corners: v00, v10, v01, v11.
+            v: corners v00, v10, v01, v11.
             px, py: polynomial degrees along both parameters.
         """
-        walls = [self.wall_bits(vertex) for vertex in corners]
+        walls = [self.wall_bits(vertex) for vertex in v]
         x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 
         def on_edge(ends: tuple[int, int], i: int) -> int:
             return self.number_vector(
-                walls[ends[0]] & walls[ends[1]], corners[ends[0]], corners[ends[1]], i
+                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
             )
 
         def scalar_on_edge(ends: tuple[int, int], i: int) -> int:
             return self.number_scalar(
-                walls[ends[0]] & walls[ends[1]], corners[ends[0]], corners[ends[1]], i
+                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
             )
 
         vectors = [
-            on_edge(x_ends[j], i)
-            if j < 2
-            else self.number_vector(0, "x", corners, i, j)
+            on_edge(x_ends[j], i) if j < 2 else self.number_vector(0, "x", v, i, j)
             for i in range(px)
             for j in range(py + 1)
         ] + [
-            on_edge(y_ends[i], j)
-            if i < 2
-            else self.number_vector(0, "y", corners, i, j)
+            on_edge(y_ends[i], j) if i < 2 else self.number_vector(0, "y", v, i, j)
             for i in range(px + 1)
             for j in range(py)
         ]
@@ -160,15 +156,13 @@ class FunctionNumbering:
         for i in range(px + 1):
             for j in range(py + 1):
                 if i < 2 and j < 2:
-                    scalars.append(
-                        self.number_scalar(walls[i + 2 * j], corners[i + 2 * j])
-                    )
+                    scalars.append(self.number_scalar(walls[i + 2 * j], v[i + 2 * j]))
                 elif j < 2:
                     scalars.append(scalar_on_edge(x_ends[j], i))
                 elif i < 2:
                     scalars.append(scalar_on_edge(y_ends[i], j))
                 else:
-                    scalars.append(self.number_scalar(0, "z", corners, i, j))
+                    scalars.append(self.number_scalar(0, "z", v, i, j))
         return vectors, scalars
 
 
