@@ -80,8 +80,16 @@ def _column(field: str) -> str:
 def _join_stacked_tables(
     body: list[tuple[int, str]], where: str
 ) -> list[tuple[int, str]]:
-    """The rows of a file whose k follows its n as a second table (as
-    refractiveindex.info exports) in one table.
+    """Rows of a file with n and k in one table.
+
+    refractiveindex.info exports k as a second table after n, each with a header "wl,…".
+    Other files are returned as they are.
+
+    Args:
+        body: (line number, line). where: name for messages.
+
+    Raises:
+        MaterialError: the two tables have different wavelengths.
     """
     heads = [
         i

@@ -62,8 +62,9 @@ def gram_matrix(matrix: np.ndarray) -> np.ndarray:
 
 
 def congruence_product(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which
-    have no diagonal, are left out.
+    """outerᵀ inner outer of a semidefinite matrix.
+
+    Rows and columns with zero diagonal are zero, and are left out.
     """
     rows = np.flatnonzero(inner.diagonal())
     reduced = outer[rows]

@@ -57,10 +57,12 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
 
 
 def gradient_modes(space: SymmetryClass) -> tuple[np.ndarray, np.ndarray]:
-    """Transverse wavenumbers squared and scalar fields of the TM modes from singular
-    values, which keep all digits of a nearly uniform field.
+    """Transverse wavenumbers squared (b,) and scalar fields (n, b) of the TM modes.
 
-    space: the symmetry class.
+    From singular values, which keep all digits of a nearly uniform field.
+
+    Args:
+        space: the symmetry class.
     """
     lower = cholesky_factor(space.cell.scalar)
     field = cholesky_factor(space.cell.mass).T @ space.gradient
@@ -75,8 +77,10 @@ def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
     the TM modes solve K f = tm scalar f, and the TE modes are x on the cotree less its
     projection on the gradients: curl_cc x = te (mass_cc - mass_cG K^-1 mass_Gc) x.
 
-    space: the symmetry class. Accuracy: the difference loses digits, 1e-8 of t at
-    worst.
+    Args:
+        space: the symmetry class.
+
+    Accuracy: the difference loses digits, 1e-8 of t at worst.
     """
     cotree, gradient_transposed = space.cotree, space.transposed
     corner = cotree[:, None], cotree

@@ -213,7 +213,12 @@ def _tile_position(count: int, parts: int) -> Array:
 def _by_part(
     windows: list[list[NodeLight]], points: Array
 ) -> list[tuple[list[NodeLight], Array, tuple[Array, Array]]]:
-    """Each part, which points lie in it, and their (row, column)."""
+    """For each part: its light, a mask of the points in it, and their (row, column).
+
+    Args:
+        windows: parts, each a list of wavelengths.
+        points: (point,) pixel numbers, counted through all parts.
+    """
     parts, first = [], 0
     for part in windows:
         rows, columns = part[0].case.samples
@@ -227,7 +232,14 @@ def _by_part(
 def _direct_fields(
     node_light: NodeLight, components: Array, depths: Array, row: Array, column: Array
 ) -> Array:
-    """(component, depth, point) fields at window pixels, summed over the nodes."""
+    """(component, depth, point) fields at window pixels, by direct sums over lens
+    nodes.
+
+    Args:
+        node_light: light of one wavelength on the nodes, with its geometry.
+        components: (component, e, x) complex light.
+        depths: indices. row, column: (point,) pixels of the window.
+    """
     case = node_light.case
     e, x = node_light.nodes_um
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]

@@ -204,7 +204,12 @@ def window_tiles(
 def _part(
     case: PropagationCase, row_span: tuple[int, int], column_span: tuple[int, int]
 ) -> PropagationCase:
-    """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
+    """Case of a part of the window, with its own centre.
+
+    Args:
+        case: geometry of the whole window.
+        row_span, column_span: first sample, and one past the last.
+    """
     my, mx = case.samples
     x, y = case.centre_um
     centre = (

@@ -585,19 +585,15 @@ def _gather(
     moments = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
     compiled_loop: Any = grid_pillars
     tile_powers: list[float] = []
-    row_positions, shares, (row_bases, column_bases) = _block_arrays(
+    u, shares, (row_bases, column_bases) = _block_arrays(
         plan, torch.empty(0, dtype=plan.dtype).numpy().dtype
     )
     # block rows at once, where maps of another dtype are copied
     step = max(
-        1,
-        int(
-            KEEP_BYTES
-            / (len(maps) * rows.length * maps[0].shape[1] * row_positions.itemsize)
-        ),
+        1, int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * u.itemsize))
     )
     for panel in plan.panels:
-        table = _table(plan, panel, row_positions.dtype)
+        table = _table(plan, panel, u.dtype)
         count = panel.stop - panel.start
         nodes = torch.zeros(
             (count * rows.nodes, 2, columns.count * columns.nodes), dtype=plan.dtype
@@ -616,8 +612,7 @@ def _gather(
                 first_row = (first + i) * rows.length
                 row_maps = [
                     np.asarray(
-                        one_map[first_row : (first + end) * rows.length],
-                        row_positions.dtype,
+                        one_map[first_row : (first + end) * rows.length], u.dtype
                     )
                     for one_map in maps
                 ]
@@ -625,13 +620,7 @@ def _gather(
                 node_rows = node_array[i * rows.nodes : end * rows.nodes]
                 tile_powers.append(
                     compiled_loop(
-                        *row_maps,
-                        table[i:end],
-                        row_positions,
-                        shares,
-                        bases,
-                        0,
-                        node_rows,
+                        *row_maps, table[i:end], u, shares, bases, 0, node_rows
                     )
                 )
 

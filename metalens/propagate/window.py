@@ -174,7 +174,8 @@ def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
     quarter = tolerance / 4
     high_y = case.half_size_um[0]
     nodes = lens_nodes(case, quarter)
-    low, high = direction_range(case, legendre.mapped_nodes(nodes[0], -high_y, high_y))
+    row_nodes = legendre.mapped_nodes(nodes[0], -high_y, high_y)
+    low, high = direction_range(case, row_nodes)
     middle, half_range = (low + high) / 2, (high - low) / 2
     directions = _needed_nodes(
         lambda t: _over_directions(case, middle + half_range * t), quarter, "directions"
@@ -256,9 +257,11 @@ def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array
         indexing="ij",
     )
     cross, X, Y, v = (g.reshape(-1, 1) for g in grid)
-    return rayleigh_sommerfeld_kernel(
-        case, cross * hx if x is None else x, cross * hy if y is None else y, X, Y, v
-    )
+    if x is None:
+        x = cross * hx
+    if y is None:
+        y = cross * hy
+    return rayleigh_sommerfeld_kernel(case, x, y, X, Y, v)
 
 
 def _over_directions(case: PropagationCase, p: Array) -> Array:
@@ -476,13 +479,17 @@ def build_operators(
     *,
     slope: int | None = None,
 ) -> TileOperators:
-    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
-    window centre x, y instead.
+    """Operators of a tile, from lens nodes to directions and from directions to the
+    window.
+
+    With ``slope`` 0, 1, 2 they give the derivative in sensor distance, window centre x,
+    y.
 
     Args:
-        case: geometry of the propagation.
+        case: geometry of the tile.
         chosen: counts of nodes and directions.
         tolerance: relative error of the field.
+        slope: derivative to compute; None: the field.
     """
     ny, nx = chosen.nodes
     directions = chosen.directions
@@ -664,7 +671,7 @@ def plan_window(
     *,
     smooth: bool = False,
 ) -> WindowPlan:
-    """Plan a windowed propagation; those used last are kept.
+    """Plan of a windowed propagation; the last 64 are cached.
 
     Args:
         case, tolerance: geometry, and relative error of the field.
@@ -802,7 +809,7 @@ def _tile_tensors(
 
 
 def _padded(array: Array, count: int) -> Array:
-    """With zeros to ``count`` along the last axis."""
+    """Array with zeros appended to ``count`` along the last axis."""
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
@@ -933,7 +940,11 @@ def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
 
 
 def _depth_coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
-    """(depth, b) of the depth basis, differentiable in the source's position."""
+    """(depth, b) coefficients of the depth basis, differentiable in the source's
+    position.
+
+    Projections of exp(i depth factors) on the basis, under the quadrature of the nodes.
+    """
     e, x = (torch.tensor(v) for v in plan.nodes_um)
     ny, nx = plan.layout.sizes.nodes
     inverse = moving.inverse_depths[:, None, None]

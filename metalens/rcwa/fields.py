@@ -135,8 +135,10 @@ class _Stack:
         return np.asarray(np.searchsorted(self.ends, self.k0 * z_um + on, "right"))
 
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
-        """For substrate, slabs and cover: eps (ny, nx), and N n n^T of (2) as (xx, yy,
-        xy), None where it is homogeneous.
+        """Permittivity and normal field on the grid, for substrate, slabs and cover.
+
+        For each, eps (ny, nx), and N n n^T of (2) as (xx, yy, xy); None for a
+        homogeneous slab.
         """
         cell, media = self.problem.cell, self.problem.media
         y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
@@ -487,8 +489,9 @@ def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
 
 
 class _PointSums:
-    """Sums of orders on the points of a grid: amplitudes (nz, k), unfolded by the
-    symmetries, to (nz, ny, nx).
+    """Sums of orders on the points of a grid, for one symmetry class.
+
+    Reduced amplitudes are unfolded by the symmetry operations before the sum.
     """
 
     def __init__(
@@ -498,6 +501,7 @@ class _PointSums:
         reach: tuple[int, int],
         grid: FieldGrid,
     ) -> None:
+        """Phases exp(i k x) of all orders up to ``reach`` on both axes of the grid."""
         light, cell = problem.light, problem.cell
         k0 = 2 * math.pi / light.wavelength_um
         self.operations, self.reach = operations, reach
@@ -514,6 +518,7 @@ class _PointSums:
         )
 
     def __call__(self, orders: OrderSet, amplitude: Array) -> Array:
+        """(nz, ny, nx) field of amplitudes (nz, k), with the images of all orders."""
         mx, my = self.reach
         table = np.zeros((len(amplitude), 2 * my + 1, 2 * mx + 1), complex)
         for (sx, sy, _), sign in zip(self.operations, orders.signs, strict=True):

@@ -147,7 +147,8 @@ def cell_problem(
 
 
 def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
-    """Indices of half-spaces and films of a ``cell``, thicknesses times k0.
+    """Refractive indices of half-spaces and films of a ``cell``, with thicknesses times
+    k0.
 
     Raises:
         CellError: no zero order of the ``light`` in the substrate. MaterialError: a

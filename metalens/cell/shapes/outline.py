@@ -281,8 +281,12 @@ class Outline:
         return solid, space
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
-        """Least distance to its copies at these lattice steps; 0 where they touch or
-        overlap (within 1 % of radius).
+        """Least distance (um) to the copies of the outline at lattice steps.
+
+        0 where they touch or overlap, within 1 % of the radius.
+
+        Args:
+            steps: (x, y) of the copies, um, nearest first.
         """
         from scipy.spatial import cKDTree
 
@@ -342,8 +346,10 @@ def _is_concave(corners: Array) -> bool:
 
 
 def _foot(tip: Array, start: Array, end: Array) -> tuple[Array, Array]:
-    """(n, 2) nearest points of lines from start to end, and whether they lie on these
-    edges.
+    """(n, 2) feet of the perpendiculars on lines, and whether they lie on the edges.
+
+    Args:
+        tip: (n, 2) points. start, end: (n, 2) of the edges.
     """
     edge = end - start
     along = ((tip - start) * edge).sum(axis=1) / (edge**2).sum(axis=1)
