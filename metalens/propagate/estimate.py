@@ -232,8 +232,7 @@ def _by_part(
 def _direct_fields(
     node_light: NodeLight, components: Array, depths: Array, row: Array, column: Array
 ) -> Array:
-    """(component, depth, point) fields at window pixels, by direct sums over lens
-    nodes.
+    """(component, depth, point) fields at window pixels, summed over lens nodes.
 
     Args:
         node_light: light of one wavelength on the nodes, with its geometry.

@@ -164,8 +164,7 @@ def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]
 
 
 def films_error(case: PropagationCase, level: Array) -> float:
-    """Relative L2 error of PSFs by the saddle-point kernel through films; 0 in one
-    medium.
+    """Relative L2 error of PSFs by the kernel through films; 0 in one medium.
 
     Twice the root-mean-square error of the amplitude over some pillars, weighted by
     their light, each for the sample of the window farthest from it.
@@ -196,8 +195,7 @@ def films_error(case: PropagationCase, level: Array) -> float:
 
 
 def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
-    """Direction cosine p = n sin θ cos φ along x of rays from lens points to the window
-    centre.
+    """Direction cosine p along x of rays from lens points to the window centre.
 
     p = across / (reach per direction), for the ray of this reach through the media.
 

@@ -93,8 +93,7 @@ class WideAxis:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticFit:
-    """Quadratic path along one axis: reach A + D (p - p0) of a ray of direction cosine
-    p.
+    """Quadratic path along one axis: the reach of a ray is A + D (p - p0).
 
     middle, reach_um, stretch_um: p0, A, D. most: largest |p - p0| of a ray to the
     window. extra_um: largest residual of the reach. steepest: |p| of any ray.
@@ -112,8 +111,7 @@ class QuadraticFit:
 def wide_axes(
     case: PropagationCase, tolerance: float
 ) -> tuple[WideAxis, WideAxis] | None:
-    """(y, x) grids of a wide window; None if rays are too steep or too far from
-    quadratic.
+    """(y, x) grids of a wide window; None if its rays are too steep or not quadratic.
 
     The quadratics are fitted twice more, each time to the window enlarged by the
     residual of the last fit. Then the width of the fading and the grids follow.
@@ -252,8 +250,7 @@ def _axis(
     fade: tuple[float, float, float],
     tolerance: float,
 ) -> WideAxis | None:
-    """Grids of one axis of a wide window; None if a transform would exceed ``MOST``
-    points.
+    """Grids of one axis; None if a transform would exceed ``MOST`` points.
 
     The first transform grows until its lens grid is dense enough for the kernel's band
     and it holds the whole lens.
@@ -468,8 +465,7 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
 def _depth_fields(
     case: PropagationCase, axes: tuple[WideAxis, WideAxis], tolerance: float
 ) -> tuple[Iterator[Array], Array]:
-    """Depth fields (b, y, x) on the lens grid, one at a time, and coefficients (depth,
-    b).
+    """Depth fields (b, y, x) on the lens grid, one by one, and coefficients.
 
     The basis is computed on a coarse Legendre grid and interpolated.
 
@@ -494,8 +490,7 @@ def _depth_fields(
 
 
 def _coarse_nodes(case: PropagationCase, i: int, grid: Array) -> int:
-    """Number of Legendre nodes along an axis that resolve the phase of the extreme
-    depths.
+    """Legendre nodes along an axis that resolve the phase of the extreme depths.
 
     24 plus six per wavelength of path difference.
 
@@ -620,8 +615,7 @@ def light_wide(
     plan: WidePlan,
     pupils: Pupils | None = None,
 ) -> tuple[torch.Tensor, Array, list[float]]:
-    """Irradiance on a wide window, Σ_c sign_c |field_c|²; differentiable once in the
-    maps.
+    """Irradiance on a wide window, Σ_c sign_c |field_c|², once differentiable.
 
     Args:
         maps: (map, y, x) phase in rad, and transmission.
@@ -652,8 +646,7 @@ def light_wide(
 def _fewer_fields(
     light: torch.Tensor, plan: WidePlan
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Reduced depth basis for this light: mixtures (fewer, b) and coefficients (depth,
-    fewer).
+    """Reduced depth basis for this light: mixtures (r, b), coefficients (depth, r).
 
         F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L, U: leading eigenvectors of C G Cᴴ,
         G_ij = Σ_x |L|² B_i B_j*
@@ -722,8 +715,7 @@ def fields_wide(
 
 
 def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """(depth, y, x) irradiance |Σ_b coefficients[depth, b] fields[b]|², some rows at a
-    time.
+    """(depth, y, x) irradiance |Σ_b coefficients[depth, b] fields[b]|², by rows.
 
     Args:
         fields: (b, y, x) complex.

@@ -87,8 +87,7 @@ class WindowLayout:
 
 @functools.lru_cache(maxsize=1024)
 def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """Nodes over the lens and tiles of the window; None if the tables would exceed 100
-    MB.
+    """Nodes over the lens and tiles of the window; None if tables exceed 100 MB.
 
     With more tiles along an axis the work on the window falls, and that of passing
     light to the tiles rises. Their sum is least for about √nodes / 4 tiles.
@@ -479,8 +478,7 @@ def build_operators(
     *,
     slope: int | None = None,
 ) -> TileOperators:
-    """Operators of a tile, from lens nodes to directions and from directions to the
-    window.
+    """Operators of a tile: lens nodes to directions, and directions to the window.
 
     With ``slope`` 0, 1, 2 they give the derivative in sensor distance, window centre x,
     y.
@@ -813,7 +811,7 @@ def _padded(array: Array, count: int) -> Array:
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
-def _slope(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
+def _derivative_tensors(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
     """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2);
     cached in the plan.
     """
@@ -908,7 +906,7 @@ def _from_nodes(
         for axis, value in enumerate(values):
             if value.requires_grad:
                 rate = _at_depths(
-                    zoom_to_tiles(fields, _slope(plan, axis)), coefficients
+                    zoom_to_tiles(fields, _derivative_tensors(plan, axis)), coefficients
                 )
                 # adds nothing but the derivative
                 field = field + (value - value.detach()) * rate

@@ -279,8 +279,7 @@ def _reflected(
     fields: TangentialFields,
     zero: int,
 ) -> Array:
-    """Reflected amplitudes (n,) in the substrate, from the fields above the lower
-    films.
+    """Reflected amplitudes (n,) in the substrate, from the fields above its films.
 
     Without the pillar the films would transmit the incident wave into a medium like the
     substrate. The difference of the fields from that wave radiates downwards.

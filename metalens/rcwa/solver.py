@@ -147,8 +147,7 @@ def cell_problem(
 
 
 def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
-    """Refractive indices of half-spaces and films of a ``cell``, with thicknesses times
-    k0.
+    """Refractive indices of half-spaces and films, with thicknesses times k0.
 
     Raises:
         CellError: no zero order of the ``light`` in the substrate. MaterialError: a
@@ -481,8 +480,7 @@ def safety_factor(reach: int) -> float:
 def _refine(
     problem: CellProblem, tolerance: float, harmonics: int | None
 ) -> JonesResponse:
-    """Jones matrices of the smallest truncation that meets the tolerance, or of the
-    last.
+    """Jones matrices of the first truncation that meets the tolerance, or the last.
 
     A homogeneous cell is solved as a stack of films. The error is that of the
     collocation of tilted walls plus :func:`estimate_error`. While the orders do not

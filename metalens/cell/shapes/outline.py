@@ -286,7 +286,7 @@ class Outline:
         0 where they touch or overlap, within 1 % of the radius.
 
         Args:
-            steps: (x, y) of the copies, um, nearest first.
+            steps: (x, y) of the copies, um.
         """
         from scipy.spatial import cKDTree
 
