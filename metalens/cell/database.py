@@ -1,5 +1,5 @@
-"""Pages of the refractiveindex.info database as they come: dispersion formulas 1 to 9
-and tables nk, n or k in YAML.
+"""Pages of the refractiveindex.info database in YAML: dispersion formulas 1 to 9 and
+tables nk, n or k.
 """
 
 import math
@@ -14,23 +14,12 @@ from metalens.core import reading
 from metalens.core.arrays import Array
 from metalens.core.errors import DAMAGE, MaterialError
 
-LEAST = {
-    1: 3,
-    2: 3,
-    3: 3,
-    4: 5,
-    5: 3,
-    6: 3,
-    7: 2,
-    8: 3,
-    9: 3,
-}  # coefficients without which a formula says nothing
-MOST = {
-    7: 6,
-    8: 4,
-    9: 6,
-}  # coefficients that a formula has; of all others the terms go on in pairs, after one alone
-_NOISE = 1e-3  # by how far k of a measured table may lie below 0: it is 0 there
+# least number of coefficients of each formula
+LEAST = {1: 3, 2: 3, 3: 3, 4: 5, 5: 3, 6: 3, 7: 2, 8: 3, 9: 3}
+# largest number of coefficients; terms of the other formulas go on in pairs, after one
+# alone
+MOST = {7: 6, 8: 4, 9: 6}
+_NOISE = 1e-3  # k of a measured table may lie below 0 by this; it counts as 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,26 +50,29 @@ class DispersionFormula:
         return complex(n.real), complex(n.imag / step)
 
     def _index(self, w: complex) -> complex:
+        """Refractive index at w (um): formulas 1 (Sellmeier), 2 (Sellmeier-2), 3
+        (polynomial), 5 (Cauchy) and 6 (gases); the others by their own methods.
+        """
         c = self.coefficients
         first, pairs = c[0], list(zip(c[1::2], c[2::2], strict=False))
         w2 = w * w
         if self.number == 1:
             return complex(
-                np.sqrt(1 + first + sum(b * w2 / (w2 - d * d) for b, d in pairs))
+                np.sqrt(1 + first + sum(b * w2 / (w2 - e * e) for b, e in pairs))
             )
         if self.number == 2:
             return complex(
-                np.sqrt(1 + first + sum(b * w2 / (w2 - d) for b, d in pairs))
+                np.sqrt(1 + first + sum(b * w2 / (w2 - e) for b, e in pairs))
             )
         if self.number == 3:
-            return complex(np.sqrt(first + sum(b * w**d for b, d in pairs)))
+            return complex(np.sqrt(first + sum(b * w**e for b, e in pairs)))
         if self.number == 4:
             return self._rational(w)
         if self.number == 5:
-            return complex(first + sum(b * w**d for b, d in pairs))
+            return complex(first + sum(b * w**e for b, e in pairs))
         if self.number == 6:
-            return complex(1 + first + sum(b / (d - w**-2) for b, d in pairs))
-        return self._rare(w)
+            return complex(1 + first + sum(b / (e - w**-2) for b, e in pairs))
+        return self._other_formula(w)
 
     def _rational(self, w: complex) -> complex:
         """n² = c1 + c2 w^c3 / (w² - c4^c5) + c6 w^c7 / (w² - c8^c9) + c10 w^c11 + ..."""
@@ -96,16 +88,16 @@ class DispersionFormula:
             )
         )
 
-    def _rare(self, w: complex) -> complex:
+    def _other_formula(self, w: complex) -> complex:
         """Formulas 7 (Herzberger), 8 (Lorentz-Lorenz) and 9."""
         c = (*self.coefficients, *(0.0,) * 6)
         w2 = w * w
         if self.number == 7:
-            near = 1 / (w2 - 0.028)
+            inverse = 1 / (w2 - 0.028)
             return (
                 c[0]
-                + c[1] * near
-                + c[2] * near**2
+                + c[1] * inverse
+                + c[2] * inverse**2
                 + c[3] * w2
                 + c[4] * w2**2
                 + c[5] * w2**3
@@ -163,7 +155,8 @@ Part = DispersionFormula | TabulatedIndex
 
 
 def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
-    """n, k (None: transparent) and the source in words of a page of refractiveindex.info.
+    """n, k (None: transparent) and the source in words of a page of
+    refractiveindex.info.
 
     Args:
         text: the page, YAML. where: its name, for messages.
@@ -192,12 +185,12 @@ def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
             raise MaterialError(
                 f"{where}: entry {i} of DATA is no table; need type and data, or type and coefficients"
             )
-        real, absorbed = _parts(block, where)
-        if (n and real) or (k and absorbed):
+        real, absorption = _parts(block, where)
+        if (n and real) or (k and absorption):
             raise MaterialError(
                 f"{where}: entry {i} of DATA gives {'n' if n and real else 'k'} a second time; need one"
             )
-        n, k = n or real, k or absorbed
+        n, k = n or real, k or absorption
     if n is None:
         raise MaterialError(
             f"{where}: neither a formula nor a table of n; need one of them"
@@ -206,7 +199,7 @@ def parse_page(text: str, where: str) -> tuple[Part, Part | None, str]:
 
 
 def _parts(block: dict[str, Any], where: str) -> tuple[Part | None, Part | None]:
-    """n and k of an entry, None for what it does not hold."""
+    """n and k of an entry, None for each that it lacks."""
     kind = _words(block, "type")
     if kind.startswith("formula"):
         return _formula(block, kind, where), None
@@ -228,6 +221,11 @@ def _words(block: dict[str, Any], key: str) -> str:
 
 
 def _formula(block: dict[str, Any], kind: str, where: str) -> DispersionFormula:
+    """Formula of an entry of type ``kind``, checked for its coefficients and range.
+
+    Raises:
+        MaterialError: with the name ``where``.
+    """
     numbers = _words(block, "coefficients").split()
     span = (_words(block, "wavelength_range") or _words(block, "range")).split()
     try:
@@ -243,66 +241,81 @@ def _formula(block: dict[str, Any], kind: str, where: str) -> DispersionFormula:
             f"{where}, {kind}: {len(values)} coefficients, range {span}; need formula 1 to 9 with its coefficients and "
             "two ends of wavelength_range"
         )
-    _complete(number, len(values), f"{where}, {kind}")
+    _check_complete(number, len(values), f"{where}, {kind}")
     return DispersionFormula(number, values, (min(ends), max(ends)), f"{where}, {kind}")
 
 
-def _complete(number: int, count: int, where: str) -> None:
+def _check_complete(number: int, count: int, where: str) -> None:
     """Refuses coefficients without their partners, and more than a formula has.
 
     Raises:
         MaterialError: with the number found.
     """
-    whole = count <= MOST[number] if number in MOST else count % 2 == 1
+    is_complete = count <= MOST[number] if number in MOST else count % 2 == 1
     if number == 4:
-        whole = whole and count != 7  # its first two terms have four coefficients each
-    if not whole:
+        # its first two terms have four coefficients each
+        is_complete = is_complete and count != 7
+    if not is_complete:
         raise MaterialError(
             f"{where}: {count} coefficients, the last of them of no whole term; need whole terms"
         )
 
 
 def _tables(text: str, columns: str, where: str) -> dict[str, TabulatedIndex]:
-    """Tables of n and k. A bad row spoils the wavelengths up to its neighbours only.
+    """Tables of n and k by column name.
+
+    A bad row becomes a fault of the interval between its good neighbours. Rows are
+    sorted by wavelength, without duplicates.
+
+    Args:
+        text: rows of numbers. columns: "nk", "n" or "k". where: name for messages.
 
     Raises:
         MaterialError: fewer than two good rows.
     """
     rows: list[list[float]] = []
-    bad: list[tuple[float, str]] = []  # wavelength (nan: unreadable) and what is wrong
-    unreadable: list[tuple[int, str]] = []  # place among the good rows
+    # wavelength and what is wrong
+    bad_rows: list[tuple[float, str]] = []
+    # number of good rows before it, and what is wrong
+    unreadable: list[tuple[int, str]] = []
     for i, line in enumerate(filter(str.strip, text.splitlines()), 1):
         fault = f"{where}, row {i}: {line.strip()!r}"
         row = _numbers(line)
         if len(row) != len(columns) + 1 or not row[0] > 0:
-            words = f"{fault}; need {len(columns) + 1} finite numbers, wavelength in um"
-            unreadable.append((len(rows), words))
+            message = (
+                f"{fault}; need {len(columns) + 1} finite numbers, wavelength in um"
+            )
+            unreadable.append((len(rows), message))
         elif "n" in columns and row[1] <= 0:
-            bad.append((row[0], f"{fault}: n = {row[1]:g}; need n above 0"))
+            bad_rows.append((row[0], f"{fault}: n = {row[1]:g}; need n above 0"))
         elif "k" in columns and row[-1] < -_NOISE:
-            words = f"{fault}: k = {row[-1]:g}; need k of 0 or above (exp(-iwt))"
-            bad.append((row[0], words))
+            message = f"{fault}: k = {row[-1]:g}; need k of 0 or above (exp(-iwt))"
+            bad_rows.append((row[0], message))
         else:
             rows.append(row)
     distinct = {row[0] for row in rows}
     if len(distinct) < 2:
-        first = [words for _, words in (*unreadable, *bad)][:3]
+        messages = [message for _, message in (*unreadable, *bad_rows)][:3]
         raise MaterialError(
             f"{where}: {len(distinct)} good rows; need two or more at distinct "
-            "wavelengths" + "".join(f" ({words})" for words in first)
+            "wavelengths" + "".join(f" ({message})" for message in messages)
         )
     faults = []
-    for place, words in unreadable:
-        around = [row[0] for row in rows[max(place - 1, 0) : place + 1]]
-        if len(around) == 2:
-            faults.append((min(around), max(around), words))
-    for wavelength, words in bad:
-        low = max((w for w in distinct if w < wavelength), default=wavelength)
-        high = min((w for w in distinct if w > wavelength), default=wavelength)
+    for position, message in unreadable:
+        neighbours = [row[0] for row in rows[max(position - 1, 0) : position + 1]]
+        if len(neighbours) == 2:
+            faults.append((min(neighbours), max(neighbours), message))
+    for wavelength, message in bad_rows:
+        low = max(
+            (other for other in distinct if other < wavelength), default=wavelength
+        )
+        high = min(
+            (other for other in distinct if other > wavelength), default=wavelength
+        )
         if wavelength not in distinct:
-            faults.append((low, high, words))
+            faults.append((low, high, message))
     rows = sorted(dict.fromkeys(map(tuple, rows)), key=lambda row: row[0])  # type: ignore[arg-type]
-    rows, steps = _joined(rows, where)
+    rows, steps = _merge_rows(rows, where)
     table = np.array(rows).T
     return {
         name: TabulatedIndex(table[[0, 1 + columns.index(name)]], (*faults, *steps))
@@ -319,23 +332,29 @@ def _numbers(line: str) -> list[float]:
     return row if all(map(math.isfinite, row)) else []
 
 
-def _joined(
+def _merge_rows(
     rows: list[list[float]], where: str
 ) -> tuple[list[list[float]], list[tuple[float, float, str]]]:
-    """Rows with at most two at one wavelength, and a fault at each such step."""
-    kept: list[list[float]] = []
+    """Rows with at most two at one wavelength, and a fault at each such step.
+
+    Of three or more rows at one wavelength the first and the last remain.
+
+    Args:
+        rows: sorted by wavelength. where: name for messages.
+    """
+    distinct: list[list[float]] = []
     faults = []
     for row in rows:
-        if len(kept) > 1 and kept[-1][0] == kept[-2][0] == row[0]:
-            kept[-1] = row
+        if len(distinct) > 1 and distinct[-1][0] == distinct[-2][0] == row[0]:
+            distinct[-1] = row
             continue
-        if kept and kept[-1][0] == row[0]:
-            values = f"{kept[-1][1:]} and {row[1:]}"
+        if distinct and distinct[-1][0] == row[0]:
+            values = f"{distinct[-1][1:]} and {row[1:]}"
             faults.append(
                 (row[0], row[0], f"{where}: two rows at {row[0]} um, {values}")
             )
-        kept.append(row)
-    return kept, faults
+        distinct.append(row)
+    return distinct, faults
 
 
 def _source(page: dict[str, Any]) -> str:

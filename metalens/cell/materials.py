@@ -167,30 +167,37 @@ def find_material(name: str) -> Material:
 def _hint(name: str) -> str:
     """What the word means, the same name in another case, or the nearest."""
     lower = name.lower().strip().replace("_", "-")
-    same = [known for known in NAMES if known.lower() == lower.replace(" ", "")]
-    meant = next(iter(same), SPOKEN.get("-".join(lower.split())))
-    return f"; did you mean {meant!r}?" if meant else nearest_name_hint(name, NAMES)
+    same_name = [
+        material for material in NAMES if material.lower() == lower.replace(" ", "")
+    ]
+    suggestion = next(iter(same_name), SPOKEN.get("-".join(lower.split())))
+    return (
+        f"; did you mean {suggestion!r}?"
+        if suggestion
+        else nearest_name_hint(name, NAMES)
+    )
 
 
-def _kin(name: str, wavelength_um: float) -> str:
+def _table_hint(name: str, wavelength_um: float) -> str:
     """Shipped tables of the same substance that hold at a wavelength, in the words of a
     message.
     """
-    alike = [
-        known
-        for known in NAMES
-        if known != name and _substance(known) == _substance(name)
+    same_substance = [
+        material
+        for material in NAMES
+        if material != name and _substance(material) == _substance(name)
     ]
-    ranges = {known: find_material(known).range_um for known in alike}
-    held = [
-        repr(known)
-        for known, (low, high) in ranges.items()
+    ranges = {material: find_material(material).range_um for material in same_substance}
+    in_range = [
+        repr(material)
+        for material, (low, high) in ranges.items()
         if low <= wavelength_um <= high
     ]
-    return f" ({' or '.join(held)} holds there)" if held else ""
+    return f" ({' or '.join(in_range)} holds there)" if in_range else ""
 
 
 def _substance(name: str) -> list[str]:
+    """Words of a material's name without phase, axis and process."""
     return [
         word
         for word in name.split("-")
@@ -240,8 +247,8 @@ def read_csv(path: str | Path) -> Material:
     path: of the CSV file.
 
     Raises:
-        MaterialError: no such file, a missing column, or a bad row; the message gives the
-            line.
+        MaterialError: no such file, a missing column, or a bad row; the message gives
+            the line.
     """
     try:
         stat = Path(path).stat()
@@ -265,6 +272,7 @@ def _read_csv(path: Path, stamp: tuple[int, int]) -> Material:
 
 @lru_cache(maxsize=64)
 def _shipped(name: str) -> Material:
+    """Material of a name in the tables and pages of the package."""
     if name in _PAGES:
         file = (
             importlib.resources.files("metalens")
@@ -289,22 +297,27 @@ def _parse(text: str, *, name: str, where: str) -> Material:
 
 
 def _index_and_slope(
-    wanted: cell.Material | Material, wavelength_um: float
+    material: cell.Material | Material, wavelength_um: float
 ) -> tuple[complex, complex]:
+    """n + ik of a material and its derivative in wavelength, 1/um.
+
+    Raises:
+        MaterialError: a wavelength outside the material's range.
+    """
     if not (math.isfinite(wavelength_um) and wavelength_um > 0):
         raise MaterialError(
             f"wavelength {wavelength_um:.7g} um: need a finite length above 0"
         )
-    if isinstance(wanted, cell.Index):
-        return complex(wanted.n, wanted.k), 0j
-    if isinstance(wanted, cell.Blend):
-        return _blended(wanted, wavelength_um)
-    record = find_material(wanted) if isinstance(wanted, str) else wanted
+    if isinstance(material, cell.Index):
+        return complex(material.n, material.k), 0j
+    if isinstance(material, cell.Blend):
+        return _bruggeman(material, wavelength_um)
+    record = find_material(material) if isinstance(material, str) else material
     low, high = record.range_um
     if not low <= wavelength_um <= high:
         raise MaterialError(
             f"{record.name} at {wavelength_um} um: its source holds from {low:.6g} to {high:.6g} um ({record.source}); "
-            f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
+            f"choose a wavelength inside, another material{_table_hint(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:
         n = record.page[0].at(wavelength_um)
@@ -315,17 +328,19 @@ def _index_and_slope(
     return _from_sellmeier(record, wavelength_um)
 
 
-def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
-    """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) /
-    (a + 2 e) + (1 - f) (b - e) /
-    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b,
-    the root that absorbs (of two
-    media that emit no light one does, Im e >= 0); then the offsets."""
-    base, base_rate = _index_and_slope(wanted.base, wavelength_um)
+def _bruggeman(blend: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
+    """Index of a Bruggeman mixture and its slope in wavelength, 1/um.
+
+    f (a - e) / (a + 2 e) + (1 - f) (b - e) / (b + 2 e) = 0 (D. A. G. Bruggeman, Ann.
+    Phys. 416, 636 (1935)) for permittivities a, b. The solution is e = (h + sqrt(h² + 8
+    a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b, the root with Im e >= 0. The offsets
+    of the blend are added to n and k.
+    """
+    base, base_rate = _index_and_slope(blend.base, wavelength_um)
     n, rate = base, base_rate
-    if wanted.other:
-        other, other_rate = _index_and_slope(wanted.other, wavelength_um)
-        f = 1 - wanted.share
+    if blend.other:
+        other, other_rate = _index_and_slope(blend.other, wavelength_um)
+        f = 1 - blend.share
         a = base**2
         b = other**2
         da = 2 * base * base_rate
@@ -338,10 +353,10 @@ def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex
         de = (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
         n = complex(np.sqrt(complex(e.real, max(e.imag, 0.0))))  # below 0 is rounding
         rate = complex(de / (2 * n))
-    n += complex(wanted.n_offset, wanted.k_offset)
+    n += complex(blend.n_offset, blend.k_offset)
     if n.real <= 0 or n.imag < 0:
         raise MaterialError(
-            f"blend of {wanted.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0"
+            f"blend of {blend.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0"
         )
     return n, rate
 
@@ -359,10 +374,10 @@ def _from_sellmeier(record: Material, wavelength_um: float) -> tuple[complex, co
 
 
 def _from_table(record: Material, wavelength_um: float) -> tuple[complex, complex]:
+    """n + ik and its slope by linear interpolation in the table."""
     x, n, k = record.table
     i = min(max(bisect.bisect_right(x, wavelength_um) - 1, 0), len(x) - 2)
     rate = complex(n[i + 1] - n[i], k[i + 1] - k[i]) / (x[i + 1] - x[i])
     share = (wavelength_um - x[i]) / (x[i + 1] - x[i])
-    return complex(
-        n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]
-    ), rate
+    real = n[i] + share * (n[i + 1] - n[i])
+    return complex(real, (1 - share) * k[i] + share * k[i + 1]), rate

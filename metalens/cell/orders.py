@@ -34,8 +34,8 @@ def propagating_orders(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> tuple[DiffractionOrder, ...]:
-    """All diffraction orders with |k| <= n k0, grazing ones included, the zero order first
-    on each side.
+    """All diffraction orders with |k| <= n k0, grazing ones included, the zero order
+    first on each side.
 
     Args:
         cell: its lattice and half-spaces. wavelength_um: in vacuum.
@@ -46,10 +46,10 @@ def propagating_orders(
     Raises:
         MaterialError: a wavelength outside the range of a material.
     """
-    found = []
+    orders = []
     kx = math.sin(angle_rad) * math.cos(azimuth_rad)
     ky = math.sin(angle_rad) * math.sin(azimuth_rad)
-    across = [
+    steps = [
         wavelength_um / period for period in cell.lattice.periods_um(cell.pitch_um)
     ]
     sides: tuple[Literal["substrate"], Literal["cover"]] = ("substrate", "cover")
@@ -57,25 +57,26 @@ def propagating_orders(
         n_side = materials.index(getattr(cell, side), wavelength_um).real
         rows, columns = (
             sorted(range(-reach, reach + 1), key=abs)
-            for reach in (math.ceil((n_side + 1) / step) for step in across)
+            for reach in (math.ceil((n_side + 1) / step) for step in steps)
         )
         for m in rows:
-            reached = [
+            inside = [
                 n
                 for n in columns
-                if math.hypot(kx + m * across[0], ky + n * across[1]) <= n_side
+                if math.hypot(kx + m * steps[0], ky + n * steps[1]) <= n_side
             ]
-            found += [
+            orders += [
                 DiffractionOrder(side, m, n)
-                for n in reached
+                for n in inside
                 if not (cell.lattice.centred and (m + n) % 2)
             ]
-    return tuple(found)
+    return tuple(orders)
 
 
 def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
-    """Pitch below which no diffraction order propagates even in the densest material of a
-    cell, at normal incidence: wavelength / index, times 2 / sqrt(3) for a hexagonal lattice.
+    """Pitch below which no diffraction order propagates even in the densest material of
+    a cell, at normal incidence: wavelength / index, times 2 / sqrt(3) for a hexagonal
+    lattice.
 
     The layer then guides no wave that the lattice couples to light from outside: no
     guided-mode resonance is left.
@@ -87,14 +88,23 @@ def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
         MaterialError: a wavelength outside the range of a material.
     """
     films = [film.material for film in (*cell.under, *cell.over)]
-    layered = [
-        m
+    layer_materials = [
+        material
         for layer in cell.layers
-        for m in (layer.material, layer.between, layer.coat)
-        if m is not None
+        for material in (layer.material, layer.between, layer.coat)
+        if material is not None
     ]
-    every = (cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *layered)
-    densest = max(materials.index(material, wavelength_um).real for material in every)
+    all_materials = (
+        cell.pillar,
+        cell.fill,
+        cell.substrate,
+        cell.cover,
+        *films,
+        *layer_materials,
+    )
+    densest = max(
+        materials.index(material, wavelength_um).real for material in all_materials
+    )
     return cell.lattice.least_order * wavelength_um / densest
 
 
@@ -105,8 +115,8 @@ def substrate_orders(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> tuple[DiffractionOrder, ...]:
-    """Diffraction orders other than zero that propagate in the substrate: what they carry
-    is lost.
+    """Diffraction orders other than zero that propagate in the substrate: what they
+    carry is lost.
 
     Args:
         cell, wavelength_um, angle_rad, azimuth_rad: as for :func:`propagating_orders`.
@@ -129,8 +139,8 @@ def named_orders(orders: Sequence[DiffractionOrder], most: int = 8) -> str:
 def describe_order_loss(
     cell: Cell, wavelength_um: float, share: float | None = None
 ) -> str:
-    """Which orders of the substrate take light at normal incidence, in a line; empty where
-    none propagates.
+    """Which orders of the substrate take light at normal incidence, in a line; empty
+    where none propagates.
 
     Args:
         cell, wavelength_um: as for :func:`propagating_orders`.
@@ -139,10 +149,10 @@ def describe_order_loss(
     orders = substrate_orders(cell, wavelength_um)
     if not orders:
         return ""
-    known = "" if share is None else f", with absorption {share:.1%} in the mean"
+    share_text = "" if share is None else f", with absorption {share:.1%} in the mean"
     return (
         f"\n  diffraction orders {named_orders(orders)} propagate in the substrate and "
-        f"take light{known}: a loss that |T| of the pillars includes"
+        f"take light{share_text}: a loss that |T| of the pillars includes"
     )
 
 
@@ -153,8 +163,8 @@ def check_subwavelength(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> None:
-    """Refuse a cell that transmits orders other than zero into the cover, which would reach
-    the sensor.
+    """Refuse a cell that transmits orders other than zero into the cover, which would
+    reach the sensor.
 
     Orders of the substrate alone are a loss: :func:`substrate_orders` lists them, the
     solvers' ``energy`` includes them.
@@ -191,22 +201,25 @@ def check_subwavelength(
 def _limit_um(
     lattice: Lattice, wavelength_um: float, sine: float, azimuth_rad: float
 ) -> float:
-    """Pitch below which no other order propagates in a medium, for the wavelength and
-    the sine of the angle in it.
+    """Pitch (um) below which only the zero order propagates in a medium.
 
-    The shortest reciprocal vectors of each direction meet the circle of the medium
-    first: of (2π/pitch) g along u,
-    |k sine ± (2π/pitch) g u| = k at pitch / wavelength = g / (|c| + sqrt(1 - s²)), with c of the sine along u and s
-    across.
+    A shortest reciprocal vector (2π/pitch) g u meets the circle |k| of the medium at
+    pitch = wavelength g / (|c| + sqrt(1 - s²)), with c and s the sine's parts along u
+    and across.
+
+    Args:
+        lattice: with its shortest reciprocal vectors.
+        wavelength_um: in the medium. sine: of the angle in the medium.
+        azimuth_rad: of the plane of incidence.
     """
     if lattice.centred:
-        short = [(lattice.least_order, math.pi * (2 * m + 1) / 6) for m in range(3)]
+        shortest = [(lattice.least_order, math.pi * (2 * m + 1) / 6) for m in range(3)]
     else:
-        short = [(1.0, 0.0), (1 / lattice.ratio, math.pi / 2)]
-    off = [(g, azimuth_rad - turn) for g, turn in short]
+        shortest = [(1.0, 0.0), (1 / lattice.ratio, math.pi / 2)]
+    relative = [(length, azimuth_rad - turn) for length, turn in shortest]
     return min(
         wavelength_um
-        * g
-        / (abs(sine * math.cos(t)) + math.sqrt(1 - (sine * math.sin(t)) ** 2))
-        for g, t in off
+        * length
+        / (abs(sine * math.cos(angle)) + math.sqrt(1 - (sine * math.sin(angle)) ** 2))
+        for length, angle in relative
     )

@@ -12,7 +12,7 @@ from metalens.cell.shapes.round import Circle
 from metalens.core.errors import CellError
 
 # of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
-_APART = 0.02
+_CLEARANCE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,13 +220,21 @@ class Cell:
 
     @property
     def height_shares(self) -> tuple[float, ...]:
-        """Of a change of the height, by section: those of the pillar's own material
-        share it in proportion. What lies
-        under, between and on them (a pedestal, a residual mask) is of other films; all
-        share it where none is of it."""
-        own = [layer.height_um * (layer.material is None) for layer in self.sections]
-        own = own if any(own) else [layer.height_um for layer in self.sections]
-        return tuple(height / sum(own) for height in own)
+        """Share of each section in a change of the height.
+
+        Sections of the pillar's own material share it in proportion to their heights.
+        Other films (a pedestal, a residual mask) have no share, unless no section is of
+        the pillar's material.
+        """
+        material_heights = [
+            layer.height_um * (layer.material is None) for layer in self.sections
+        ]
+        material_heights = (
+            material_heights
+            if any(material_heights)
+            else [layer.height_um for layer in self.sections]
+        )
+        return tuple(height / sum(material_heights) for height in material_heights)
 
     def at_height(self, height_um: float) -> "Cell":
         """The same cell with pillars of another height; of layered ones by
@@ -237,19 +245,19 @@ class Cell:
         """
         if not self.layers:
             return replace(self, height_um=height_um)
-        own = sum(
+        own_um = sum(
             layer.height_um
             for layer, share in zip(self.layers, self.height_shares, strict=True)
             if share
         )
-        more = height_um - self.height_um
-        if own + more <= 0:
+        change = height_um - self.height_um
+        if own_um + change <= 0:
             raise CellError(
-                f"height_um = {height_um:g} of a pillar in layers, {self.height_um - own:g} um of it of other films: "
+                f"height_um = {height_um:g} of a pillar in layers, {self.height_um - own_um:g} um of it of other films: "
                 "need a larger height"
             )
         layers = tuple(
-            replace(layer, height_um=layer.height_um + more * share)
+            replace(layer, height_um=layer.height_um + change * share)
             for layer, share in zip(self.layers, self.height_shares, strict=True)
         )
         return replace(self, height_um=height_um, layers=layers)
@@ -277,35 +285,37 @@ class Cell:
         return min(bare), max(coated)
 
     def widest_um(self, gap_um: float) -> float:
-        """Largest size that leaves this gap between neighbours (0 where even the
-        thinnest leave less).
+        """Largest size (um) that leaves this gap between neighbours; 0 if none does.
 
-        Where a foot, a pedestal or a coat is wider than the size, it is less where that
-        comes within a fiftieth of the
-        pitch of its neighbour.
+        Where a foot, a pedestal or a coat is wider than the size, it must also stay a
+        fiftieth of the pitch from its neighbour.
         """
-        _, most = self.widening_um
-        wide = most if most > 0 else -math.inf
+        _, most_widening = self.widening_um
+        widening = most_widening if most_widening > 0 else -math.inf
         if self.round:
-            return self.pitch_um - max(gap_um, _APART * self.pitch_um + wide)
+            return self.pitch_um - max(gap_um, _CLEARANCE * self.pitch_um + widening)
         low, high = 0.0, 4 * self.pitch_um
         while high - low > 1e-4 * self.pitch_um:
             middle = (low + high) / 2
-            apart = self.gap_um(middle) > gap_um and (
-                wide < 0 or self.gap_um(middle, grow_um=wide) > _APART * self.pitch_um
+            is_clear = self.gap_um(middle) > gap_um and (
+                widening < 0
+                or self.gap_um(middle, grow_um=widening) > _CLEARANCE * self.pitch_um
             )
-            low, high = (middle, high) if apart else (low, middle)
+            low, high = (middle, high) if is_clear else (low, middle)
         return round(low, 4)
 
     def size_um(self, width_um: float, gap_um: float = 0.0) -> float:
-        """The least size of the shape that is nowhere narrower than this (a ring's
-        wall, a cross's bar), and whose
-        holes and hollows are nowhere narrower than ``gap_um``. Of a top or a layer that
-        is thinner than the size at
-        least a fiftieth of the pitch is left.
+        """Least size (um) of the shape with every solid width (a ring's wall, a cross's
+        bar) at least ``width_um``, and every hole and hollow at least ``gap_um``.
+
+        Of a top or a layer that is thinner than the size, at least a fiftieth of the
+        pitch remains.
         """
-        least, _ = self.widening_um
-        width_um = max(width_um, _APART * self.pitch_um - least if least < 0 else 0.0)
+        least_widening, _ = self.widening_um
+        width_um = max(
+            width_um,
+            _CLEARANCE * self.pitch_um - least_widening if least_widening < 0 else 0.0,
+        )
         if self.round:
             return width_um
         unit = self.pitch_um / 2

@@ -16,11 +16,12 @@ class Response:
     t, r: co-polarised transmission and reflection amplitudes.
     t_error: estimate of the larger of |t - exact| and |r - exact|, not below it.
     orders: harmonics (RCWA) or degrees of freedom (modal) of the finest solution used.
-    energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a defect if lossless). In a
+    energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a
+    defect if lossless). In a
         substrate that absorbs, powers of light that comes and that is reflected do not
         add, and it may exceed 1.
     engine: ``rcwa``, ``modal`` or ``film``.
-    converged: whether ``t_error`` meets the tolerance that was asked for.
+    converged: whether ``t_error`` meets the requested tolerance.
     reason: why the solver stopped, in words.
     """
 

@@ -35,21 +35,33 @@ def parse_table(text: str, where: str) -> tuple[Array, str]:
         raise MaterialError(
             f"{where}: empty; need columns {COLUMNS}, and at least two rows"
         )
-    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), ",")
-    plain = [
-        (i, line if mark == "," else line.replace(",", ".").replace(mark, ","))
-        for i, line in body
-    ]
-    body = _unstacked(plain, where)
+    separator = next(
+        (mark for mark in ";\t" if mark in body[0][1] and "," not in body[0][1]), ","
+    )
+    if separator != ",":
+        body = [(i, line.replace(",", ".").replace(separator, ",")) for i, line in body]
+    body = _join_stacked_tables(body, where)
     names = [_column(field) for field in next(csv.reader([body[0][1]]))]
-    place = next((names.index(column) for column in _SCALES if column in names), -1)
-    if place < 0 or "n" not in names:
+    wavelength_column = next(
+        (names.index(column) for column in _SCALES if column in names), -1
+    )
+    if wavelength_column < 0 or "n" not in names:
         raise MaterialError(
             f"{where}, line {body[0][0]}: columns {', '.join(names)}; need {COLUMNS}"
         )
-    order = [place, names.index("n"), names.index("k") if "k" in names else -1]
+    order = [
+        wavelength_column,
+        names.index("n"),
+        names.index("k") if "k" in names else -1,
+    ]
     rows = [
-        _row(line, order, len(names), f"{where}, line {i}", _SCALES[names[place]])
+        _row(
+            line,
+            order,
+            len(names),
+            f"{where}, line {i}",
+            _SCALES[names[wavelength_column]],
+        )
         for i, line in body[1:]
     ]
     return np.array(_rising(rows, [i for i, _ in body[1:]], where)).T, " ".join(
@@ -65,9 +77,19 @@ def _column(field: str) -> str:
     return re.sub(r"[\s,()\[\]/]+", "_", plain).strip("_")
 
 
-def _unstacked(body: list[tuple[int, str]], where: str) -> list[tuple[int, str]]:
-    """The rows of a file whose k follows its n as a second table (as
-    refractiveindex.info exports) in one table.
+def _join_stacked_tables(
+    body: list[tuple[int, str]], where: str
+) -> list[tuple[int, str]]:
+    """Rows of a file with n and k in one table.
+
+    refractiveindex.info exports k as a second table after n, each with a header "wl,…".
+    Other files are returned as they are.
+
+    Args:
+        body: (line number, line). where: name for messages.
+
+    Raises:
+        MaterialError: the two tables have different wavelengths.
     """
     heads = [
         i
@@ -76,22 +98,31 @@ def _unstacked(body: list[tuple[int, str]], where: str) -> list[tuple[int, str]]
     ]
     if len(heads) != 2:
         return body
-    first, second = body[: heads[1]], body[heads[1] + 1 :]
-    waves = [line.split(",")[0].strip() for _, line in first[1:]]
-    if waves != [line.split(",")[0].strip() for _, line in second]:
+    n_table, k_table = body[: heads[1]], body[heads[1] + 1 :]
+    wavelengths = [line.split(",")[0].strip() for _, line in n_table[1:]]
+    if wavelengths != [line.split(",")[0].strip() for _, line in k_table]:
         raise MaterialError(
             f"{where}, line {body[heads[1]][0]}: n and k stand at different wavelengths; need the same"
         )
     rows = [
-        (i, f"{line},{other.split(',')[1]}")
-        for (i, line), (_, other) in zip(first[1:], second, strict=True)
+        (i, f"{n_line},{k_line.split(',')[1]}")
+        for (i, n_line), (_, k_line) in zip(n_table[1:], k_table, strict=True)
     ]
-    return [(first[0][0], "wl,n,k"), *rows]
+    return [(n_table[0][0], "wl,n,k"), *rows]
 
 
 def _row(
     line: str, order: list[int], width: int, where: str, scale: float
 ) -> list[float]:
+    """Wavelength in um, n and k of one line.
+
+    Args:
+        line: of the file. order: columns of the three; -1: none, 0.
+        width: number of fields. where: line, for messages. scale: wavelength to um.
+
+    Raises:
+        MaterialError: not numbers, or out of range.
+    """
     fields = next(csv.reader([line]))
     if len(fields) != width:
         raise MaterialError(f"{where}: {len(fields)} fields, the header has {width}")

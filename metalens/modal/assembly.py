@@ -83,25 +83,29 @@ def element_matrices(
     Returns:
         Mass, curl-curl and scalar mass, (elements, functions, functions) each.
     """
-    b = patch.basis
-    w = b.weight
+    basis = patch.basis
+    weight = basis.weight
 
     def gram(left: np.ndarray, field: np.ndarray, right: np.ndarray) -> np.ndarray:
-        product: np.ndarray = (left * (field * w)[:, None, :]) @ right.T
+        product: np.ndarray = (left * (field * weight)[:, None, :]) @ right.T
         return product
 
-    cross = gram(b.along_xi, m.xi_eta, b.along_eta)
+    cross = gram(basis.along_xi, m.xi_eta, basis.along_eta)
     mass = np.concatenate(
         [
-            np.concatenate([gram(b.along_xi, m.xi_xi, b.along_xi), cross], 2),
+            np.concatenate([gram(basis.along_xi, m.xi_xi, basis.along_xi), cross], 2),
             np.concatenate(
-                [cross.transpose(0, 2, 1), gram(b.along_eta, m.eta_eta, b.along_eta)], 2
+                [
+                    cross.transpose(0, 2, 1),
+                    gram(basis.along_eta, m.eta_eta, basis.along_eta),
+                ],
+                2,
             ),
         ],
         1,
     )
-    curl = b.curl.T @ gram(b.turn, m.inverse_area, b.turn) @ b.curl
-    return mass, curl, gram(b.scalar, m.area, b.scalar)
+    curl = basis.curl.T @ gram(basis.turn, m.inverse_area, basis.turn) @ basis.curl
+    return mass, curl, gram(basis.scalar, m.area, basis.scalar)
 
 
 def sum_blocks(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
@@ -121,13 +125,13 @@ def gradient_matrix(plan: MeshPlan) -> np.ndarray:
     plan: of the mesh.
     """
     mesh = build_mesh(plan)
-    out = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
+    gradient = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
     for patch in mesh.patches:
         rows, columns = np.nonzero(patch.basis.gradient)
-        out[patch.vector[..., rows], patch.scalar[..., columns]] = patch.basis.gradient[
-            rows, columns
-        ]
-    return out
+        gradient[patch.vector[..., rows], patch.scalar[..., columns]] = (
+            patch.basis.gradient[rows, columns]
+        )
+    return gradient
 
 
 def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMatrices]:
@@ -148,10 +152,11 @@ def integrate_matrices(mesh: DiscMesh, rho: float) -> tuple[CellMatrices, CellMa
         total[1] += sum_blocks(patch.vector, curl, nv)
         total[2] += sum_blocks(patch.scalar, scalar, ns)
     disc = CellMatrices(*sums[True])
-    rest = sums[False]
-    return CellMatrices(
-        disc.mass + rest[0], disc.curl + rest[1], disc.scalar + rest[2]
-    ), disc
+    outside = sums[False]
+    whole = CellMatrices(
+        disc.mass + outside[0], disc.curl + outside[1], disc.scalar + outside[2]
+    )
+    return whole, disc
 
 
 def assemble_disc(rho: float, plan: MeshPlan) -> AssembledDisc:

@@ -1,5 +1,5 @@
-"""From a cell, a size and a plane wave to the numbers of one modal case; refuses what
-the elements cannot follow.
+"""From a cell, a size and a plane wave to the numbers of one modal case; raises for
+shapes that the elements cannot follow.
 """
 
 import math
@@ -19,8 +19,8 @@ class ModalCase:
 
     rho: diameter over pitch. k0, height: vacuum wavenumber and height.
     below, above: permittivities of the half-spaces. disc, around: of the layer.
-    bloch: kx. p: whether the plane of incidence holds the electric field of oblique
-        light.
+    bloch: kx. p: whether oblique light has its electric field in the plane of
+        incidence.
     under, over: films, nearest to the layer first.
     """
 
@@ -52,24 +52,29 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
     check_shape(cell, diameter_um)
     along = plane_of_incidence(light)
     below, above = half_spaces(cell, light)
-    disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.fill))
+    disc, around = (
+        index(material, light.wavelength_um) for material in (cell.pillar, cell.fill)
+    )
     k0 = 2 * math.pi / light.wavelength_um
-    half = cell.pitch_um / 2
+    half_pitch_um = cell.pitch_um / 2
     sine = abs(math.sin(light.angle_rad))
-    bloch = k0 * sine * half
+    bloch = k0 * sine * half_pitch_um
     if bloch <= NORMAL_RAD:
         bloch = 0.0
 
     def films(stack: tuple[Film, ...]) -> Films:
         return tuple(
-            (index(film.material, light.wavelength_um) ** 2, film.thickness_um / half)
+            (
+                index(film.material, light.wavelength_um) ** 2,
+                film.thickness_um / half_pitch_um,
+            )
             for film in stack
         )
 
     return ModalCase(
         rho=diameter_um / cell.pitch_um,
-        k0=k0 * half,
-        height=cell.height_um / half,
+        k0=k0 * half_pitch_um,
+        height=cell.height_um / half_pitch_um,
         below=below.real**2,
         above=above.real**2,
         disc=disc**2,
@@ -82,7 +87,8 @@ def case_of(cell: Cell, diameter_um: float, light: Incidence) -> ModalCase:
 
 
 def plane_of_incidence(light: Incidence) -> str:
-    """The lattice axis, "x" or "y", that the plane of incidence of a ``light`` contains.
+    """The lattice axis, "x" or "y", that the plane of incidence of a ``light``
+    contains.
 
     Raises:
         CellError: a plane off the lattice axes.
@@ -97,8 +103,8 @@ def plane_of_incidence(light: Incidence) -> str:
 
 
 def half_spaces(cell: Cell, light: Incidence) -> tuple[complex, complex]:
-    """Refractive indices of substrate and cover of a ``cell``, neither absorbing, with a
-    zero order of the ``light`` in both.
+    """Refractive indices of substrate and cover of a ``cell``, neither absorbing, with
+    a zero order of the ``light`` in both.
 
     Raises:
         CellError: says which absorbs, or that the angle is too large.
@@ -118,7 +124,7 @@ def half_spaces(cell: Cell, light: Incidence) -> tuple[complex, complex]:
 
 
 def check_shape(cell: Cell, diameter_um: float) -> None:
-    """Refuse a ``cell`` or a ``diameter_um`` that the elements cannot follow.
+    """Raise for a ``cell`` or a ``diameter_um`` that the elements cannot follow.
 
     Raises:
         CellError: no upright round pillar, or one that touches its neighbours.

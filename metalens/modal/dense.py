@@ -62,12 +62,13 @@ def gram_matrix(matrix: np.ndarray) -> np.ndarray:
 
 
 def congruence_product(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which
-    have no diagonal, are left out.
+    """outerᵀ inner outer of a semidefinite matrix.
+
+    Rows and columns with zero diagonal are zero, and are left out.
     """
     rows = np.flatnonzero(inner.diagonal())
-    few = outer[rows]
-    product: np.ndarray = few.T @ (inner.take(rows, 0).take(rows, 1) @ few)
+    reduced = outer[rows]
+    product: np.ndarray = reduced.T @ (inner.take(rows, 0).take(rows, 1) @ reduced)
     return product
 
 

@@ -28,15 +28,15 @@ from metalens.modal.match import (
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.spaces import build_symmetry_class, class_topology
 
-SMALL = 500  # unknowns of a symmetry class: bases of no more are kept for longer
+SMALL = 500  # unknowns of a symmetry class: more of the bases up to it are cached
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MeshSolution:
     """Solution on one mesh.
 
-    matrix: (2, 2) zero-order scattering matrix, the mean of both forms, substrate first.
-    half_difference: half of the largest difference of the forms.
+    matrix: (2, 2) zero-order scattering matrix, the mean of both forms, substrate
+    first. half_difference: half of the largest difference of the forms.
     energy: power out per unit power in from the substrate, mean of both forms.
     unknowns: of both forms. loss: what the modes that are left out change at most.
     """
@@ -124,10 +124,10 @@ def scatter_layer(
     loss: float,
 ) -> tuple[np.ndarray, bool]:
     """Scattering matrix of the layer over the ports of both half-spaces, and whether it
-    is of the dual unknown.
+    belongs to the dual unknown.
 
-    From few modes where the layer is without loss and so thick that few carry light,
-    else from all.
+    Few modes suffice where the layer is lossless and so thick that few carry light;
+    otherwise all are used.
 
     Args:
         case: the problem. b: homogeneous modes. foot, top: half-spaces.
@@ -146,8 +146,8 @@ def scatter_layer(
 def solve_form(
     case: ModalCase, plan: MeshPlan, *, magnetic: bool, loss: float
 ) -> tuple[np.ndarray, float, int]:
-    """Zero-order scattering matrix (2, 2) of one variational form on one mesh, power out
-    per unit power in, unknowns.
+    """Zero-order scattering matrix (2, 2) of one variational form on one mesh, power
+    out per unit power in, unknowns.
 
     Args:
         case: the problem. plan: of the mesh. magnetic: the form.
@@ -156,33 +156,36 @@ def solve_form(
     # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the
     # electric space
     te = case.p == magnetic if case.bloch else True
-    b = homogeneous_basis(case.rho, plan, te and case.bloch > 0, case.bloch)
+    basis = homogeneous_basis(case.rho, plan, te and case.bloch > 0, case.bloch)
     foot, top = (
-        half_space(b, case.k0, *side, magnetic=magnetic, bloch=case.bloch)
+        half_space(basis, case.k0, *side, magnetic=magnetic, bloch=case.bloch)
         for side in ((case.below, case.under), (case.above, case.over))
     )
-    whole, dual = scatter_layer(case, b, foot, top, magnetic=magnetic, loss=loss)
-    first, second = (zero_order(b, half, case.bloch, te=te) for half in (foot, top))
-    pair = [first, len(foot.ports) + second]
-    matrix = whole[pair][:, pair]
+    all_ports, dual = scatter_layer(
+        case, basis, foot, top, magnetic=magnetic, loss=loss
+    )
+    first, second = (zero_order(basis, half, case.bloch, te=te) for half in (foot, top))
+    zero_ports = [first, len(foot.ports) + second]
+    matrix = all_ports[zero_ports][:, zero_ports]
     if magnetic and not dual:
         matrix = matrix * [[-1.0, 1.0], [1.0, -1.0]]
-    return matrix, float((np.abs(whole[:, first]) ** 2).sum()), b.size
+    return matrix, float((np.abs(all_ports[:, first]) ** 2).sum()), basis.size
 
 
 @lru_cache(maxsize=256)
 def solve_on_mesh(case: ModalCase, plan: MeshPlan) -> MeshSolution:
     """Zero-order scattering matrix on one mesh: the mean of the electric and magnetic
-    forms, whose errors have opposite tendency; remembered.
+    forms, whose errors tend to have opposite signs; cached.
 
-    Layer modes that decay over the height below 1e-7, or 10^-(3 + degree), end where
-    they start: far below the error of a mesh of that degree.
+    Layer modes that decay over the height below 1e-7, or 10^-(3 + degree), do not cross
+    the layer. This is below the error of a mesh of that degree.
 
     Args:
         case: the problem. plan: of the mesh.
 
     Raises:
-        CellError: a disc so thin or so wide that the matrices of its elements are singular.
+        CellError: a disc so thin or so wide that the matrices of its elements are
+            singular.
     """
     loss = min(1e-7, 10.0 ** -(3 + plan.radial))
     try:

@@ -46,20 +46,23 @@ def exact_zero_order(discrete: np.ndarray, half_phase_rad: float | None) -> np.n
     it, set to its exact value.
 
     Args:
-        discrete: (n,) of the mesh, rising. half_phase_rad: half the Bloch phase, or None.
+        discrete: (n,) of the mesh, rising. half_phase_rad: half the Bloch phase, or
+            None.
     """
     exact = (half_phase_rad or 0.0) ** 2
-    out: np.ndarray = np.maximum(discrete, 0.0)
-    if abs(out[0] - exact) <= 0.05 * exact + 1e-9:
-        out[0] = exact
-    return out
+    squares: np.ndarray = np.maximum(discrete, 0.0)
+    if abs(squares[0] - exact) <= 0.05 * exact + 1e-9:
+        squares[0] = exact
+    return squares
 
 
 def gradient_modes(space: SymmetryClass) -> tuple[np.ndarray, np.ndarray]:
-    """Transverse wavenumbers squared and scalar fields of the TM modes from singular
-    values, which keep all digits of a nearly uniform field.
+    """Transverse wavenumbers squared (b,) and scalar fields (n, b) of the TM modes.
 
-    space: the symmetry class.
+    From singular values, which keep all digits of a nearly uniform field.
+
+    Args:
+        space: the symmetry class.
     """
     lower = cholesky_factor(space.cell.scalar)
     field = cholesky_factor(space.cell.mass).T @ space.gradient
@@ -70,34 +73,37 @@ def gradient_modes(space: SymmetryClass) -> tuple[np.ndarray, np.ndarray]:
 def homogeneous_modes(space: SymmetryClass) -> HomogeneousBasis:
     """Eigenmodes of the empty cell in the basis of cotree unknowns and gradients.
 
-    The curl knows the cotree unknowns alone: with G the gradients, K = G^T mass G, the TM
-    modes solve K f = tm scalar f, and the TE modes are x on the cotree less its projection
-    on the gradients: curl_cc x = te (mass_cc - mass_cG K^-1 mass_Gc) x.
+    The curl acts on the cotree unknowns alone. With G the gradients, K = G^T mass G,
+    the TM modes solve K f = tm scalar f, and the TE modes are x on the cotree less its
+    projection on the gradients: curl_cc x = te (mass_cc - mass_cG K^-1 mass_Gc) x.
 
-    space: the symmetry class. Accuracy: the difference loses digits, 1e-8 of t at worst.
+    Args:
+        space: the symmetry class.
+
+    Accuracy: the difference loses digits, 1e-8 of t at worst.
     """
-    c, down_to = space.cotree, space.transposed
-    corner = c[:, None], c
-    mass = (down_to @ space.cell.mass).T
+    cotree, gradient_transposed = space.cotree, space.transposed
+    corner = cotree[:, None], cotree
+    mass = (gradient_transposed @ space.cell.mass).T
     if 0 < (space.half_phase_rad or 0.0) < SMALL_PHASE_RAD:
         tm, scalar = gradient_modes(space)
     else:
-        tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
-    unit = scalar / np.sqrt(tm)
-    inner = unit.T @ mass[c].T
+        tm, scalar = eigen_pairs(gradient_transposed @ mass, space.cell.scalar)
+    normalized = scalar / np.sqrt(tm)
+    coupling = normalized.T @ mass[cotree].T
     te, x = eigen_pairs(
-        space.cell.curl[corner], space.cell.mass[corner] - gram_matrix(inner)
+        space.cell.curl[corner], space.cell.mass[corner] - gram_matrix(coupling)
     )
-    gradients = down_to.T @ unit
-    rest = -gradients @ (inner @ x)
-    rest[c] += x
+    tm_fields = gradient_transposed.T @ normalized
+    te_fields = -tm_fields @ (coupling @ x)
+    te_fields[cotree] += x
     return HomogeneousBasis(
         te=np.maximum(te, 0.0),
         tm=tm,
         te_exact=exact_zero_order(te, space.half_phase_rad),
         tm_exact=exact_zero_order(tm, space.half_phase_rad),
         disc_mass=congruence_product(
-            space.disc.mass, np.concatenate([rest, gradients], 1)
+            space.disc.mass, np.concatenate([te_fields, tm_fields], 1)
         ),
         disc_curl=congruence_product(space.disc.curl[corner], x),
         disc_scalar=congruence_product(space.disc.scalar, scalar),

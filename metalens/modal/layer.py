@@ -26,7 +26,7 @@ class LayerMedium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerModes:
-    """Fields and partners of the layer modes, columns scaled alike.
+    """Fields and partners of the layer modes, with one scale for each column of both.
 
     q: (n,) axial wavenumbers, decaying or going up. field: (n, n) w. partner: (n, n)
     growth w.
@@ -53,26 +53,30 @@ def electric_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
         basis: homogeneous modes. medium: wavenumber and permittivities.
     """
     disc, around = medium.permittivities()
-    n, a, k0 = basis.size, len(basis.te), medium.k0
+    n, te_count, k0 = basis.size, len(basis.te), medium.k0
     scale = k0 / np.sqrt(basis.tm)
-    both = np.concatenate([np.ones(a), scale])
+    scaling = np.concatenate([np.ones(te_count), scale])
     stiffness = -(k0**2) * (disc - around) * basis.disc_mass
     diagonal = np.arange(n)
     stiffness[diagonal, diagonal] -= k0**2 * around
-    stiffness[diagonal[:a], diagonal[:a]] += basis.te
-    level = 1 / np.concatenate([np.sqrt(basis.te + k0**2), np.full(n - a, k0)])
+    stiffness[diagonal[:te_count], diagonal[:te_count]] += basis.te
+    level = 1 / np.concatenate([np.sqrt(basis.te + k0**2), np.full(n - te_count, k0)])
     inverse = np.linalg.inv(level[:, None] * stiffness * level)
-    longitudinal = (disc - around) * basis.disc_scalar + around * np.eye(n - a)
-    shrink = np.linalg.solve(np.eye(n - a) - longitudinal * scale**2, longitudinal)
-    shrink = (shrink + shrink.T) / 2
-    level = level * both
-    problem = level[:, None] * inverse * level
-    problem[:, a:] = -problem[:, a:] @ shrink
-    value, vectors = np.linalg.eig(problem)
+    longitudinal = (disc - around) * basis.disc_scalar + around * np.eye(n - te_count)
+    tm_growth = np.linalg.solve(
+        np.eye(n - te_count) - longitudinal * scale**2, longitudinal
+    )
+    tm_growth = (tm_growth + tm_growth.T) / 2
+    level = level * scaling
+    inverse_pencil = level[:, None] * inverse * level
+    inverse_pencil[:, te_count:] = -inverse_pencil[:, te_count:] @ tm_growth
+    value, vectors = np.linalg.eig(inverse_pencil)
     partner = vectors.copy()
-    partner[a:] = -shrink @ vectors[a:]
+    partner[te_count:] = -tm_growth @ vectors[te_count:]
     return LayerModes(
-        axial_wavenumber(-1 / value), vectors / both[:, None], partner * both[:, None]
+        axial_wavenumber(-1 / value),
+        vectors / scaling[:, None],
+        partner * scaling[:, None],
     )
 
 
@@ -83,25 +87,25 @@ def magnetic_modes(basis: HomogeneousBasis, medium: LayerMedium) -> LayerModes:
         basis: homogeneous modes. medium: wavenumber and permittivities.
     """
     disc, around = (1 / e for e in medium.permittivities())
-    n, a, k0 = basis.size, len(basis.te), medium.k0
+    n, te_count, k0 = basis.size, len(basis.te), medium.k0
     scale = k0 / np.sqrt(basis.tm)
-    both = np.concatenate([np.ones(a), scale])
+    scaling = np.concatenate([np.ones(te_count), scale])
     weighted = (disc - around) * basis.disc_mass + around * np.eye(n)
-    inverse = both[:, None] * np.linalg.inv(weighted) * both
-    tail = np.arange(a, n)
-    inverse[tail, tail] -= 1
+    inverse = scaling[:, None] * np.linalg.inv(weighted) * scaling
+    tm_places = np.arange(te_count, n)
+    inverse[tm_places, tm_places] -= 1
     growth = np.linalg.inv(inverse)
     growth = (growth + growth.T) / 2
     stiffness = (disc - around) * basis.disc_curl + np.diag(around * basis.te - k0**2)
     level = 1 / np.sqrt(basis.te + k0**2)
-    problem = np.empty_like(growth)
-    problem[:a] = level[:, None] * np.linalg.solve(
-        level[:, None] * stiffness * level, level[:, None] * growth[:a]
+    inverse_pencil = np.empty_like(growth)
+    inverse_pencil[:te_count] = level[:, None] * np.linalg.solve(
+        level[:, None] * stiffness * level, level[:, None] * growth[:te_count]
     )
-    problem[a:] = -((scale / k0) ** 2)[:, None] * growth[a:]
-    value, vectors = np.linalg.eig(problem)
+    inverse_pencil[te_count:] = -((scale / k0) ** 2)[:, None] * growth[te_count:]
+    value, vectors = np.linalg.eig(inverse_pencil)
     return LayerModes(
         axial_wavenumber(-1 / value),
-        vectors / both[:, None],
-        both[:, None] * (growth @ vectors),
+        vectors / scaling[:, None],
+        scaling[:, None] * (growth @ vectors),
     )

@@ -15,20 +15,20 @@ from metalens.modal.layer import LayerModes, axial_wavenumber
 # relative distance of k² from its cutoff within which an order takes its exact
 # wavenumber
 NEAR = 0.4
-KNOWN = 0.02  # relative error of k² up to which a mode of the mesh is that order
+KNOWN = 0.02  # relative error of k² up to which a mode of the mesh counts as an order
 # modes that decay below this over the height cannot change a result of double precision
 CARRY = 1e-13
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfSpace:
-    """A homogeneous half-space seen through its films, in the homogeneous modes.
+    """A homogeneous half-space behind its films, in the homogeneous modes.
 
     Waves that go away have p = Y u. Of the orders that propagate (``ports``), incoming
     power-normalised amplitudes a add -2 T a to p, and leaving ones are b = T u + R a.
 
-    admittance: (n,) Y. ports: (m,) places. transfer, reflection: (m,) T and R, of a bare
-    half-space sqrt(Y) and -1. lossless: whether no film absorbs.
+    admittance: (n,) Y. ports: (m,) places. transfer, reflection: (m,) T and R, of a
+    bare half-space sqrt(Y) and -1. lossless: whether no film absorbs.
     """
 
     admittance: np.ndarray
@@ -51,10 +51,10 @@ class HalfSpace:
         stand-in of a travelling layer mode has, so that the two cannot cancel: plus in
         the dual unknown, else minus.
         """
-        near = self.admittance.real.copy()
+        stand_in = self.admittance.real.copy()
         size = np.abs(self.admittance[self.ports])
-        near[self.ports] = size if dual else -size
-        return near
+        stand_in[self.ports] = size if dual else -size
+        return stand_in
 
 
 def half_space(
@@ -70,7 +70,8 @@ def half_space(
     i kz / eps, i k0^2 / kz.
 
     Args:
-        basis: homogeneous modes. k0: vacuum wavenumber. permittivity: of the half-space.
+        basis: homogeneous modes. k0: vacuum wavenumber. permittivity: of the
+            half-space.
         films: those on it, nearest first.
         magnetic: the form.
         bloch: if given, orders near their cut-off get the wavenumbers of the lattice
@@ -79,14 +80,14 @@ def half_space(
     A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance
     stays finite.
     """
-    square = np.concatenate([basis.te_exact, basis.tm_exact])
+    squares = np.concatenate([basis.te_exact, basis.tm_exact])
     if bloch is not None:
-        square = near_cutoff(square, k0**2 * permittivity, bloch)
-    is_te = np.arange(len(square)) < len(basis.te)
+        squares = near_cutoff(squares, k0**2 * permittivity, bloch)
+    is_te = np.arange(len(squares)) < len(basis.te)
 
     def wave(eps: complex) -> tuple[np.ndarray, np.ndarray]:
         """kz, and c of p = c du/dz."""
-        kz = axial_wavenumber(k0**2 * eps - square)
+        kz = axial_wavenumber(k0**2 * eps - squares)
         kz = np.where(np.abs(kz) < 1e-8 * k0, 1e-8 * k0, kz)
         te, tm = (1 / eps, 1.0) if magnetic else (1.0, eps)
         return kz, np.where(is_te, te, k0**2 * tm / kz**2)
@@ -97,13 +98,13 @@ def half_space(
     transfer, reflection = np.sqrt(y), -np.ones(len(y), complex)
     for eps, thickness in films:
         kz, factor = wave(eps)
-        once = np.exp(1j * kz * thickness)
-        cosine = (1 + once**2) / 2
-        sine = (once**2 - 1) / (2j * kz * factor)
-        through = cosine - y * sine  # all times exp(i kz d), so that nothing grows
-        reflection = reflection - 2 * transfer**2 * sine / through
-        transfer = once * transfer / through
-        y = (y * cosine + (kz * factor) ** 2 * sine) / through
+        phase_factor = np.exp(1j * kz * thickness)
+        cosine = (1 + phase_factor**2) / 2
+        sine = (phase_factor**2 - 1) / (2j * kz * factor)
+        denominator = cosine - y * sine  # all times exp(i kz d), so that nothing grows
+        reflection = reflection - 2 * transfer**2 * sine / denominator
+        transfer = phase_factor * transfer / denominator
+        y = (y * cosine + (kz * factor) ** 2 * sine) / denominator
     return HalfSpace(
         y,
         ports,
@@ -117,8 +118,8 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
     """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the
     lattice has them: (bloch + pi m)^2 + (pi n)^2, each the nearest.
 
-    Near its cutoff an order's admittance is the root of a small difference, in which the
-    error of the mesh weighs as one over the axial wavenumber.
+    Near its cutoff an order's admittance is the root of a small difference, in which
+    the error of the mesh weighs as one over the axial wavenumber.
 
     Args:
         square: of the mesh. cutoff: k0^2 times the permittivity. bloch: kx.
@@ -130,10 +131,10 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
         return square
     exact = lattice_wavenumbers(cutoff, bloch)
     nearest = exact[np.abs(square[close, None] - exact).argmin(axis=1)]
-    known = np.abs(nearest - square[close]) < KNOWN * nearest
-    out = square.copy()
-    out[close[known]] = nearest[known]
-    return out
+    reliable = np.abs(nearest - square[close]) < KNOWN * nearest
+    corrected = square.copy()
+    corrected[close[reliable]] = nearest[reliable]
+    return corrected
 
 
 def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
@@ -147,8 +148,8 @@ def lattice_wavenumbers(cutoff: float, bloch: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LayerInterface:
-    """Scattering at one end of the layer, between the modes that carry light over it and
-    the propagating orders (power-normalised).
+    """Scattering at one end of the layer, between the modes that carry light over it
+    and the propagating orders (power-normalised).
 
     reflect: (carry, carry) of layer modes. enter: (carry, ports). leave: (ports,
         carry). back: (ports, ports).
@@ -167,18 +168,19 @@ def interface_blocks(
     partners of the carrying modes and the ports as columns.
 
     Args:
-        green: (carry + ports, carry + ports) G. norm: (carry, carry) partners with fields.
+        green: (carry + ports, carry + ports) G. norm: (carry, carry) partners with
+            fields.
         rate: (carry,) i q. half: the half-space.
     """
-    c, through = len(rate), half.transfer
-    weight = 2 * np.concatenate([rate, through])
-    arrive = np.linalg.solve(norm, green[:c]) * weight
-    leaving = through[:, None] * green[c:] * weight
+    carry_count, transfer = len(rate), half.transfer
+    weight = 2 * np.concatenate([rate, transfer])
+    arriving = np.linalg.solve(norm, green[:carry_count]) * weight
+    leaving = transfer[:, None] * green[carry_count:] * weight
     return LayerInterface(
-        reflect=arrive[:, :c] - np.eye(c),
-        enter=arrive[:, c:],
-        leave=leaving[:, :c],
-        back=leaving[:, c:] + np.diag(half.reflection),
+        reflect=arriving[:, :carry_count] - np.eye(carry_count),
+        enter=arriving[:, carry_count:],
+        leave=leaving[:, :carry_count],
+        back=leaving[:, carry_count:] + np.diag(half.reflection),
     )
 
 
@@ -205,31 +207,39 @@ def layer_interface(
 def few_interface(
     pencil: LayerPencil, modes: FewModes, half: HalfSpace
 ) -> LayerInterface:
-    """Scattering at a half-space, from the modes that carry and the real admittance of
-    all others; what is real in place of the travelling waves is corrected after
-    (Woodbury).
+    """Scattering at a half-space, from the carrying modes and a real admittance of all
+    others.
+
+    A real operator is solved first, with real stand-ins for the travelling waves. The
+    Woodbury identity then replaces the stand-ins by the complex values.
 
     Args:
         pencil: of the layer. modes: those that carry. half: the half-space.
     """
     half = half.dual if pencil.dual else half
-    near, ports = half.real_admittance(dual=pencil.dual), half.ports
-    a, c = len(pencil.te), len(modes.q)
+    stand_in, ports = half.real_admittance(dual=pencil.dual), half.ports
+    te_count, carry_count = len(pencil.te), len(modes.q)
     operator = modes.near.copy()
-    pencil.te_turn.add_congruence(operator[:a, :a], near[:a])
-    pencil.tm_turn.add_congruence(operator[a:, a:], near[a:])
-    fed = np.zeros((len(operator), len(ports)))
-    te = ports < a
-    fed[:a, te] = pencil.te_turn.take_rows(ports[te]).T
-    fed[a:, ~te] = pencil.tm_turn.take_rows(ports[~te] - a).T
-    columns = np.concatenate([modes.partner, fed], 1)
+    pencil.te_turn.add_congruence(operator[:te_count, :te_count], stand_in[:te_count])
+    pencil.tm_turn.add_congruence(operator[te_count:, te_count:], stand_in[te_count:])
+    port_columns = np.zeros((len(operator), len(ports)))
+    is_te = ports < te_count
+    port_columns[:te_count, is_te] = pencil.te_turn.take_rows(ports[is_te]).T
+    port_columns[te_count:, ~is_te] = pencil.tm_turn.take_rows(
+        ports[~is_te] - te_count
+    ).T
+    columns = np.concatenate([modes.partner, port_columns], 1)
     green = columns.T @ solve_real(operator, columns)
     norm = modes.partner.T @ modes.field
     rate = 1j * modes.q
-    correction = np.zeros((c + len(ports), c + len(ports)), complex)
-    correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rate - modes.near_rate)).T
-    correction[c:, c:] = np.diag(half.admittance[ports] - near[ports])
-    green = green @ np.linalg.inv(np.eye(c + len(ports)) + correction @ green)
+    correction = np.zeros((carry_count + len(ports), carry_count + len(ports)), complex)
+    correction[:carry_count, :carry_count] = np.linalg.solve(
+        norm.T, np.diag(rate - modes.near_rate)
+    ).T
+    correction[carry_count:, carry_count:] = np.diag(
+        half.admittance[ports] - stand_in[ports]
+    )
+    green = green @ np.linalg.inv(np.eye(carry_count + len(ports)) + correction @ green)
     return interface_blocks(green, norm, rate, half)
 
 
@@ -237,16 +247,16 @@ def solve_real(operator: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """operator^-1 columns of a real operator, for columns that may be complex."""
     if not np.iscomplexobj(columns):
         return np.linalg.solve(operator, columns)
-    both = np.linalg.solve(operator, np.concatenate([columns.real, columns.imag], 1))
-    half = columns.shape[1]
-    return np.asarray(both[:, :half] + 1j * both[:, half:])
+    parts = np.linalg.solve(operator, np.concatenate([columns.real, columns.imag], 1))
+    count = columns.shape[1]
+    return np.asarray(parts[:, :count] + 1j * parts[:, count:])
 
 
 def scattering_matrix(
     layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
 ) -> np.ndarray:
-    """Scattering matrix of a layer between half-spaces, from all its modes, over the ports
-    of both sides, below first: symmetric, and unitary where lossless.
+    """Scattering matrix of a layer between half-spaces, from all its modes, over the
+    ports of both sides, below first: symmetric, and unitary where lossless.
 
     Args:
         layer: modes. height: of the layer. below, above: half-spaces.
@@ -285,20 +295,23 @@ def join_interfaces(
     Args:
         foot, top: interfaces. x: (c,) factors exp(iqh) of the modes.
     """
-    c, n = len(x), len(foot.back)
+    carry_count, foot_ports = len(x), len(foot.back)
 
     def cross(up: np.ndarray, down: np.ndarray) -> np.ndarray:
         """[[0, up x], [down x, 0]]: waves that crossed the layer meet the other end."""
-        out = np.zeros((len(up) + len(down), 2 * c), complex)
-        out[: len(up), c:], out[len(up) :, :c] = up * x, down * x
+        out = np.zeros((len(up) + len(down), 2 * carry_count), complex)
+        out[: len(up), carry_count:], out[len(up) :, :carry_count] = up * x, down * x
         return out
 
-    source = np.zeros((2 * c, n + len(top.back)), complex)
-    source[:c, :n], source[c:, n:] = foot.enter, top.enter
-    round_trip = np.eye(2 * c) - cross(foot.reflect, top.reflect)
+    source = np.zeros((2 * carry_count, foot_ports + len(top.back)), complex)
+    source[:carry_count, :foot_ports], source[carry_count:, foot_ports:] = (
+        foot.enter,
+        top.enter,
+    )
+    round_trip = np.eye(2 * carry_count) - cross(foot.reflect, top.reflect)
     matrix = cross(foot.leave, top.leave) @ np.linalg.solve(round_trip, source)
-    matrix[:n, :n] += foot.back
-    matrix[n:, n:] += top.back
+    matrix[:foot_ports, :foot_ports] += foot.back
+    matrix[foot_ports:, foot_ports:] += top.back
     return matrix
 
 

@@ -105,18 +105,14 @@ class FunctionNumbering:
         return (start if j == 0 else 0) | (end if last else 0)
 
     def number_vector(self, wall: int, *key: object) -> int:
-        """Number of the vector function ``key``; a key seen for the first time takes
-        the next one.
-        """
+        """Number of the vector function ``key``; a new key takes the next number."""
         if key not in self.vectors:
             self.vectors[key] = len(self.vectors)
             self.vector_wall.append(wall)
         return self.vectors[key]
 
     def number_scalar(self, wall: int, *key: object) -> int:
-        """Number of the scalar function ``key``; a key seen for the first time takes
-        the next one.
-        """
+        """Number of the scalar function ``key``; a new key takes the next number."""
         if key not in self.scalars:
             self.scalars[key] = len(self.scalars)
             self.scalar_wall.append(wall)
@@ -125,8 +121,14 @@ class FunctionNumbering:
     def number_element(
         self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
     ) -> tuple[list[int], list[int]]:
-        """Numbers of the vector and scalar functions of the element with corners v00,
-        v10, v01, v11.
+        """Global numbers of the vector and scalar functions of one element.
+
+        Functions on an edge or a vertex are shared with the neighbours; interior
+        functions belong to the element.
+
+        Args:
+            v: corners v00, v10, v01, v11.
+            px, py: polynomial degrees along both parameters.
         """
         walls = [self.wall_bits(vertex) for vertex in v]
         x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
@@ -189,22 +191,24 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
     Args:
         plan: of the mesh. numbers: hands out global numbers.
     """
-    a = plan.core
-    excess = 0.8 * a - a
-    cuts = np.concatenate([[0.0], plan.sectors])
+    half_width = plan.core
+    excess = 0.8 * half_width - half_width
+    ends = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
     line = polynomial_interval(plan.angular, plan.angular + 4)
-    s = line.point
+    points = line.point
     along_u, along_v, vectors, scalars = [], [], [], []
     for i in range(n):
         for j in range(n):
-            du, dv = cuts[i + 1] - cuts[i], cuts[j + 1] - cuts[j]
-            u, v = np.meshgrid(cuts[i] + du * s, cuts[j] + dv * s, indexing="ij")
+            du, dv = ends[i + 1] - ends[i], ends[j + 1] - ends[j]
+            u, v = np.meshgrid(
+                ends[i] + du * points, ends[j] + dv * points, indexing="ij"
+            )
             along_u.append(
-                du * np.stack([a + excess * v, excess * v], -1).reshape(-1, 2)
+                du * np.stack([half_width + excess * v, excess * v], -1).reshape(-1, 2)
             )
             along_v.append(
-                dv * np.stack([excess * u, a + excess * u], -1).reshape(-1, 2)
+                dv * np.stack([excess * u, half_width + excess * u], -1).reshape(-1, 2)
             )
             corners = tuple(
                 core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1)
@@ -227,8 +231,8 @@ def core_patch(plan: MeshPlan, numbers: FunctionNumbering) -> MeshPatch:
 
 
 def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as parts P
-    and Q of rho P + Q, each with its derivative.
+    """Start and end curve of a stack of rings at fractions ``v`` of 45 degrees, as
+    parts P and Q of rho P + Q, each with its derivative.
 
     Args:
         plan: of the mesh. inside: whether the rings lie in the disc.
@@ -254,28 +258,33 @@ def ring_patch(
     inside: bool,
     radial: IntervalBasis,
 ) -> MeshPatch:
-    """Elements of some rings, both sides; the Jacobians are those of side A.
+    """Elements of some rings on both sides of the diagonal.
+
+    An element maps (g, v) to (1 - g) start(v) + g end(v). Its Jacobian is stored as the
+    parts P and Q of rho P + Q, for side A; side B is its mirror image.
 
     Args:
         plan: of the mesh. numbers: hands out global numbers.
         rings: counted from the core. inside: whether they lie in the disc.
         radial: basis along the radius.
     """
-    ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
+    ring_ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
     first = 0 if inside else len(plan.inner)
-    cuts = np.concatenate([[0.0], plan.sectors])
+    sector_ends = np.concatenate([[0.0], plan.sectors])
     n = len(plan.sectors)
     angular = polynomial_interval(plan.angular, plan.angular + 5)
     jacobians: list[tuple[np.ndarray, ...]] = []
     vectors: list[list[list[int]]] = [[], []]
     scalars: list[list[list[int]]] = [[], []]
     for ring in rings:
-        g0 = ends[ring - first]
-        dg = ends[ring - first + 1] - ends[ring - first]
+        g0 = ring_ends[ring - first]
+        dg = ring_ends[ring - first + 1] - ring_ends[ring - first]
         for j in range(n):
-            dv = cuts[j + 1] - cuts[j]
+            dv = sector_ends[j + 1] - sector_ends[j]
             g, v = np.meshgrid(
-                g0 + dg * radial.point, cuts[j] + dv * angular.point, indexing="ij"
+                g0 + dg * radial.point,
+                sector_ends[j] + dv * angular.point,
+                indexing="ij",
             )
             start, d_start, end, d_end = ring_curves(plan, inside, v.ravel())
             g = g.reshape(-1, 1)
@@ -317,29 +326,43 @@ def ring_patch(
 
 @lru_cache(maxsize=32)
 def build_mesh(plan: MeshPlan) -> DiscMesh:
-    """All patches of a plan; cached, as they do not depend on the diameter."""
+    """All patches of a mesh plan; cached, as they do not depend on the diameter.
+
+    From the centre: the core, the plain rings of the disc, the ring at the rim inside
+    and the one outside with graded rules, and the plain rings around them.
+    """
     inner, outer = len(plan.inner), len(plan.outer)
     numbers = FunctionNumbering(inner + outer, len(plan.sectors))
     points = plan.radial + 24  # of the graded rule: masses to 1e-13
-    smooth = polynomial_interval(plan.radial, plan.radial + 5)
+    plain_inside = polynomial_interval(plan.radial, plan.radial + 5)
     patches = [core_patch(plan, numbers)]
     if inner > 1:
         patches.append(
-            ring_patch(plan, numbers, range(inner - 1), inside=True, radial=smooth)
+            ring_patch(
+                plan, numbers, range(inner - 1), inside=True, radial=plain_inside
+            )
         )
-    towards = rim_interval(plan.radial, points, plan.exponents, True)
+    graded_inside = rim_interval(plan.radial, points, plan.exponents, True)
     patches.append(
-        ring_patch(plan, numbers, range(inner - 1, inner), inside=True, radial=towards)
+        ring_patch(
+            plan, numbers, range(inner - 1, inner), inside=True, radial=graded_inside
+        )
     )
-    away = rim_interval(plan.outside, points, plan.exponents, False)
+    graded_outside = rim_interval(plan.outside, points, plan.exponents, False)
     patches.append(
-        ring_patch(plan, numbers, range(inner, inner + 1), inside=False, radial=away)
+        ring_patch(
+            plan, numbers, range(inner, inner + 1), inside=False, radial=graded_outside
+        )
     )
     if outer > 1:
-        far = polynomial_interval(plan.outside, plan.outside + 5)
+        plain_outside = polynomial_interval(plan.outside, plan.outside + 5)
         patches.append(
             ring_patch(
-                plan, numbers, range(inner + 1, inner + outer), inside=False, radial=far
+                plan,
+                numbers,
+                range(inner + 1, inner + outer),
+                inside=False,
+                radial=plain_outside,
             )
         )
     return DiscMesh(

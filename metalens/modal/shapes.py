@@ -73,8 +73,8 @@ def rim_interval(
     """Polynomials and singular functions ``d**tau - d``, d the distance to s = 0, or to
     s = 1 if ``at_end``.
 
-    The slope of each singular function is made orthonormal to the slopes before it, which
-    keeps the matrices well conditioned.
+    The slope of each singular function is made orthonormal to the slopes before it,
+    which keeps the matrices well conditioned.
 
     Args:
         degree: of the polynomials. points: of the graded rule.
@@ -89,10 +89,10 @@ def rim_interval(
         bubble, rate = d**tau - d, side * (tau * d ** (tau - 1) - 1)
         fine_rate = side * (tau * fine ** (tau - 1) - 1)
         for _ in range(2):  # twice is enough (Kahan) for orthogonality to rounding
-            part = (fine_slope[1:] * fine_weight) @ fine_rate
-            bubble = bubble - part @ value[2:]
-            rate = rate - part @ slope[1:]
-            fine_rate = fine_rate - part @ fine_slope[1:]
+            overlap = (fine_slope[1:] * fine_weight) @ fine_rate
+            bubble = bubble - overlap @ value[2:]
+            rate = rate - overlap @ slope[1:]
+            fine_rate = fine_rate - overlap @ fine_slope[1:]
         norm = np.sqrt(fine_weight @ fine_rate**2)
         value = np.vstack([value, bubble / norm])
         slope = np.vstack([slope, rate / norm])

@@ -22,9 +22,8 @@ def mesh_of_degree(degree: int) -> MeshPlan:
     From degree 5 on rings narrow geometrically towards the rim: the field is singular
     there, and degree alone gains little.
     """
-    ends = tuple(
-        GRADING**k for k in range((degree - 3) // 2 if degree > 4 else 0, 0, -1)
-    )
+    rings = (degree - 3) // 2 if degree > 4 else 0
+    ends = tuple(GRADING**k for k in range(rings, 0, -1))
     inner = tuple(1 - end for end in reversed(ends))
     return MeshPlan(degree, degree + 1, degree, inner=(*inner, 1.0), outer=(*ends, 1.0))
 
@@ -40,9 +39,9 @@ def estimate_level_error(coarser: MeshSolution, finer: MeshSolution) -> float:
     geometric mean of its change from the ``coarser`` and half the difference of its two
     forms, but at least that half.
 
-    The forms bound smooth waves from opposite sides; what they have wrong alike shows in
-    the change, which is the error of the coarser level. Where the forms part from one
-    level to the next neither says anything yet: ``LARGEST``.
+    The forms bound smooth waves from opposite sides. An error common to both shows in
+    the change, which is the error of the coarser level. Where the forms differ more on
+    the finer level, neither is reliable yet: ``LARGEST``.
     """
     change = float(np.abs(finer.matrix - coarser.matrix).max())
     half = finer.half_difference
@@ -69,7 +68,7 @@ def solve_level(case: ModalCase, level: int, tolerance: float) -> Response:
 
     Args:
         case: the problem. level: place in ``LEVELS``, 1 or more.
-        tolerance: that ``converged`` tells of.
+        tolerance: of t and r, for ``converged``.
     """
     coarser, finer = (solve_on_mesh(case, LEVELS[i]) for i in (level - 1, level))
     resolved = resolves_waves(case, LEVELS[level - 1])
@@ -103,8 +102,8 @@ def solve(
     polarization: Polarization = "x",
     tolerance: float = 1e-3,
 ) -> Response:
-    """Zero-order transmission and reflection of a round pillar by the modal method: exact
-    along z, curved finite elements across.
+    """Zero-order transmission and reflection of a round pillar by the modal method:
+    exact along z, curved finite elements across.
 
     Pillars with tilted walls: see :mod:`metalens.modal.tilted`.
 
@@ -112,11 +111,11 @@ def solve(
         cell: round pillar on a square lattice, films allowed.
         diameter_um: above 0 and below the pitch.
         wavelength_um: in vacuum.
-        angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in every layer by
-            Snell's law.
+        angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in every layer
+            by Snell's law.
         azimuth_rad: of the plane of incidence, a multiple of pi/2.
-        polarization: "s" or "p", or "x" or "y" for the field along that axis of the plane
-            of incidence.
+        polarization: "s" or "p", or "x" or "y" for the field along that axis of the
+            plane of incidence.
         tolerance: of t and r; the mesh is refined until the estimate meets it.
 
     Returns:

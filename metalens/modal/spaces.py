@@ -17,7 +17,7 @@ from metalens.modal.assembly import (
 from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build_mesh
 
 PHASE_STEP = 0.25  # rad: phases that share a choice of cotree
-TYPICAL = 0.5  # pitches: disc whose mass weighs the choice
+TYPICAL = 0.5  # pitches: diameter of the disc whose mass weights the choice
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -25,13 +25,11 @@ class FunctionSelection:
     """Which quarter-cell functions carry the unknowns, for the real and the imaginary
     part.
 
-    order: quarter-cell numbers of the functions inside, at x = 0, and at x = pitch / 2,
-    one after the other; inside,
-    start, end: how many of each. The unknowns are the real parts inside and at x = 0,
-    the imaginary parts inside, and
-    the moduli at the end, where the real part is ``real`` times the modulus and the
-    imaginary part ``imaginary`` times.
-    Without Bloch phase (``real`` = 0): the functions inside alone.
+    order: quarter-cell numbers of the functions inside, at x = 0, and at x = pitch / 2.
+    inside, start, end: their counts. The unknowns are the real parts inside and at x =
+    0, the imaginary parts inside, and the moduli at x = pitch / 2. There the real part
+    is ``real`` times the modulus, the imaginary part ``imaginary`` times. Without Bloch
+    phase (``real`` = 0) the functions inside are all.
     """
 
     order: np.ndarray
@@ -85,27 +83,33 @@ def select_functions(
 def restrict_matrix(
     matrix: np.ndarray, rows: FunctionSelection, columns: FunctionSelection
 ) -> np.ndarray:
-    """A quarter-cell matrix acting on the real and imaginary parts of the unknowns.
+    """Quarter-cell matrix, acting on the real and imaginary parts of the unknowns.
+
+    The blocks are, in order: real parts (inside and x = 0), imaginary parts (inside),
+    and moduli at x = pitch / 2 with the cosine and sine of the half phase.
 
     Args:
-        matrix: of the functions. rows, columns: unknowns; the half phase enters by the
-            weights at x = pitch / 2.
+        matrix: of the functions. rows, columns: unknowns.
     """
-    picked = matrix.take(rows.order, 0).take(columns.order, 1)
+    selected = matrix.take(rows.order, 0).take(columns.order, 1)
     if not rows.is_periodic:
-        return picked
-    out = np.zeros((rows.size, columns.size))
+        return selected
+    restricted = np.zeros((rows.size, columns.size))
     r, c = rows.inside, columns.inside
     first, second = r + rows.start, c + columns.start
+    real_rows, real_columns = slice(first), slice(second)
+    imaginary_rows = slice(first, first + r)
+    imaginary_columns = slice(second, second + c)
+    end_rows, end_columns = slice(first + r, None), slice(second + c, None)
     cos, sin = columns.real, columns.imaginary
-    out[:first, :second] = picked[:first, :second]
-    out[first : first + r, second : second + c] = picked[:r, :c]
-    out[first + r :, second + c :] = picked[first:, second:]
-    out[:first, second + c :] = cos * picked[:first, second:]
-    out[first : first + r, second + c :] = sin * picked[:r, second:]
-    out[first + r :, :second] = cos * picked[first:, :second]
-    out[first + r :, second : second + c] = sin * picked[first:, :c]
-    return out
+    restricted[real_rows, real_columns] = selected[:first, :second]
+    restricted[imaginary_rows, imaginary_columns] = selected[:r, :c]
+    restricted[end_rows, end_columns] = selected[first:, second:]
+    restricted[real_rows, end_columns] = cos * selected[:first, second:]
+    restricted[imaginary_rows, end_columns] = sin * selected[:r, second:]
+    restricted[end_rows, real_columns] = cos * selected[first:, :second]
+    restricted[end_rows, imaginary_columns] = sin * selected[first:, :c]
+    return restricted
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,8 +133,9 @@ class SymmetryClass:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ClassTopology:
-    """What a symmetry class has for all diameters: its unknowns, and the rest as in
-    ``Space``.
+    """Part of a symmetry class that holds for all diameters.
+
+    vectors, scalars: unknowns. gradient, transposed: as in :class:`SymmetryClass`.
     """
 
     vectors: FunctionSelection
@@ -165,23 +170,27 @@ def class_topology(
 def cotree_functions(
     plan: MeshPlan, electric: bool, half_phase_rad: float | None
 ) -> np.ndarray:
-    """Unknowns off a spanning tree, by pivoted elimination of the gradients, once for a
-    mesh and a phase.
+    """Unknowns off a spanning tree (n - scalars,), ascending.
+
+    By QR with pivoting of the gradients, weighted by the mass of a typical disc; cached
+    for a mesh and a phase.
 
     Args:
         plan: of the mesh. electric: whether the y walls are electric.
         half_phase_rad: Bloch phase over half a pitch, or None.
     """
-    known = class_topology(plan, electric, half_phase_rad)
-    size = np.sqrt(
+    topology = class_topology(plan, electric, half_phase_rad)
+    weights = np.sqrt(
         np.diag(
             restrict_matrix(
-                assemble_disc(TYPICAL, plan).cell.mass, known.vectors, known.vectors
+                assemble_disc(TYPICAL, plan).cell.mass,
+                topology.vectors,
+                topology.vectors,
             )
         )
     )
-    pivots = sl.qr((size[:, None] * known.gradient).T, mode="r", pivoting=True)[1]
-    return np.sort(pivots[known.scalars.size :])
+    pivots = sl.qr((weights[:, None] * topology.gradient).T, mode="r", pivoting=True)[1]
+    return np.sort(pivots[topology.scalars.size :])
 
 
 def build_symmetry_class(
@@ -190,31 +199,31 @@ def build_symmetry_class(
     """Matrices of a symmetry class of one disc.
 
     Args:
-        geometry: assembled disc. electric: whether the y walls are electric, else natural.
+        geometry: assembled disc. electric: whether the y walls are electric, else
+            natural.
         half_phase_rad: Bloch phase over half a pitch, or None.
     """
     plan = geometry.mesh.plan
-    known = class_topology(plan, electric, half_phase_rad)
-    vectors, scalars = known.vectors, known.scalars
+    topology = class_topology(plan, electric, half_phase_rad)
+    vectors, scalars = topology.vectors, topology.scalars
 
-    def part(p: CellMatrices) -> CellMatrices:
+    def restrict(quarter: CellMatrices) -> CellMatrices:
         return CellMatrices(
-            restrict_matrix(p.mass, vectors, vectors),
-            restrict_matrix(p.curl, vectors, vectors),
-            restrict_matrix(p.scalar, scalars, scalars),
+            restrict_matrix(quarter.mass, vectors, vectors),
+            restrict_matrix(quarter.curl, vectors, vectors),
+            restrict_matrix(quarter.scalar, scalars, scalars),
         )
 
-    step = (
-        None
-        if half_phase_rad is None
-        else (math.floor(half_phase_rad / PHASE_STEP) + 0.5) * PHASE_STEP
-    )
+    typical_phase_rad = half_phase_rad
+    if half_phase_rad is not None:
+        step = math.floor(half_phase_rad / PHASE_STEP)
+        typical_phase_rad = (step + 0.5) * PHASE_STEP
     return SymmetryClass(
-        part(geometry.cell),
-        part(geometry.disc),
-        known.gradient,
+        restrict(geometry.cell),
+        restrict(geometry.disc),
+        topology.gradient,
         electric,
         half_phase_rad,
-        cotree_functions(plan, electric, step),
-        known.transposed,
+        cotree_functions(plan, electric, typical_phase_rad),
+        topology.transposed,
     )

@@ -21,7 +21,7 @@ NODES = 4  # diameters between foot and top at which (1) is solved
 STEPS = 3  # of Gauss-Newton for (1)
 STEP_UM = 1e-4
 MOST_UM = 0.01  # of a shift
-UNEXPLAINED = 0.5  # share of what (1) leaves of t that counts as error
+UNEXPLAINED = 0.5  # share of the misfit of t after (1) that counts as error
 SHARE = 0.2  # of the tolerance, for the modal solves
 
 
@@ -42,8 +42,8 @@ def solve_tilted(
         tolerance: of t and r.
 
     Returns:
-        Mean of four truncations; ``t_error`` is the largest difference from it, half of
-        what (1) leaves, the error of the modal solves and that of the collocation.
+        Mean of four truncations. ``t_error`` is the sum of the largest difference from
+        it, half the misfit of (1), and the errors of modal solves and collocation.
 
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
@@ -54,27 +54,27 @@ def solve_tilted(
     half = abs(math.tan(cell.sidewall_rad)) * cell.height_um
     nodes = diameter_um + half * np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     anchors = [upright(plain, d, max(SHARE * tolerance, 2e-6)) for d in nodes.tolist()]
-    wanted = np.array([(one.t, one.r) for one in anchors])
+    modal_amplitudes = np.array([(anchor.t, anchor.r) for anchor in anchors])
     bare = [problem_of_light(plain, d, light) for d in nodes.tolist()]
-    stages, left = choose_stage_count(
+    stages, collocation_error = choose_stage_count(
         lambda count: solve_problem(problem, REACHES[0], count).both, tolerance
     )
-    found, unexplained = [], []
+    results, unexplained = [], []
     for reach in REACHES:
-        shift, rest = _fit_shift(bare, nodes, wanted, reach)
-        here = dataclasses.replace(problem, shift=shift)
-        one = solve_problem(here, reach, stages)
-        found.append((*one.both[:, column, column], one.energy[column]))
-        unexplained.append(rest)
-        if len(found) < COMPARED:
+        shift, misfit = _fit_shift(bare, nodes, modal_amplitudes, reach)
+        shifted = dataclasses.replace(problem, shift=shift)
+        truncation = solve_problem(shifted, reach, stages)
+        results.append((*truncation.both[:, column, column], truncation.energy[column]))
+        unexplained.append(misfit)
+        if len(results) < COMPARED:
             continue
-        last = np.array(found[-COMPARED:])
+        last = np.array(results[-COMPARED:])
         t, r, energy = last.mean(axis=0)
         error = float(
             np.abs(last[:, :2] - (t, r)).max()
             + UNEXPLAINED * np.mean(unexplained[-COMPARED:])
-            + max(one.t_error for one in anchors)
-            + left
+            + max(anchor.t_error for anchor in anchors)
+            + collocation_error
         )
         if error <= tolerance:
             break
@@ -82,34 +82,43 @@ def solve_tilted(
     reason = f"orders within {reach}, corrected to the modal solution"
     m = np.arange(-reach, reach + 1)
     orders = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
-    bar = min(error, 1 + max(1.0, abs(t), abs(r)))
+    t_error = min(error, 1 + max(1.0, abs(t), abs(r)))
     return Response(
-        complex(t), complex(r), bar, orders, float(energy.real), "rcwa", met, reason
+        complex(t), complex(r), t_error, orders, float(energy.real), "rcwa", met, reason
     )
 
 
 def _fit_shift(
-    bare: list[CellProblem], nodes: Array, wanted: Array, reach: int
+    bare: list[CellProblem], nodes: Array, modal_amplitudes: Array, reach: int
 ) -> tuple[np.polynomial.Polynomial, float]:
-    """Solution of (1) at one truncation, as a polynomial of the diameter, and the root
-    mean square of what it leaves of t.
+    """Width shift that solves (1) at one truncation, as a polynomial of the diameter,
+    and the root-mean-square misfit of t.
+
+    Gauss-Newton on t and r of the upright pillar at each node, with the derivative by a
+    finite difference and the shift limited to ``MOST_UM``.
+
+    Args:
+        bare: upright pillars at the nodes, without films.
+        nodes: (k,) diameters, um.
+        modal_amplitudes: (k, 2) t and r of the modal solution.
+        reach: harmonics.
     """
 
     def amplitudes(shift: Array) -> Array:
-        found = []
-        for problem, by in zip(bare, shift.tolist(), strict=True):
-            moved = dataclasses.replace(problem, size_um=problem.size_um + by)
+        responses = []
+        for problem, width in zip(bare, shift.tolist(), strict=True):
+            moved = dataclasses.replace(problem, size_um=problem.size_um + width)
             column = problem.columns[0]
-            found.append(solve_problem(moved, reach, 0).both[:, column, column])
-        return np.array(found)
+            responses.append(solve_problem(moved, reach, 0).both[:, column, column])
+        return np.array(responses)
 
     shift = np.zeros(len(nodes))
     for _ in range(STEPS):
-        here = amplitudes(shift)
-        slope = (amplitudes(shift + STEP_UM) - here) / STEP_UM
-        move = (slope.conj() * (wanted - here)).sum(axis=1).real
-        shift = shift + move / (np.abs(slope) ** 2).sum(axis=1)
+        current = amplitudes(shift)
+        slope = (amplitudes(shift + STEP_UM) - current) / STEP_UM
+        change = (slope.conj() * (modal_amplitudes - current)).sum(axis=1).real
+        shift = shift + change / (np.abs(slope) ** 2).sum(axis=1)
         shift = np.clip(shift, -MOST_UM, MOST_UM)
-    rest = np.abs(wanted - amplitudes(shift))[:, 0]
+    misfit = np.abs(modal_amplitudes - amplitudes(shift))[:, 0]
     polynomial = np.polynomial.Polynomial.fit(nodes, shift, len(nodes) - 1)
-    return polynomial, float(np.sqrt((rest**2).mean()))
+    return polynomial, float(np.sqrt((misfit**2).mean()))

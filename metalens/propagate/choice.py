@@ -64,8 +64,8 @@ def choose_method(
     if not differentiable and pillars * points * (depths + 2) / 3 < EXACT_WORK:
         reason = f"exact sum: {pillars:,} pillars at {points} points"
         return MethodChoice("exact", reason, ((case,),))
-    many = pillars * points > WIDE_WORK
-    if not moving and many and is_wide(case, tolerance):
+    is_large = pillars * points > WIDE_WORK
+    if not moving and is_large and is_wide(case, tolerance):
         return MethodChoice("wide", "wide window by Fourier transforms", ((case,),))
     with one_blas_thread():
         tiles = _windows(case, tolerance)
@@ -81,8 +81,14 @@ def choose_method(
 def _windows(
     case: PropagationCase, tolerance: float
 ) -> tuple[tuple[PropagationCase, ...], ...]:
-    """The window, cut into equal parts until each can be planned with a useful number
-    of nodes.
+    """The window, cut into equal parts until two opposite corners can be planned.
+
+    Args:
+        case: geometry of the propagation.
+        tolerance: relative error of the field.
+
+    Raises:
+        PropagationError: not even single samples can be planned.
     """
     parts = 1
     while True:
@@ -98,6 +104,7 @@ def _windows(
 
 
 def _layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
+    """Layout of a window; None if it needs too many nodes or too large tables."""
     try:
         return plan_layout(case, tolerance)
     except PropagationError:

@@ -55,10 +55,10 @@ def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
     return field_exact(phase, level, make_case(phase.shape, **geometry))
 
 
-DEGREES = (8, 16, 32, 64)  # of the series of a point wave through films
+DEGREES = (8, 16, 32, 64)  # coefficients of the series of a point wave through films
 
 
-ROUNDING = 1e-15  # of the largest coefficient, below which a series has converged
+ROUNDING = 1e-15  # of the largest coefficient: a tail below it has converged
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,34 +99,42 @@ def point_wave(case: PropagationCase, points_um: Array) -> PointWave:
         d, k = case.sensor_distance_um, case.wavenumber
         series = np.array([[0, 0, -k / (2 * np.pi * d)], [0, 0.5 / (np.pi * d * d), 0]])
         return PointWave(d, d, k, (0.0, 1.0), series)
-    far = np.abs(points_um).max(0) + case.half_size_um[::-1]
-    return _films_wave(case.behind, case.wavenumber, math.hypot(*far))
+    lateral_um = np.abs(points_um).max(0) + case.half_size_um[::-1]
+    return _films_wave(case.behind, case.wavenumber, math.hypot(*lateral_um))
 
 
 @functools.lru_cache(maxsize=64)
 def _films_wave(behind: Media, wavenumber: float, reach_um: float) -> PointWave:
-    """Series of the ray's path and amplitude, doubled until their tails round off."""
+    """Chebyshev series of path and amplitude of a point wave through films.
+
+    The degree is doubled until the last two coefficients are below rounding.
+
+    Args:
+        behind: media from lens to sensor.
+        wavenumber: k in vacuum, rad/um.
+        reach_um: largest lateral distance.
+    """
     layers = behind.layers
-    length = layers[0][0] * behind.reduced_um
-    level = layers[0][0] * length
-    low = length / math.hypot(length, reach_um)
-    middle, half = (1 + low) / 2, (1 - low) / 2
+    reduced_um = layers[0][0] * behind.reduced_um
+    path_per_v = layers[0][0] * reduced_um
+    low = reduced_um / math.hypot(reduced_um, reach_um)
+    middle, half_range = (1 + low) / 2, (1 - low) / 2
     for count in DEGREES:
         u = chebyshev.chebpts1(count)
-        v = middle + half * u
-        w = media.solve_direction_square(layers, length**2 * (1 / v**2 - 1))
-        path = np.asarray(media.whole_path(layers, w)) - level / v
+        v = middle + half_range * u
+        w = media.solve_direction_square(layers, reduced_um**2 * (1 / v**2 - 1))
+        path = np.asarray(media.whole_path(layers, w)) - path_per_v / v
         amplitude = ray_amplitude(behind, wavenumber, w, reach_um) / v**2
         values = np.stack([path, amplitude.real, amplitude.imag], -1)
         series = chebyshev.chebvander(u, count - 1).T @ values * (2 / count)
         series[0] /= 2
-        scale = np.array([level, *[np.abs(amplitude).max()] * 2])
+        scale = np.array([path_per_v, *[np.abs(amplitude).max()] * 2])
         tail = np.abs(series[-2:] / scale).max()
         if tail < ROUNDING:
             break
-    kept = np.flatnonzero((np.abs(series / scale) > ROUNDING / 8).any(1))
-    series = np.ascontiguousarray(series[: kept[-1] + 1])
-    return PointWave(length, level, wavenumber, (middle, half), series)
+    significant = np.flatnonzero((np.abs(series / scale) > ROUNDING / 8).any(1))
+    series = np.ascontiguousarray(series[: significant[-1] + 1])
+    return PointWave(reduced_um, path_per_v, wavenumber, (middle, half_range), series)
 
 
 @numba.njit(
@@ -144,21 +152,28 @@ def _complex_product(a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
 @numba.njit(
     fastmath=True, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
-def _clenshaw(u, series, column, out, work):  # type: ignore[no-untyped-def]
-    """Chebyshev series (degree, column) along a row of u in [-1, 1]."""
-    before = work
+def _clenshaw(u, series, column, out, before):  # type: ignore[no-untyped-def]
+    """Chebyshev series (degree, column) along a row of u in [-1, 1], by Clenshaw's
+    recurrence.
+
+    out: (u,) result. before: (u,) working memory.
+    """
     out[:], before[:] = series[series.shape[0] - 1, column], 0.0
     for n in range(series.shape[0] - 2, -1, -1):
-        twice = 2.0 if n > 0 else 1.0
+        factor = 2.0 if n > 0 else 1.0
         for j in range(u.size):
-            now = twice * u[j] * out[j] - before[j] + series[n, column]
-            before[j], out[j] = out[j], now
+            new = factor * u[j] * out[j] - before[j] + series[n, column]
+            before[j], out[j] = out[j], new
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _add_point_waves(re, im, x, y, points, wave, out):  # type: ignore[no-untyped-def]
-    """Add the light (depth, y, x) of pillars, times their waves, to (depth, point)."""
-    (length, level, k, middle, half), series = wave
+    """Add the waves of all pillars to out (depth, point): out += Σ (re + i im) h(ρ).
+
+    re, im: (depth, y, x) light. x, y: pillar positions, um. points: (point, [x, y]).
+    wave: ``numbers`` of a :class:`PointWave`.
+    """
+    (length, path_per_v, k, middle, half_range), series = wave
     columns = x.size
     v, u, work = np.empty(columns), np.empty(columns), np.empty(columns)
     path = np.empty(columns)
@@ -166,10 +181,10 @@ def _add_point_waves(re, im, x, y, points, wave, out):  # type: ignore[no-untype
     h_im = np.empty(columns)
     for p in range(points.shape[0]):
         for i in range(y.size):
-            across = (points[p, 1] - y[i]) ** 2 + length**2
+            row_square = (points[p, 1] - y[i]) ** 2 + length**2
             for j in range(columns):
-                v[j] = length / np.sqrt((points[p, 0] - x[j]) ** 2 + across)
-                u[j] = (v[j] - middle) / half
+                v[j] = length / np.sqrt((points[p, 0] - x[j]) ** 2 + row_square)
+                u[j] = (v[j] - middle) / half_range
             if series.shape[0] == 2:  # one medium
                 for j in range(columns):
                     path[j] = 0.0
@@ -179,10 +194,13 @@ def _add_point_waves(re, im, x, y, points, wave, out):  # type: ignore[no-untype
                 _clenshaw(u, series, 1, h_re, work)
                 _clenshaw(u, series, 2, h_im, work)
             for j in range(columns):
-                turns = (level / v[j] + path[j]) * (k / (2 * np.pi))
-                c, s = sincos_turns64(turns - np.rint(turns))
-                a, b = v[j] * v[j] * h_re[j], v[j] * v[j] * h_im[j]
-                h_re[j], h_im[j] = a * c - b * s, a * s + b * c
+                turns = (path_per_v / v[j] + path[j]) * (k / (2 * np.pi))
+                cosine, sine = sincos_turns64(turns - np.rint(turns))
+                real, imaginary = v[j] * v[j] * h_re[j], v[j] * v[j] * h_im[j]
+                h_re[j], h_im[j] = (
+                    real * cosine - imaginary * sine,
+                    real * sine + imaginary * cosine,
+                )
             for z in range(re.shape[0]):
                 out[z, p] += _complex_product(re[z, i], im[z, i], h_re, h_im)
 
@@ -204,12 +222,14 @@ def add_point_waves(
         out: (depth, point) complex128, changed in place.
     """
     y, x = at_um
-    real, imaginary = (np.ascontiguousarray(p) for p in (light.real, light.imag))
-    add: Any = _add_point_waves
+    real, imaginary = (np.ascontiguousarray(part) for part in (light.real, light.imag))
+    compiled_loop: Any = _add_point_waves
     points = np.ascontiguousarray(points_um, float)
 
-    def work(a: int, b: int) -> None:
-        add(real, imaginary, x, y, points[a:b], wave.numbers, out[:, a:b])
+    def work(start: int, stop: int) -> None:
+        compiled_loop(
+            real, imaginary, x, y, points[start:stop], wave.numbers, out[:, start:stop]
+        )
 
     run_split(len(points), work)
 
@@ -264,10 +284,10 @@ def field_at(
     for start in range(0, case.shape[0], 16):
         rows = slice(start, start + 16)
         level = np.asarray(transmission[rows], float)
-        open_ = np.nonzero(level.any(0))[0]
-        if open_.size == 0:
+        open_columns = np.nonzero(level.any(0))[0]
+        if open_columns.size == 0:
             continue
-        columns = slice(open_[0], open_[-1] + 1)
+        columns = slice(open_columns[0], open_columns[-1] + 1)
         light = sum_field(
             np.asarray(phase_rad[rows], float)[:, columns],
             level[:, columns],

@@ -19,12 +19,10 @@ from metalens.propagate.moments import Pupils
 from metalens.propagate.paths import rayleigh_sommerfeld_kernel, to_sensor
 from metalens.propagate.window import depth_factors
 
-POINTS, EVERY = (
-    128,
-    32,
-)  # least number of points, and pixels to a point in a large window
+# least number of points, and pixels to a point in a large window
+POINTS, EVERY = 128, 32
 FEWEST, WORK = 48, 5e6  # least number of points where nodes times points exceed WORK
-DEPTHS = 8  # judged at most
+DEPTHS = 8  # largest number of depths that are sampled
 SAFETY = 1.7  # on the root of a sum over sampled points
 SCATTER = 1.5  # in addition, where fewer than a quarter of the pixels are sampled
 NEAR = 9  # pixels along a side of the neighbourhood of a pixel
@@ -34,7 +32,7 @@ FACTORS = 12  # nodes along an axis of the lens on which it is formed
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NodeLight:
-    """Light of one wavelength on nodes of the lens, its carrier taken off.
+    """Light of one wavelength on nodes of the lens, without its carrier.
 
     case: geometry of the window. weight: of the wavelength.
     light: (map, e, x) complex amplitudes. nodes_um: (e,), (x,) positions.
@@ -75,20 +73,23 @@ def relative_error(windows: list[list[NodeLight]], intensity: list[Array]) -> fl
     nodes = max(part[0].light[0].size for part in windows)
     pixels = sum(math.prod(part[0].case.samples) for part in windows)
     count = min(max(POINTS, pixels // EVERY), max(FEWEST, int(WORK / nodes)))
-    few = count * nodes > WORK / 2
+    is_limited = count * nodes > WORK / 2
     light, energy, depths, points, chance = _sample(
-        windows, intensity, count, DEPTHS // 2 if few else DEPTHS
+        windows, intensity, count, DEPTHS // 2 if is_limited else DEPTHS
     )
     direct = np.zeros((len(depths), len(points)))
-    for part, mine, (row, column) in _by_part(windows, points):
-        for one in part:
-            signs, components = one.components
-            field = _direct_fields(one, components, depths, row, column)
-            direct[:, mine] += one.weight * np.einsum(
+    for part, in_part, (row, column) in _by_part(windows, points):
+        for wavelength_light in part:
+            signs, components = wavelength_light.components
+            field = _direct_fields(wavelength_light, components, depths, row, column)
+            direct[:, in_part] += wavelength_light.weight * np.einsum(
                 "c,czp->zp", signs, np.abs(field) ** 2
             )
     difference = direct / energy[:, None] - light[:, points]
-    noise = sum(2 * abs(s.weight) * s.noise**2 * (1 / energy).sum() for s in windows[0])
+    noise = sum(
+        2 * abs(first.weight) * first.noise**2 * (1 / energy).sum()
+        for first in windows[0]
+    )
     total = sampled_square_error(light[:, points], chance, difference) + float(noise)
     return _relative_root(total, light, len(points))
 
@@ -102,19 +103,19 @@ def pupil_error(
     window's middle, for all points.
 
     Args:
-        windows, intensity: as :func:`relative_error`; light without ``pupils`` counts as
-            |U|² in place of them.
+        windows, intensity: as :func:`relative_error`; light without ``pupils`` counts
+            as |U|².
         pupils: mixing for the middle of a case's window.
 
     Accuracy: 1 to 2 times the true difference.
     """
     light, energy, depths, points, chance = _sample(windows, intensity, RAYS, 2)
     changed = np.zeros((len(depths), len(points)))
-    for part, mine, pixels in _by_part(windows, points):
-        for i, row, column in zip(np.flatnonzero(mine), *pixels, strict=True):
-            for one in part:
-                changed[:, i] += one.weight * _own_mixing(
-                    one, depths, (row, column), pupils
+    for part, in_part, pixels in _by_part(windows, points):
+        for i, row, column in zip(np.flatnonzero(in_part), *pixels, strict=True):
+            for wavelength_light in part:
+                changed[:, i] += wavelength_light.weight * _own_mixing(
+                    wavelength_light, depths, (row, column), pupils
                 )
     total = sampled_square_error(light[:, points], chance, changed / energy[:, None])
     return _relative_root(total, light, len(points))
@@ -161,26 +162,41 @@ def draw_pixels(
 
 
 def _sample(
-    windows: list[list[NodeLight]], intensity: list[Array], count: int, most: int
+    windows: list[list[NodeLight]], intensity: list[Array], count: int, most_depths: int
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """(depth, pixel) light of sum 1, (depth,) sums, indices of at most ``most`` depths,
-    and sampled pixels with their chances."""
-    number = len(intensity[0])
-    depths = np.linspace(0, number - 1, min(number, most)).round().astype(int)
-    parts = [part.reshape(number, -1)[depths] for part in intensity]
+    """Sample of depths and pixels at which the PSFs are computed directly.
+
+    Pixels are drawn by the light, by its root (more at the ends of tiles), and by the
+    smoothed light.
+
+    Args:
+        windows, intensity: as :func:`relative_error`.
+        count: of pixels. most_depths: largest number of depths.
+
+    Returns:
+        (depth, pixel) light of sum 1, (depth,) sums, indices of depths, and sampled
+        pixels with their chances.
+    """
+    depth_count = len(intensity[0])
+    depths = (
+        np.linspace(0, depth_count - 1, min(depth_count, most_depths))
+        .round()
+        .astype(int)
+    )
+    parts = [part.reshape(depth_count, -1)[depths] for part in intensity]
     light = np.concatenate(parts, axis=1, dtype=float)
     energy = light.sum(1)
     light /= energy[:, None]
     mean = np.maximum(light.mean(0), 0.0)  # a flux may run back where it is dark
-    edges, near, first = [], [], 0
+    edges, smoothed, first = [], [], 0
     for part in windows:
         rows, columns = part[0].case.samples
-        spot = mean[first : first + rows * columns].reshape(rows, columns)
-        near.append(uniform_filter(spot, NEAR).ravel())
-        y, x = (_tile_position(n, part[0].parts) for n in spot.shape)
+        part_mean = mean[first : first + rows * columns].reshape(rows, columns)
+        smoothed.append(uniform_filter(part_mean, NEAR).ravel())
+        y, x = (_tile_position(n, part[0].parts) for n in part_mean.shape)
         edges.append((1 + 9 * np.maximum(np.abs(x), np.abs(y)[:, None]) ** 8).ravel())
         first += rows * columns
-    others = np.sqrt(mean) * np.concatenate(edges), np.concatenate(near)
+    others = np.sqrt(mean) * np.concatenate(edges), np.concatenate(smoothed)
     points, chance = draw_pixels(mean, count, others)
     return light, energy, depths, points, chance
 
@@ -197,62 +213,85 @@ def _tile_position(count: int, parts: int) -> Array:
 def _by_part(
     windows: list[list[NodeLight]], points: Array
 ) -> list[tuple[list[NodeLight], Array, tuple[Array, Array]]]:
-    """Each part, which points lie in it, and their (row, column)."""
+    """For each part: its light, a mask of the points in it, and their (row, column).
+
+    Args:
+        windows: parts, each a list of wavelengths.
+        points: (point,) pixel numbers, counted through all parts.
+    """
     parts, first = [], 0
     for part in windows:
         rows, columns = part[0].case.samples
-        mine = (points >= first) & (points < first + rows * columns)
-        row, column = np.divmod(points[mine] - first, columns)
-        parts.append((part, mine, (row, column)))
+        in_part = (points >= first) & (points < first + rows * columns)
+        row, column = np.divmod(points[in_part] - first, columns)
+        parts.append((part, in_part, (row, column)))
         first += rows * columns
     return parts
 
 
 def _direct_fields(
-    one: NodeLight, components: Array, depths: Array, row: Array, column: Array
+    node_light: NodeLight, components: Array, depths: Array, row: Array, column: Array
 ) -> Array:
-    """(component, depth, point) fields at window pixels, summed over the nodes."""
-    case, (e, x) = one.case, one.nodes_um
+    """(component, depth, point) fields at window pixels, summed over lens nodes.
+
+    Args:
+        node_light: light of one wavelength on the nodes, with its geometry.
+        components: (component, e, x) complex light.
+        depths: indices. row, column: (point,) pixels of the window.
+    """
+    case = node_light.case
+    e, x = node_light.nodes_um
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
-    turn = depth_factors(case, e[:, None], x, case.tangents, inverse)
-    turn = turn - case.wavenumber * np.asarray(to_sensor(case, x, e[:, None]))
-    light = components[:, None] * np.exp(1j * turn)
+    phase_rad = depth_factors(case, e[:, None], x, case.tangents, inverse)
+    phase_rad = phase_rad - case.wavenumber * np.asarray(to_sensor(case, x, e[:, None]))
+    light = components[:, None] * np.exp(1j * phase_rad)
     wy, wx = case.window_um
     points = np.stack([wx[column], wy[row]], -1) + np.array(case.centre_um)
-    out = np.zeros((len(components) * len(depths), len(points)), complex)
+    fields = np.zeros((len(components) * len(depths), len(points)), complex)
     wave = point_wave(case, points)
-    add_point_waves(light.reshape(-1, len(e), len(x)), (e, x), points, wave, out)
-    return (out * case.area_um2).reshape(len(components), len(depths), -1)
+    add_point_waves(light.reshape(-1, len(e), len(x)), (e, x), points, wave, fields)
+    return (fields * case.area_um2).reshape(len(components), len(depths), -1)
 
 
 def _own_mixing(
-    one: NodeLight,
+    node_light: NodeLight,
     depths: Array,
     pixel: tuple[int, int],
     pupils: Callable[[PropagationCase], Pupils],
 ) -> Array:
-    """(depth,) intensity of a pixel with its own mixing, less that with the window's.
+    """(depth,) intensity of a pixel with its own polarisation mixing, less that with
+    the window's.
 
-    The mixing is smooth over the lens: it is formed on few nodes, to which the waves of
-    the finer nodes are handed by interpolation.
+    The mixing is smooth over the lens. It is formed on few nodes, to which the waves of
+    the fine nodes are interpolated.
+
+    Args:
+        node_light: light of one wavelength on the nodes.
+        depths: indices. pixel: (row, column) of the window.
+        pupils: mixing for the middle of a case's window.
     """
-    case, (e, x) = one.case, one.nodes_um
-    Y, X = (float(a[i]) for a, i in zip(case.window_um, pixel, strict=True))
+    case = node_light.case
+    e, x = node_light.nodes_um
+    Y, X = (
+        float(positions[index])
+        for positions, index in zip(case.window_um, pixel, strict=True)
+    )
     inverse = np.array(case.inverse_depths_per_um)[depths, None, None]
     kernel = rayleigh_sommerfeld_kernel(case, x, e[:, None], X, Y, inverse)
-    (few_e, onto_e), (few_x, onto_x) = _fewer_nodes(e), _fewer_nodes(x)
-    waves = onto_e @ (one.light[:, None] * kernel) @ onto_x.T
+    few_e, weights_e = _fewer_nodes(e)
+    few_x, weights_x = _fewer_nodes(x)
+    waves = weights_e @ (node_light.light[:, None] * kernel) @ weights_x.T
 
-    def mixed(centre: PropagationCase) -> Array:
+    def intensity(centre: PropagationCase) -> Array:
         signs, factors = pupils(centre)(few_e, few_x)
         return np.asarray(
             signs @ np.abs(np.einsum("cmyx,mzyx->cz", factors, waves)) ** 2
         )
 
-    there = replace(case, centre_um=(case.centre_um[0] + X, case.centre_um[1] + Y))
-    scalar = one.pupils is None
-    used = np.abs(waves[0].sum((-1, -2))) ** 2 if scalar else mixed(case)
-    return (mixed(there) - used) * case.area_um2**2
+    centred = replace(case, centre_um=(case.centre_um[0] + X, case.centre_um[1] + Y))
+    scalar = node_light.pupils is None
+    applied = np.abs(waves[0].sum((-1, -2))) ** 2 if scalar else intensity(case)
+    return (intensity(centred) - applied) * case.area_um2**2
 
 
 def _fewer_nodes(places_um: Array) -> tuple[Array, Array]:
@@ -260,6 +299,6 @@ def _fewer_nodes(places_um: Array) -> tuple[Array, Array]:
     low, high = float(places_um.min()), float(places_um.max())
     if len(places_um) <= FACTORS or not high > low:
         return places_um, np.eye(len(places_um))
-    at = (2 * places_um - low - high) / (high - low)
+    relative = (2 * places_um - low - high) / (high - low)
     nodes = legendre.mapped_nodes(FACTORS, low, high)
-    return np.asarray(nodes), legendre.interpolation_matrix(FACTORS, at).T
+    return np.asarray(nodes), legendre.interpolation_matrix(FACTORS, relative).T

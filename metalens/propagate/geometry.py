@@ -60,7 +60,10 @@ class PropagationCase:
                 raise PropagationError(
                     f"{name} is {value}, need a positive length in um"
                 )
-        if not all(np.isfinite(v) and v >= 0 for v in (self.row_um, self.site_um2)):
+        if not all(
+            np.isfinite(length) and length >= 0
+            for length in (self.row_um, self.site_um2)
+        ):
             raise PropagationError(
                 f"row_um = {self.row_um}, site_um2 = {self.site_um2}: need finite values, 0 or more"
             )
@@ -77,7 +80,7 @@ class PropagationCase:
             raise PropagationError(
                 f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}"
             )
-        if inverse.max() * sum(t for _, t in self.front) > 1:
+        if inverse.max() * sum(thickness for _, thickness in self.front) > 1:
             raise PropagationError(
                 f"layers: films of {sum(t for _, t in self.front):g} um in the {1 / inverse.max():g} um from source to "
                 "lens; need films no thicker than the gap"
@@ -90,7 +93,7 @@ class PropagationCase:
 
     @property
     def media(self) -> Media:
-        """From lens to sensor; one of index 1 where no films are given."""
+        """Media from lens to sensor; one medium of index 1 without films."""
         return self.behind or Media((1.0,), (self.sensor_distance_um,))
 
     @property
@@ -100,7 +103,7 @@ class PropagationCase:
 
     @property
     def area_um2(self) -> float:
-        """Of the cell of one pillar: what its light is worth."""
+        """Area of the cell of one pillar, the weight of its light in the sum."""
         return self.site_um2 or self.steps_um[0] * self.steps_um[1]
 
     @property
@@ -117,18 +120,17 @@ class PropagationCase:
         """(y, x) distance from the window centre to its outermost sample, at least a
         hundredth of a step.
         """
-        my, mx = self.samples
-        return max(my - 1, 0.02) / 2 * self.step_um, max(
-            mx - 1, 0.02
-        ) / 2 * self.step_um
+        y, x = (max(count - 1, 0.02) / 2 * self.step_um for count in self.samples)
+        return y, x
 
     @property
     def reach_um(self) -> float:
-        """Farthest that light goes sideways from a site to a sample, at least."""
+        """Upper bound of the lateral distance between a site and a window sample."""
         parts = zip(
             self.centre_um[::-1], self.half_window_um, self.half_size_um, strict=True
         )
-        return math.hypot(*(abs(c) + w + h for c, w, h in parts))
+        sums = (abs(centre) + window + lens for centre, window, lens in parts)
+        return math.hypot(*sums)
 
     @property
     def pillars_um(self) -> tuple[Array, Array]:
@@ -142,9 +144,8 @@ class PropagationCase:
     @property
     def window_um(self) -> tuple[Array, Array]:
         """(y,), (x,) positions of the window samples from the window centre."""
-        return axis_positions(self.samples[0], self.step_um), axis_positions(
-            self.samples[1], self.step_um
-        )
+        y, x = (axis_positions(count, self.step_um) for count in self.samples)
+        return y, x
 
 
 def axis_positions(count: int, step: float) -> Array:
@@ -165,8 +166,13 @@ def split_window(
     Args:
         case: geometry of the propagation.
     """
-    rows, columns = (_cut(count, min(parts, count)) for count in case.samples)
-    return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+    row_spans, column_spans = (
+        _even_spans(count, min(parts, count)) for count in case.samples
+    )
+    return tuple(
+        tuple(_part(case, row_span, column_span) for column_span in column_spans)
+        for row_span in row_spans
+    )
 
 
 def window_tiles(
@@ -180,41 +186,50 @@ def window_tiles(
     """
     firsts, sizes = [], []
     for count in case.samples:
-        number = min(parts, count)
-        sizes.append(-(-count // number))
+        tiles = min(parts, count)
+        sizes.append(-(-count // tiles))
         firsts.append(
-            [i * (count - sizes[-1]) // max(number - 1, 1) for i in range(number)]
+            [i * (count - sizes[-1]) // max(tiles - 1, 1) for i in range(tiles)]
         )
-    rows, columns = (
-        [(a, a + size) for a in first]
-        for first, size in zip(firsts, sizes, strict=True)
+    row_spans, column_spans = (
+        [(start, start + size) for start in axis_firsts]
+        for axis_firsts, size in zip(firsts, sizes, strict=True)
     )
     return (firsts[0], firsts[1]), tuple(
-        tuple(_part(case, row, column) for column in columns) for row in rows
+        tuple(_part(case, row_span, column_span) for column_span in column_spans)
+        for row_span in row_spans
     )
 
 
 def _part(
-    case: PropagationCase, row: tuple[int, int], column: tuple[int, int]
+    case: PropagationCase, row_span: tuple[int, int], column_span: tuple[int, int]
 ) -> PropagationCase:
-    """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
-    (my, mx), (x, y) = case.samples, case.centre_um
+    """Case of a part of the window, with its own centre.
+
+    Args:
+        case: geometry of the whole window.
+        row_span, column_span: first sample, and one past the last.
+    """
+    my, mx = case.samples
+    x, y = case.centre_um
     centre = (
-        x + (sum(column) - mx) / 2 * case.step_um,
-        y + (sum(row) - my) / 2 * case.step_um,
+        x + (sum(column_span) - mx) / 2 * case.step_um,
+        y + (sum(row_span) - my) / 2 * case.step_um,
     )
     return replace(
-        case, centre_um=centre, samples=(row[1] - row[0], column[1] - column[0])
+        case,
+        centre_um=centre,
+        samples=(row_span[1] - row_span[0], column_span[1] - column_span[0]),
     )
 
 
-def _cut(count: int, parts: int) -> list[tuple[int, int]]:
+def _even_spans(count: int, parts: int) -> list[tuple[int, int]]:
+    """(start, stop) of ``parts`` spans of nearly equal size."""
     return list(itertools.pairwise(count * i // parts for i in range(parts + 1)))
 
 
 def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> None:
-    """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or
-    infinity.
+    """Raise for maps of another shape, of no transmission, or with NaN or infinity.
 
     Args:
         phase_rad, transmission: (y, x) numpy arrays of float.
@@ -227,22 +242,23 @@ def check_aperture(phase_rad: Any, transmission: Any, case: PropagationCase) -> 
             raise PropagationError(
                 f"{name} has shape {array.shape}, need {case.shape} (y, x)"
             )
-    light = 0.0
+    nonzero = 0.0
     for start in range(0, case.shape[0], 256):
         rows = slice(start, start + 256)
-        total = float(phase_rad[rows].sum()) + float(
-            transmission[rows].sum()
-        )  # NaN and infinity survive a sum
+        # NaN and infinity survive a sum
+        total = float(phase_rad[rows].sum()) + float(transmission[rows].sum())
         if not np.isfinite(total):
-            bad = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
-            row, column = (int(i) for i in np.argwhere(bad)[0])
+            invalid = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
+            row, column = (int(i) for i in np.argwhere(invalid)[0])
             raise PropagationError(
                 f"phase or transmission at row {start + row}, column {column} is not finite"
             )
-        light = (
-            light or float(transmission[rows].max()) or float(transmission[rows].min())
+        nonzero = (
+            nonzero
+            or float(transmission[rows].max())
+            or float(transmission[rows].min())
         )
-    if light == 0:
+    if nonzero == 0:
         raise PropagationError(
             "empty aperture: transmission is 0 everywhere; check the aperture and the lens"
         )
@@ -289,27 +305,27 @@ def make_case(
             depth, an offset that is no pair,
             films without a gap and rays beyond their critical angle, a stop in front.
     """
-    step_um, cells = window_of(window_um, samples)
+    step_um, counts = window_of(window_um, samples)
     ax, ay = to_angle_pair(angle_rad)
     tangents = float(np.tan(ax)), float(np.tan(ay))
     depths = _depths(depths_um, offset_um)
-    d = sensor_distance_um
-    films = _films(layers, float(d), float(wavelength_um))
-    meets = [
-        chief_ray_offset(films.get("behind"), float(d), tangents, i)
-        + float(offset_um[i])
-        for i in (0, 1)
+    distance_um = float(sensor_distance_um)
+    films = _films(layers, distance_um, float(wavelength_um))
+    centre_um = [
+        chief_ray_offset(films.get("behind"), distance_um, tangents, axis)
+        + float(offset_um[axis])
+        for axis in (0, 1)
     ]
     case = PropagationCase(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
         wavelength_um=float(wavelength_um),
-        sensor_distance_um=float(sensor_distance_um),
+        sensor_distance_um=distance_um,
         tangents=tangents,
         inverse_depths_per_um=tuple((1 / depths).tolist()),
-        centre_um=(meets[0], meets[1]),
+        centre_um=(centre_um[0], centre_um[1]),
         step_um=step_um,
-        samples=cells,
+        samples=counts,
         row_um=float(row_um),
         site_um2=float(site_um2),
         **films,
@@ -321,7 +337,11 @@ def make_case(
 def _films(
     layers: Layers | None, sensor_distance_um: float, wavelength_um: float
 ) -> dict[str, Any]:
-    """What films add to a case."""
+    """Keywords ``front`` and ``behind`` of a case with films; empty without films.
+
+    Raises:
+        PropagationError: the layers have a stop.
+    """
     if layers is not None and layers.stop is not None:
         raise PropagationError(
             "layers: a stop is no part of a propagation from the pillars on; put Layers.stop_share onto their transmission "
@@ -329,35 +349,37 @@ def _films(
         )
     if layers is None or layers.plain or not sensor_distance_um > 0:
         return {}
-    before = layers.before(math.inf, wavelength_um)
-    films = zip(before.index[1:], before.thickness_um[1:], strict=True)
-    front = tuple((n, t) for n, t in films if t > 0)
+    in_front = layers.before(math.inf, wavelength_um)
+    pairs = zip(in_front.index[1:], in_front.thickness_um[1:], strict=True)
+    front = tuple((n, t) for n, t in pairs if t > 0)
     return {"front": front, "behind": layers.after(sensor_distance_um, wavelength_um)}
 
 
 def _check_rays(case: PropagationCase) -> None:
-    """Refuse rays that no face lets through: where films fill the whole gap, those that
-    its cover cannot hold.
+    """Raise for rays beyond the critical angle of the cover, if films fill the gap.
+
+    The steepest ray runs from the rim of a round lens to the opposite window corner.
     """
     if case.behind is None or case.behind.thickness_um[0] > 0:
         return
-    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    (high, wide), (down, across) = case.half_size_um, case.half_window_um
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    lens_y, lens_x = case.half_size_um
+    half_y, half_x = case.half_window_um
     x = np.abs(
-        np.abs(case.centre_um[0]) + across + wide * np.cos(turn)
+        np.abs(case.centre_um[0]) + half_x + lens_x * np.cos(angles)
     )  # the rim of a round lens, the far corner
-    y = np.abs(np.abs(case.centre_um[1]) + down + high * np.sin(turn))
+    y = np.abs(np.abs(case.centre_um[1]) + half_y + lens_y * np.sin(angles))
     steepest = float(media.ray_direction(case.behind, np.hypot(x, y).max()))
-    most = min(case.behind.order)
-    if steepest >= most:
+    cover_index = min(case.behind.order)
+    if steepest >= cover_index:
         raise PropagationError(
             f"layers: the films fill the way from lens to sensor, and rays of n sin θ = {steepest:.3g} from the rim to "
-            f"the window do not leave the cover of index {most:g}: need a gap, a nearer window or a smaller angle"
+            f"the window do not leave the cover of index {cover_index:g}: need a gap, a nearer window or a smaller angle"
         )
 
 
 def _depths(depths_um: Any, offset_um: Any) -> Array:
-    """(depth,) of the sources; nan, which a case refuses, for one that is not above 0."""
+    """(depth,) source depths, um; NaN, for which a case raises, unless all exceed 0."""
     depths = np.atleast_1d(np.asarray(depths_um, float))
     if depths.ndim != 1 or np.shape(offset_um) != (2,):
         words = f"depths_um of shape {depths.shape}, offset_um of {np.shape(offset_um)}"
@@ -366,59 +388,67 @@ def _depths(depths_um: Any, offset_um: Any) -> Array:
 
 
 def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
-    """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs
-    (x, y).
+    """Sampling step (um) and (y, x) samples of a window.
 
     Args:
-        window_um: width, or a pair (x, y).
+        window_um: full width, or a pair (x, y).
+        samples: cells along the width, or a pair (x, y).
 
     Raises:
         PropagationError: no number and no pair, parts of samples, or cells that are not
             square to 1e-6.
     """
-    wide = np.ravel(np.asarray(window_um, float))
-    many = np.ravel(np.asarray(samples, float))
-    if wide.size not in (1, 2) or many.size not in (1, 2) or (many % 1 != 0).any():
+    widths = np.ravel(np.asarray(window_um, float))
+    counts = np.ravel(np.asarray(samples, float))
+    if (
+        widths.size not in (1, 2)
+        or counts.size not in (1, 2)
+        or (counts % 1 != 0).any()
+    ):
         raise PropagationError(
             f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each, samples whole"
         )
-    (width, height), (across, down) = (
-        np.resize(wide, 2).tolist(),
-        np.resize(many.astype(int), 2).tolist(),
-    )
-    step = width / max(across, 1)
-    if abs(height / max(down, 1) - step) > 1e-6 * abs(step):
+    width, height = np.resize(widths, 2).tolist()
+    columns, rows = np.resize(counts.astype(int), 2).tolist()
+    step = width / max(columns, 1)
+    if abs(height / max(rows, 1) - step) > 1e-6 * abs(step):
         raise PropagationError(
-            f"window of {width:g} x {height:g} um with {across} x {down} samples: cells of {step:g} x "
-            f"{height / max(down, 1):g} um; need square ones"
+            f"window of {width:g} x {height:g} um with {columns} x {rows} samples: cells of {step:g} x "
+            f"{height / max(rows, 1):g} um; need square ones"
         )
-    return step, (down, across)
+    return step, (rows, columns)
 
 
 def chief_ray_offset(
     behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int
 ) -> Any:
-    """Where the chief ray of these tangents (in air) meets the sensor, along x (axis 0)
-    or y (1), um.
+    """Lateral position of the chief ray on the sensor, along x (axis 0) or y (1), um.
 
-    Operands may be torch tensors: behind films the cover takes what the distance gains.
+    Operands may be torch tensors. Behind films a change of the distance changes the
+    thickness of the medium at the sensor gap, so that its gradient is kept.
 
     Args:
+        behind: media from lens to sensor; None: air.
         sensor_distance_um: from lens to sensor.
+        tangents: (x, y) of the field angle, in air.
     """
     if behind is None:
         return sensor_distance_um * tangents[axis]
-    steep = 1 + tangents[0] * tangents[0] + tangents[1] * tangents[1]
-    value = (
+    secant_squared = 1 + tangents[0] * tangents[0] + tangents[1] * tangents[1]
+    detached = (
         sensor_distance_um.detach()
         if hasattr(sensor_distance_um, "detach")
         else sensor_distance_um
     )
-    gained = [
+    layers = [
         (n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0
     ]
-    pairs = [*gained, (behind.index[0], sensor_distance_um - value)]
-    return media.reach_per_direction(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
+    with_gap = [*layers, (behind.index[0], sensor_distance_um - detached)]
+    return (
+        media.reach_per_direction(with_gap, 1 - 1 / secant_squared)
+        * tangents[axis]
+        / secant_squared**0.5
+    )
 
 
 def to_angle_pair(angle_rad: Any) -> tuple[float, float]:

@@ -1,7 +1,8 @@
-"""From millions of pillars to a few thousand moments, by blocks of neighbouring pillars.
+"""From millions of pillars to a few thousand moments, by blocks of neighbouring
+pillars.
 
-The known phase is carried across a block by a polynomial and taken off; a few nodes
-stand for the pillars of a block.
+The geometric phase (the carrier) is a polynomial over each block and is removed. A few
+interpolation nodes then stand for the pillars of the block.
 """
 
 import functools
@@ -36,26 +37,26 @@ ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
 ACCURACY = {
     4: 2e-8,
     8: 1e-11,
-}  # of the carrier in turns, beside the rounding of the path itself
+}  # of the carrier in turns, in addition to the rounding of the path
 
 
-# of the longest path: what path and polynomial round to in float64 (up to 3.5e-15 was
-# found)
+# rounding of path and polynomial in float64, relative to the longest path (largest
+# measured: 3.5e-15)
 ROUNDED = 5e-15
 
 
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
 
 
-# positions in a block where the kernel is looked at; blocks that need more keep their
-# pillars
+# positions in a block where the kernel is sampled; blocks that need more nodes keep
+# their pillars
 PROBES = 48
 
 
 TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
 
 
-NODES = 60  # of a lens along an axis, about, where nothing else is said
+NODES = 60  # default of the approximate number of nodes of a lens along an axis
 
 
 CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
@@ -65,10 +66,9 @@ CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 class AxisBlocks:
     """Pillars along one axis in blocks of ``length``, ``nodes`` points in each.
 
-    The last block is as long as the others and overlaps the one before it; every pillar
-    belongs to the first block
-    that holds it. Where a block would need as many nodes as pillars, the nodes are the
-    pillars.
+    The last block is as long as the others and overlaps its neighbour; every pillar
+    belongs to the first block that holds it. Where a block would need as many nodes as
+    pillars, the nodes are the pillars.
     """
 
     pillars: int
@@ -103,7 +103,7 @@ class AxisBlocks:
 
     @property
     def weights(self) -> Array:
-        """(nodes, length): share of a pillar's light that each node gets."""
+        """(nodes, length): share of each node in a pillar's light."""
         if self.nodes == self.length:
             return np.eye(self.length)
         return np.ascontiguousarray(
@@ -135,33 +135,37 @@ def choose_blocks(
     nodes: int = NODES,
     more: int = 0,
 ) -> tuple[AxisBlocks, AxisBlocks]:
-    """(rows, columns) blocks that cost least.
+    """Row blocks and column blocks of the least cost, nodes (1 + lens nodes / length).
 
     Args:
         case: geometry of the propagation.
-        reference: inverse depth whose phase is taken off, 1/um.
+        reference: inverse depth of the carrier, 1/um.
         itemsize: bytes of a number of the maps.
-        kernel: (y, x) in um to (line, …) values whose variation over a block must be
-            met, broadcasting.
+        kernel: (y, x) in um to (line, …) values, broadcasting; their variation over a
+            block must be met.
         tolerance: root mean square error of the interpolation, relative.
-        nodes: of the lens along an axis, to which the light of every block's goes on,
-            about.
+        nodes: approximate number of nodes of the lens along an axis, to which the light
+            of the blocks is passed on.
         more: nodes of a block beyond those that the kernel needs.
     """
-    height = next(
-        n
-        for n in LENGTHS[0]
-        if n <= case.shape[0] and _carried(case, reference, n, itemsize)
+    tallest = next(
+        length
+        for length in LENGTHS[0]
+        if length <= case.shape[0]
+        and _polynomials_suffice(case, reference, length, itemsize)
     )
-    chosen = []
-    for axis, longest in ((0, height), (1, LENGTHS[1][0])):
-        options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
-        blocks = [_needed(case, axis, n, kernel, tolerance, more) for n in options]
-        chosen.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
-    return chosen[0], chosen[1]
+    cheapest = []
+    for axis, longest in ((0, tallest), (1, LENGTHS[1][0])):
+        blocks = [
+            _fewest_nodes(case, axis, length, kernel, tolerance, more)
+            for length in LENGTHS[axis]
+            if length <= min(longest, case.shape[axis])
+        ]
+        cheapest.append(min(blocks, key=lambda b: b.nodes * (1 + nodes / b.length)))
+    return cheapest[0], cheapest[1]
 
 
-def _needed(
+def _fewest_nodes(
     case: PropagationCase,
     axis: int,
     length: int,
@@ -169,14 +173,25 @@ def _needed(
     tolerance: float,
     more: int,
 ) -> AxisBlocks:
-    """Blocks of a length along an axis with as few nodes as the kernel needs at its
-    ends and its middle.
+    """Blocks of ``length`` pillars along an axis, with the fewest nodes per block.
+
+    The kernel is sampled over the first, the middle and the last block, on three lines
+    across the axis. Blocks that would need more than ``PROBES`` nodes keep their
+    pillars.
+
+    Args:
+        case: geometry of the propagation.
+        axis: 0 rows (y), 1 columns (x).
+        length: pillars of a block.
+        kernel: (y, x) in um to values, broadcasting.
+        tolerance: relative root mean square error of the interpolation.
+        more: nodes added to those that the kernel needs.
     """
     if length < 4:
         return AxisBlocks(case.shape[axis], length, length)
     step_um = case.steps_um[axis]
-    bases = AxisBlocks(case.shape[axis], length, length).middles_um(step_um)
-    middles = bases[[0, len(bases) // 2, -1], None, None]
+    all_middles = AxisBlocks(case.shape[axis], length, length).middles_um(step_um)
+    middles = all_middles[[0, len(all_middles) // 2, -1], None, None]
     across = case.half_size_um[1 - axis] * np.array([-1.0, 0.0, 1.0])[:, None]
     line = (
         middles + legendre.gauss_legendre_nodes(PROBES)[0] * (length - 1) / 2 * step_um
@@ -202,19 +217,25 @@ def carrier_turns(case: PropagationCase, reference: float, x: Any, y: Any) -> An
     ) / case.wavelength_um
 
 
-def _carried(
+def _polynomials_suffice(
     case: PropagationCase, reference: float, length: int, itemsize: int
 ) -> bool:
-    """Whether polynomials over blocks of ``length`` rows are as exact as asked."""
+    """Whether polynomials over blocks of ``length`` rows meet ``ACCURACY``.
+
+    The carrier is compared with its polynomials at four block rows and about 16
+    columns, in turns.
+    """
     rows = AxisBlocks(case.shape[0], length, length)
-    picked = np.unique([0, rows.count // 4, rows.count // 2, rows.count - 1])
+    block_rows = np.unique([0, rows.count // 4, rows.count // 2, rows.count - 1])
     x = case.pillars_um[1][:: max(1, case.shape[1] // 16)]
-    y = rows.middles_um(case.steps_um[0])[picked, None, None]
+    y = rows.middles_um(case.steps_um[0])[block_rows, None, None]
     half = (length - 1) / 2 * case.steps_um[0]
-    got = _powers(case, reference, (y, half), x, ORDER[itemsize])
-    want = carrier_turns(case, reference, x, y + half * rows.along[:, None])
-    error = np.abs(rows.along[:, None] ** np.arange(ORDER[itemsize]) @ got - want).max()
-    return bool(error <= ACCURACY[itemsize] + ROUNDED * np.abs(want).max())
+    coefficients = _powers(case, reference, (y, half), x, ORDER[itemsize])
+    exact = carrier_turns(case, reference, x, y + half * rows.along[:, None])
+    error = np.abs(
+        rows.along[:, None] ** np.arange(ORDER[itemsize]) @ coefficients - exact
+    ).max()
+    return bool(error <= ACCURACY[itemsize] + ROUNDED * np.abs(exact).max())
 
 
 def _powers(
@@ -224,18 +245,24 @@ def _powers(
     x: Array,
     order: int,
 ) -> Array:
-    """(block, order, x) power coefficients of the carrier in turns along the rows of
-    blocks at ``rows`` middles.
+    """(block, order, x) power coefficients of the carrier along the rows, in turns.
 
-    Of the differences to the middle node, u = 0: the transform would round thousands of
-    turns that all nodes share, by
-    its large entries.
+    The carrier is sampled at Chebyshev nodes u in [-1, 1]. The value at the middle node
+    is subtracted before the transform and added after it: the transform has large
+    entries and would round the thousands of turns that all nodes share.
+
+    Args:
+        case: geometry of the propagation.
+        reference: inverse depth of the carrier, 1/um.
+        rows: middles of the blocks (block, 1, 1) and their half height, um.
+        x: (x,) column positions, um.
+        order: number of coefficients.
     """
     u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
     values = carrier_turns(case, reference, x, rows[0] + rows[1] * u[:, None])
-    middle = values[..., order // 2 : order // 2 + 1, :]
-    powers = np.asarray(_to_powers(order) @ (values - middle))
-    powers[..., :1, :] += middle
+    middle_node = values[..., order // 2 : order // 2 + 1, :]
+    powers = np.asarray(_to_powers(order) @ (values - middle_node))
+    powers[..., :1, :] += middle_node
     return powers
 
 
@@ -254,8 +281,10 @@ def _to_powers(order: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class ReferencePhase:
-    """The known phase in turns, c(u) = Σ_n coefficients[n] uⁿ for u in [-1, 1] along
-    the rows of a block.
+    """The carrier in turns along the rows of a block, c(u) = Σ_n coefficients[n] uⁿ for
+    u in [-1, 1].
+
+    reference: inverse depth, 1/um. rows: blocks of rows. chunk: columns in a chunk.
     """
 
     case: PropagationCase
@@ -265,33 +294,37 @@ class ReferencePhase:
 
     @property
     def rounding_rad(self) -> float:
-        """Standard deviation of the phase from what its polynomials round, a tenth of
-        the largest.
+        """Standard deviation of the phase by rounding of its polynomials, rad: a tenth
+        of the largest error.
         """
         y, x = (half * np.array([-1.0, 0.0, 1.0]) for half in self.case.half_size_um)
         longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
         return float(2 * np.pi * ROUNDED / 10 * longest)
 
     def table(self, start: int, stop: int, dtype: Any) -> Array:
-        """(block, chunk, order, column) coefficients of block rows start to stop; whole
-        turns are left out.
+        """(block, chunk, order, column) coefficients of block rows start to stop, in
+        turns, without whole turns.
+
+        The columns are cut in chunks of equal size; the last is padded with zeros.
         """
         order = ORDER[np.dtype(dtype).itemsize]
         columns = self.case.shape[1]
         chunks = -(-columns // self.chunk)
-        out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
-        for first in range(start, stop, TABLE_ROWS):
-            some = slice(first, min(first + TABLE_ROWS, stop))
-            coefficients = self._coefficients(some, order)
+        table = np.zeros((stop - start, chunks, order, self.chunk), dtype)
+        for begin in range(start, stop, TABLE_ROWS):
+            block_rows = slice(begin, min(begin + TABLE_ROWS, stop))
+            coefficients = self._coefficients(block_rows, order)
             padded = np.zeros((*coefficients.shape[:2], chunks * self.chunk), dtype)
             padded[..., :columns] = coefficients
             parts = padded.reshape(*coefficients.shape[:2], chunks, self.chunk)
-            out[some.start - start : some.stop - start] = parts.swapaxes(1, 2)
-        return out
+            table[block_rows.start - start : block_rows.stop - start] = parts.swapaxes(
+                1, 2
+            )
+        return table
 
-    def _coefficients(self, some: slice, order: int) -> Array:
-        """(block, order, column) float64 of some block rows."""
-        middles = self.rows.middles_um(self.case.steps_um[0])[some, None, None]
+    def _coefficients(self, block_rows: slice, order: int) -> Array:
+        """(block, order, column) float64 of block_rows block rows."""
+        middles = self.rows.middles_um(self.case.steps_um[0])[block_rows, None, None]
         half = (self.rows.length - 1) / 2 * self.case.steps_um[0]
         coefficients = _powers(
             self.case, self.reference, (middles, half), self.case.pillars_um[1], order
@@ -318,13 +351,12 @@ KEEP_BYTES = 32e6
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PillarMoments:
-    """How pillars are reduced.
+    """Plan of the reduction of a lens to moments.
 
-    blocks: of rows and columns; carrier: the phase that is taken off; table: its
-    polynomials, where they are small enough to be kept; dtype: of the maps.
-    rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks, in the dtype of
-    the sums; bands: of each, the nodes that are taken at once and the moments that have
-    a share.
+    blocks: of rows and columns. carrier: the phase that is removed. table: its
+    polynomials, or None where they exceed ``KEEP_BYTES``. dtype: of the maps.
+    rows, columns: (y node, m) and (x node, n) weights of the nodes in the moments, in
+    the dtype of the sums. bands: of both, nodes handled at once and their moments.
     """
 
     blocks: tuple[AxisBlocks, AxisBlocks]
@@ -365,10 +397,11 @@ def plan_moments(
     nodes: int = NODES,
     more: int = 0,
 ) -> PillarMoments:
-    """Blocks, and what light at their nodes is worth in each moment.
+    """Plan the reduction of a lens to moments: blocks, carrier and weights of the
+    nodes.
 
     Args:
-        case, reference: geometry, and inverse depth whose phase is taken off.
+        case, reference: geometry, and inverse depth (1/um) of the carrier.
         tolerance: relative root mean square error of the moments.
         dtype, sums: of the maps, and of what is summed over blocks.
         weights: of the rows and of the columns, (place,) um to (place, m): polynomials,
@@ -381,52 +414,56 @@ def plan_moments(
     )
     rows, columns = blocks
     width = columns.length
-    wave = ReferencePhase(
-        case,
-        reference,
-        rows,
-        width * max(1, min(CHUNK // width, -(-case.shape[1] // width))),
-    )
-    places = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
+    chunk = width * max(1, min(CHUNK // width, -(-case.shape[1] // width)))
+    carrier = ReferencePhase(case, reference, rows, chunk)
+    nodes_um = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
     table = None
     if case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
-        table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
-    values = [weight(place) for weight, place in zip(weights, places, strict=True)]
-    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=sums) for f in values]
+        table = carrier.table(0, rows.count, np.dtype(f"f{itemsize}"))
+    values = [weight(at_um) for weight, at_um in zip(weights, nodes_um, strict=True)]
+    tensors = [torch.tensor(np.ascontiguousarray(v), dtype=sums) for v in values]
     return PillarMoments(
         blocks,
-        wave,
+        carrier,
         table,
         dtype,
-        polynomials[0],
-        polynomials[1],
+        tensors[0],
+        tensors[1],
         (_bands(values[0]), _bands(values[1])),
     )
 
 
 def _bands(weights: Array) -> Bands:
-    """Nodes and the moments that are not 0 at all of them; one band of all where most
-    are not.
+    """Bands of nodes, each with the range of moments that have a weight there.
+
+    Where the bands hold more than half of the matrix, one band holds all of it.
+
+    Args:
+        weights: (node, moment) share of a node's light in each moment.
     """
     bands = []
     for start in range(0, len(weights), BAND):
-        at = slice(start, min(start + BAND, len(weights)))
-        there = np.flatnonzero(weights[at].any(0))
-        bands.append(
-            (
-                at,
-                slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 0),
-            )
-        )
-    if sum(to.stop - to.start for _, to in bands) > weights.shape[1] * len(bands) / 2:
+        nodes = slice(start, min(start + BAND, len(weights)))
+        nonzero = np.flatnonzero(weights[nodes].any(0))
+        group = slice(0, 0)
+        if len(nonzero):
+            group = slice(int(nonzero[0]), int(nonzero[-1]) + 1)
+        bands.append((nodes, group))
+    if (
+        sum(group.stop - group.start for _, group in bands)
+        > weights.shape[1] * len(bands) / 2
+    ):
         return [(slice(0, len(weights)), slice(0, weights.shape[1]))]
     return bands
 
 
-def _in(bands: Bands, start: int, stop: int) -> Bands:
-    """The bands of nodes from start to stop."""
-    cut = [(slice(max(at.start, start), min(at.stop, stop)), to) for at, to in bands]
-    return [(at, to) for at, to in cut if at.start < at.stop]
+def _clip_bands(bands: Bands, start: int, stop: int) -> Bands:
+    """The bands, cut to the nodes from start to stop; empty bands are dropped."""
+    clipped = [
+        (slice(max(nodes.start, start), min(nodes.stop, stop)), group)
+        for nodes, group in bands
+    ]
+    return [(nodes, group) for nodes, group in clipped if nodes.start < nodes.stop]
 
 
 def reduce_to_moments(
@@ -434,18 +471,17 @@ def reduce_to_moments(
 ) -> tuple[torch.Tensor, float]:
     """(m, n) complex moments of a lens, and the sum of squares of its transmission.
 
-    Differentiable in phase and transmission, (y, x) real; sums are of the plan's dtype,
-    to which maps of another are
-    brought some rows at a time where no derivative is wanted. Values that are not
-    finite give moments or a sum that is
-    not; closed pillars are passed over where a whole tile is closed.
+    Differentiable in phase and transmission. Maps of another dtype than the plan's are
+    converted, some rows at a time where no derivative is required. Values that are not
+    finite give results that are not finite; tiles of closed pillars are skipped.
 
     Args:
         phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) amplitude of every pillar.
+        plan: of :func:`plan_moments`.
 
-    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars,
-    incoherent, and the interpolation
-    inside blocks that the plan allows.
+    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars. The
+    interpolation inside blocks adds what the plan allows.
     """
     if phase_rad.requires_grad or transmission.requires_grad:
         phase_rad, transmission = (m.to(plan.dtype) for m in (phase_rad, transmission))
@@ -466,10 +502,10 @@ def mix_components(
     if pupils is None:
         return [(1.0, light[0])]
     signs, factors = pupils(*places_um)
-    by = torch.as_tensor(factors, device=light.device).to(light.real.dtype)
+    weights = torch.as_tensor(factors, device=light.device).to(light.real.dtype)
     return [
-        (float(sign), (factor * light).sum(0))
-        for sign, factor in zip(signs, by, strict=True)
+        (float(sign), (weight * light).sum(0))
+        for sign, weight in zip(signs, weights, strict=True)
     ]
 
 
@@ -515,9 +551,12 @@ def _table(plan: PillarMoments, panel: slice, dtype: Any) -> Any:
     )
 
 
-def _fixed(plan: PillarMoments, dtype: Any) -> tuple[Array, Any, Any]:
-    """What both loops know of the blocks: positions of the rows, shares of the nodes,
-    first pillars.
+def _block_arrays(plan: PillarMoments, dtype: Any) -> tuple[Array, Any, Any]:
+    """Arrays of the blocks that both compiled loops take.
+
+    Returns:
+        Row positions in a block (length,); (rows, columns) shares of the nodes, (nodes,
+        length) each; (rows, columns) indices of the first pillars, (block,) each.
     """
     rows, columns = plan.blocks
     return (
@@ -530,99 +569,150 @@ def _fixed(plan: PillarMoments, dtype: Any) -> tuple[Array, Any, Any]:
 def _gather(
     phase: torch.Tensor, level: torch.Tensor, plan: PillarMoments
 ) -> tuple[torch.Tensor, float]:
-    """Moments by the compiled loops."""
+    """Moments (2, m, n), real and imaginary, and the sum of squares of the level.
+
+    Each panel of block rows goes through three steps: pillars to the nodes of their
+    blocks (compiled), column nodes to column moments, row nodes to row moments.
+
+    Args:
+        phase: (y, x) phase, rad.
+        level: (y, x) transmission.
+        plan: blocks and weights.
+    """
     maps = phase.detach().numpy(), level.detach().numpy()
-    (rows, columns), (m, n) = plan.blocks, plan.counts
-    out = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
-    kernel: Any = grid_pillars
-    powers: list[float] = []
-    along, shares, (row_bases, column_bases) = _fixed(
+    rows, columns = plan.blocks
+    m, n = plan.counts
+    moments = torch.zeros((m, 2 * n), dtype=plan.rows.dtype)
+    compiled_loop: Any = grid_pillars
+    tile_powers: list[float] = []
+    u, shares, (row_bases, column_bases) = _block_arrays(
         plan, torch.empty(0, dtype=plan.dtype).numpy().dtype
     )
     # block rows at once, where maps of another dtype are copied
     step = max(
-        1,
-        int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * along.itemsize)),
+        1, int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * u.itemsize))
     )
     for panel in plan.panels:
-        table = _table(plan, panel, along.dtype)
+        table = _table(plan, panel, u.dtype)
         count = panel.stop - panel.start
         nodes = torch.zeros(
             (count * rows.nodes, 2, columns.count * columns.nodes), dtype=plan.dtype
         )
-        view = nodes.numpy()
+        node_array = nodes.numpy()
 
         def work(
-            a: int,
-            b: int,
+            low: int,
+            high: int,
             first: int = panel.start,
             table: Any = table,
-            view: Any = view,
+            node_array: Any = node_array,
         ) -> None:
-            for i in range(a, b, step):
-                end = min(i + step, b)
-                begin = (first + i) * rows.length
-                few = [
-                    np.asarray(one[begin : (first + end) * rows.length], along.dtype)
-                    for one in maps
+            for i in range(low, high, step):
+                end = min(i + step, high)
+                first_row = (first + i) * rows.length
+                row_maps = [
+                    np.asarray(
+                        one_map[first_row : (first + end) * rows.length], u.dtype
+                    )
+                    for one_map in maps
                 ]
-                bases = row_bases[first + i : first + end] - begin, column_bases
-                part = view[i * rows.nodes : end * rows.nodes]
-                powers.append(kernel(*few, table[i:end], along, shares, bases, 0, part))
+                bases = row_bases[first + i : first + end] - first_row, column_bases
+                node_rows = node_array[i * rows.nodes : end * rows.nodes]
+                tile_powers.append(
+                    compiled_loop(
+                        *row_maps, table[i:end], u, shares, bases, 0, node_rows
+                    )
+                )
 
         run_split(count, work)
-        sums = torch.zeros((count * rows.nodes * 2, n), dtype=out.dtype)
-        light = nodes.flatten(0, 1).to(out.dtype)
-        for at, to in plan.bands[1]:
-            sums[:, to].addmm_(light[:, at], plan.columns[at, to])
-        sums, before = sums.view(-1, 2 * n), panel.start * rows.nodes
-        for at, to in _in(plan.bands[0], before, panel.stop * rows.nodes):
-            out[to].addmm_(
-                plan.rows[at, to].T, sums[at.start - before : at.stop - before]
+        sums = torch.zeros((count * rows.nodes * 2, n), dtype=moments.dtype)
+        light = nodes.flatten(0, 1).to(moments.dtype)
+        for span, group in plan.bands[1]:
+            sums[:, group].addmm_(light[:, span], plan.columns[span, group])
+        sums, first_node = sums.view(-1, 2 * n), panel.start * rows.nodes
+        for span, group in _clip_bands(
+            plan.bands[0], first_node, panel.stop * rows.nodes
+        ):
+            moments[group].addmm_(
+                plan.rows[span, group].T,
+                sums[span.start - first_node : span.stop - first_node],
             )
-    return out.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(powers)
+    return moments.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(tile_powers)
 
 
 def _spread(
     maps: tuple[torch.Tensor, torch.Tensor],
     plan: PillarMoments,
     grad: torch.Tensor,
-    out: tuple[Any, Any],
+    gradients: tuple[Any, Any],
 ) -> None:
-    """Gradients of the moments to those of phase and transmission by the compiled
-    loops.
+    """Write the gradients in phase and transmission, from those of the moments.
+
+    The adjoint of :func:`_gather`, one panel of block rows after the other.
+
+    Args:
+        maps: (y, x) phase in rad, and transmission.
+        plan: blocks and weights.
+        grad: (2, m, n) gradients of the moments.
+        gradients: (y, x) outputs, written in place; None where not needed.
     """
-    phase, level = (m.detach().numpy() for m in maps)
-    none = np.empty((0, 0), phase.dtype)
-    targets = tuple(none if t is None else t.numpy() for t in out)
-    rows, (m, n) = plan.blocks[0], plan.counts
-    inner = grad.movedim(0, 1).reshape(m, 2 * n)
-    kernel: Any = interpolate_to_pillars
-    fixed = _fixed(plan, phase.dtype)
+    phase, level = (one_map.detach().numpy() for one_map in maps)
+    empty = np.empty((0, 0), phase.dtype)
+    targets = tuple(
+        empty if gradient is None else gradient.numpy() for gradient in gradients
+    )
+    rows = plan.blocks[0]
+    m, n = plan.counts
+    moment_gradient = grad.movedim(0, 1).reshape(m, 2 * n)
+    compiled_loop: Any = interpolate_to_pillars
+    fixed = _block_arrays(plan, phase.dtype)
     for panel in plan.panels:
         table = _table(plan, panel, phase.dtype)
-        nodes = _given(plan, panel, inner).to(plan.dtype).numpy()
+        nodes = _node_gradients(plan, panel, moment_gradient).to(plan.dtype).numpy()
 
         def work(
-            a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel
+            low: int,
+            high: int,
+            table: Any = table,
+            nodes: Any = nodes,
+            panel: slice = panel,
         ) -> None:
-            part = nodes[a * rows.nodes : b * rows.nodes]
-            kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
+            node_rows = nodes[low * rows.nodes : high * rows.nodes]
+            compiled_loop(
+                phase,
+                level,
+                table[low:high],
+                *fixed,
+                panel.start + low,
+                node_rows,
+                *targets,
+            )
 
         run_split(panel.stop - panel.start, work)
 
 
-def _given(plan: PillarMoments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
-    """Gradients (m, re/im · n) of the moments to those of the nodes of a panel (row
-    node, re/im, column node).
+def _node_gradients(
+    plan: PillarMoments, panel: slice, moment_gradient: torch.Tensor
+) -> torch.Tensor:
+    """Gradients at the nodes of a panel (row node, re/im, column node).
+
+    Args:
+        plan: blocks and weights.
+        panel: block rows.
+        moment_gradient: (m, re/im · n) gradients of the moments.
     """
-    (rows, columns), n = plan.blocks, plan.counts[1]
-    before, stop = panel.start * rows.nodes, panel.stop * rows.nodes
+    rows, columns = plan.blocks
+    n = plan.counts[1]
+    first_node, last_node = panel.start * rows.nodes, panel.stop * rows.nodes
     sums = torch.cat(
-        [plan.rows[at, to] @ inner[to] for at, to in _in(plan.bands[0], before, stop)]
+        [
+            plan.rows[span, group] @ moment_gradient[group]
+            for span, group in _clip_bands(plan.bands[0], first_node, last_node)
+        ]
     ).view(-1, n)
     nodes = torch.cat(
-        [sums[:, to] @ plan.columns[at, to].T for at, to in plan.bands[1]], 1
+        [sums[:, group] @ plan.columns[span, group].T for span, group in plan.bands[1]],
+        1,
     )
     return nodes.view(-1, 2, columns.count * columns.nodes)
 
@@ -640,13 +730,14 @@ PER_RAD = 1 / (2 * np.pi)
 
 @numba.njit(inline="always")
 def whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
-    """Phase in turns less its whole turns, in the precision of ``like``: 2π in two
-    parts, the first of few bits, so that its multiples are exact.
+    """Phase (rad) in turns, reduced to [-1/2, 1/2], in the precision of ``like``.
+
+    2π is split in two parts; the first has few bits, so that its multiples are exact.
     """
     number = like.dtype.type
     whole = np.rint(phase * number(PER_RAD))
-    rest = (phase - whole * number(6.28125)) - whole * number(2 * np.pi - 6.28125)
-    return rest * number(PER_RAD)
+    reduced = (phase - whole * number(6.28125)) - whole * number(2 * np.pi - 6.28125)
+    return reduced * number(PER_RAD)
 
 
 def reference_phase_at(table: Any, u: Any, j: Any, like: Any) -> Any:
@@ -686,7 +777,7 @@ def _phasors(phase, table, u, re, im):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=EXACT, nogil=True, error_model="numpy", cache=True)
 def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
-    """Transmission times the phasors along a row."""
+    """Transmission times the phasors exp(i (phase + carrier)) along a row."""
     for j in range(phase.size):
         t = whole_turns_off(phase[j], re) + reference_phase_at(table, u, j, re)
         c, s = sincos_turns(t - np.rint(t), re)
@@ -697,7 +788,11 @@ def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
     fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
 )
 def _power(level, first, last, start, stop):  # type: ignore[no-untyped-def]
-    """(sum of squares, sum of magnitudes) of a tile, kept open to NaN."""
+    """(sum of squares, sum of magnitudes) of the transmission of a tile; NaN
+    propagates.
+
+    level: (y, x). first, last: rows. start, stop: columns.
+    """
     total, size = 0.0, 0.0
     for i in range(first, last):
         row = level[i, start:stop]
@@ -714,7 +809,10 @@ def _power(level, first, last, start, stop):  # type: ignore[no-untyped-def]
     fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
 )
 def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
-    """0, or NaN where a phase of a tile is not finite."""
+    """0, or NaN where a phase of a tile is not finite.
+
+    phase: (y, x). first, last: rows. start, stop: columns.
+    """
     total = phase.dtype.type(0)
     for i in range(first, last):
         row = phase[i, start:stop]
@@ -725,7 +823,11 @@ def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _add_rows(rows, shares, first, sums):  # type: ignore[no-untyped-def]
-    """Add four rows (row, re/im, column) to the row nodes: sums (node, re/im, column)."""
+    """Add four rows of light to the row nodes: sums[a] += Σ_q shares[a, first + q]
+    rows[q].
+
+    rows: (4, re/im, column). shares: (node, row). sums: (node, re/im, column).
+    """
     for a in range(sums.shape[0]):
         s0 = shares[a, first]
         s1 = shares[a, first + 1]
@@ -743,8 +845,10 @@ def _add_rows(rows, shares, first, sums):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def]
-    """Add the columns span[0] to span[1] of a tile to the column nodes: out (node,
-    re/im, column node).
+    """Add the columns span[0] to span[1] of a tile to the column nodes.
+
+    sums: (row node, re/im, column). shares: (node, column of a block). bases: (block,)
+    first columns. out: (row node, re/im, column node).
     """
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
@@ -763,17 +867,20 @@ def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
 def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ignore[no-untyped-def]
-    """Light of some block rows at their nodes, added to ``out`` (block row · node,
-    re/im, column node).
+    """Interpolate the light of some block rows to their nodes, added to ``out`` (block
+    row · node, re/im, column node).
 
-    phase, level: (y, x). table: (block row, chunk, order, column) of those block rows,
-    the first being ``first``.
-    u: (length,) row positions. shares, bases: a pair each, for rows and columns.
+    phase, level: (y, x), rad and amplitude. table: (block row, chunk, order, column)
+    carrier, from block row ``first`` on. u: (length,) row positions in a block. shares,
+    bases: (rows, columns) weights of the nodes and first pillars.
 
-    Returns the sum of squares of the transmission, NaN where a phase of a closed tile
-    is not finite.
+    Tile by tile: phasors of four rows are formed, added to the row nodes, and then to
+    the column nodes. Returns the sum of squares of the transmission, NaN where a phase
+    of a closed tile is not finite.
     """
-    (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
+    ny, nx = phase.shape
+    nodes, length = shares[0].shape
+    chunk = table.shape[3]
     rows = np.zeros((4, 2, chunk), out.dtype)
     sums = np.empty((nodes, 2, chunk), out.dtype)
     padded = np.zeros((nodes, length + 4), out.dtype)
@@ -818,7 +925,12 @@ def grid_pillars(phase, level, table, u, shares, bases, first, out):  # type: ig
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped-def]
-    """Adjoint of :func:`_add_columns`: column nodes to the columns of a tile."""
+    """Adjoint of :func:`_add_columns`: column nodes to the columns of a tile.
+
+    grad: (row node, re/im, column node). span: first and last column. shares: (node,
+    column of a block). bases: (block,) first columns. sums: (row node, re/im, column),
+    written in place.
+    """
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
         low = max(block * length, span[0])
@@ -835,8 +947,10 @@ def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
-    """Adjoint of :func:`_add_rows` for one row: row (re/im, column); nodes are taken
-    four at a time.
+    """Adjoint of :func:`_add_rows` for one row: row = Σ_a shares[a, i] sums[a].
+
+    Nodes are taken four at a time. sums: (node, re/im, column). shares: (node, row). i:
+    index of the row. row: (re/im, column), written in place.
     """
     row[:] = 0
     for a in range(0, sums.shape[0], 4):
@@ -855,15 +969,15 @@ def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _turned(row, re, im, level, out):  # type: ignore[no-untyped-def]
-    """Gradient in phase."""
+def _phase_gradient(row, re, im, level, out):  # type: ignore[no-untyped-def]
+    """Gradient in phase of a row: level · Im(conj(phasor) row)."""
     for j in range(out.size):
         out[j] = level[j] * (row[1, j] * re[j] - row[0, j] * im[j])
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
-def _scaled(row, re, im, out):  # type: ignore[no-untyped-def]
-    """Gradient in transmission."""
+def _level_gradient(row, re, im, out):  # type: ignore[no-untyped-def]
+    """Gradient in transmission of a row: Re(conj(phasor) row)."""
     for j in range(out.size):
         out[j] = row[0, j] * re[j] + row[1, j] * im[j]
 
@@ -872,10 +986,15 @@ def _scaled(row, re, im, out):  # type: ignore[no-untyped-def]
 def interpolate_to_pillars(  # type: ignore[no-untyped-def]
     phase, level, table, u, shares, bases, first, grad, out_phase, out_level
 ):
-    """Gradients at the nodes, as ``out`` of :func:`grid_pillars`, to those of phase and
-    transmission; empty arrays: none.
+    """Gradients in phase and transmission from those at the nodes: the adjoint of
+    :func:`grid_pillars`, which has the other arguments.
+
+    grad: as ``out`` there. out_phase, out_level: (y, x), written in place; an empty
+    array: no gradient is computed.
     """
-    (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
+    ny, nx = phase.shape
+    nodes, length = shares[0].shape
+    chunk = table.shape[3]
     row = np.empty((2, chunk), grad.dtype)
     re, im = np.empty(chunk, grad.dtype), np.empty(chunk, grad.dtype)
     sums = np.zeros(((nodes + 3) // 4 * 4, 2, chunk), grad.dtype)
@@ -902,6 +1021,6 @@ def interpolate_to_pillars(  # type: ignore[no-untyped-def]
                 _spread_row(sums, padded, i - base, row)
                 _phasors(phase[i, x0:x1], table[block, c], u[i - base], re, im)
                 if out_phase.size:
-                    _turned(row, re, im, level[i, x0:x1], out_phase[i, x0:x1])
+                    _phase_gradient(row, re, im, level[i, x0:x1], out_phase[i, x0:x1])
                 if out_level.size:
-                    _scaled(row, re, im, out_level[i, x0:x1])
+                    _level_gradient(row, re, im, out_level[i, x0:x1])

@@ -16,7 +16,7 @@ SOME = 32  # pillars along an axis whose rays tell what films leave out
 
 
 def reference_depth(case: PropagationCase) -> float:
-    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the
+    """Inverse depth, 1/um, of the source whose phase is removed: the middle of the
     range.
 
     Args:
@@ -84,98 +84,108 @@ def ray_to_offset(
         case: geometry of the propagation.
     """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
-    more = X * X + Y * Y + 2 * (X * dx + Y * dy)
+    change = X * X + Y * Y + 2 * (X * dx + Y * dy)
     behind, reach2 = case.media, dx * dx + dy * dy
     w0 = media.solve_direction_square(behind.layers, reach2)
-    w, away = media.path_difference(behind.layers, w0, reach2, more)
-    return ray_amplitude(behind, case.wavenumber, w, case.reach_um), away
+    w, difference = media.path_difference(behind.layers, w0, reach2, change)
+    return ray_amplitude(behind, case.wavenumber, w, case.reach_um), difference
 
 
 def ray_amplitude(behind: Media, wavenumber: float, w: Any, reach_um: float) -> Any:
-    """Complex amplitude of the module's heading for the ray of w = p², the phase kL
-    taken off.
+    """Complex amplitude of the ray of w = p² without its phase kL (see the module).
 
     Args:
         behind: media from lens to sensor. wavenumber: in vacuum, rad/um.
-        w: squared p of the rays. reach_um: largest lateral way of any ray.
+        w: squared p of the rays. reach_um: largest lateral distance of any ray.
     """
-    real, ahead, aside = ray_amplitude_parts(
+    magnitude, in_phase, quadrature = ray_amplitude_parts(
         behind, wavenumber, behind.layers, w, reach_um
     )
-    return -1j * real * (ahead + 1j * aside)
+    return -1j * magnitude * (in_phase + 1j * quadrature)
 
 
 def ray_amplitude_parts(
     behind: Media, wavenumber: float, pairs: media.Pairs, w: Any, reach_um: float
 ) -> tuple[Any, Any, Any]:
-    """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the
-    ray of w = p²; for complex
-    steps in w and in thicknesses, on which C itself counts as not depending.
+    """Magnitude k/(2π) √(passed / spread) of the ray of w = p², and the real and
+    imaginary part of its factor 1 + iC/(kL).
+
+    Complex steps in w and in thicknesses are allowed; C counts as independent of them.
 
     Args:
         behind: media from lens to sensor.
         wavenumber: in vacuum, rad/um.
         pairs: (index, thickness) of the media.
-        reach_um: lateral distance, um.
+        w: squared p of the rays.
+        reach_um: largest lateral distance of any ray, um.
     """
     passed = media.passed_at(behind.order, w) / media.area_spreading_of_square(pairs, w)
-    level = wavenumber / (2 * np.pi) * passed**0.5
-    turn = 1 / (wavenumber * media.whole_path(pairs, w))
-    ahead, aside = saddle_correction(behind, wavenumber, reach_um).at(w)
-    return level, 1 - turn * aside, turn * ahead
+    magnitude = wavenumber / (2 * np.pi) * passed**0.5
+    inverse_phase = 1 / (wavenumber * media.whole_path(pairs, w))
+    correction_real, correction_imaginary = saddle_correction(
+        behind, wavenumber, reach_um
+    ).at(w)
+    return (
+        magnitude,
+        1 - inverse_phase * correction_imaginary,
+        inverse_phase * correction_real,
+    )
 
 
 def polarized_amplitudes(case: PropagationCase, w: Array) -> tuple[Array, Array]:
-    """Amplitudes of s and of p light behind films over :func:`ray_amplitude`, of rays
-    of w
-    = p²; complex.
+    """Complex amplitudes of s and p light behind films, relative to
+    :func:`ray_amplitude`.
+
+    Each is the ratio of its saddle-point factor to the mean one, times the root of
+    twice its share of the transmitted power. Both are 1 in one medium.
 
     Args:
         case: geometry of the propagation.
+        w: squared p of the rays.
     """
     behind, k = case.behind, case.wavenumber
     if behind is None:
         return np.ones_like(w), np.ones_like(w)
     powers = media.passed_apart(behind.order, w)
-    turn, (ahead, aside) = (
-        1 / (k * media.whole_path(behind.layers, w)),
-        saddle_correction(behind, k, case.reach_um).at(w),
-    )
+    inverse_phase = 1 / (k * media.whole_path(behind.layers, w))
+    mean_real, mean_imaginary = saddle_correction(behind, k, case.reach_um).at(w)
     amplitudes = []
-    every = (
+    saddles = (
         saddle_correction(behind, k, case.reach_um, "s"),
         saddle_correction(behind, k, case.reach_um, "p"),
     )
-    for own, power in zip(every, powers, strict=True):
-        own_ahead, own_imaginary = own.at(w)
-        waves = (1 - turn * own_imaginary + 1j * turn * own_ahead) / (
-            1 - turn * aside + 1j * turn * ahead
+    for saddle, power in zip(saddles, powers, strict=True):
+        own_real, own_imaginary = saddle.at(w)
+        waves = (1 - inverse_phase * own_imaginary + 1j * inverse_phase * own_real) / (
+            1 - inverse_phase * mean_imaginary + 1j * inverse_phase * mean_real
         )
         amplitudes.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
     return amplitudes[0], amplitudes[1]
 
 
 def films_error(case: PropagationCase, level: Array) -> float:
-    """Relative L2 error of PSFs by what the kernel leaves out of the plane waves
-    through films; 0 in one medium.
+    """Relative L2 error of PSFs by the kernel through films; 0 in one medium.
 
-    Root mean square over the light of some pillars (transmission ``level`` (y, x)),
-    each seen from where the window is
-    farthest; twice that of the amplitude.
+    Twice the root-mean-square error of the amplitude over some pillars, weighted by
+    their light, each for the sample of the window farthest from it.
 
     Args:
         case: geometry of the propagation.
+        level: (y, x) transmission.
     """
     if case.behind is None:
         return 0.0
-    some = tuple(slice(n // SOME // 2, None, max(1, n // SOME)) for n in case.shape)
-    y, x = (a[part] for a, part in zip(case.pillars_um, some, strict=True))
-    light = np.asarray(level[some], float) ** 2
+    sampled = tuple(slice(n // SOME // 2, None, max(1, n // SOME)) for n in case.shape)
+    y, x = (
+        positions[span]
+        for positions, span in zip(case.pillars_um, sampled, strict=True)
+    )
+    light = np.asarray(level[sampled], float) ** 2
     if not light.sum() > 0:
         light = np.ones_like(light)
     far_y, far_x = (
-        abs(c - a) + h
-        for c, a, h in zip(
+        abs(centre - positions) + half_window
+        for centre, positions, half_window in zip(
             case.centre_um[::-1], (y, x), case.half_window_um, strict=True
         )
     )
@@ -185,11 +195,13 @@ def films_error(case: PropagationCase, level: Array) -> float:
 
 
 def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
-    """p along x of the rays to the window centre from lens points ``across``, ``far``
-    beside it: n sin θ cos φ.
+    """Direction cosine p along x of rays from lens points to the window centre.
+
+    p = across / (reach per direction), for the ray of this reach through the media.
 
     Args:
         case: geometry of the propagation.
+        across, far: offset along x, and along the other axis, um.
     """
     pairs = case.media.layers
     return across / media.reach_per_direction(
@@ -198,15 +210,17 @@ def ray_cosines(case: PropagationCase, across: Any, far: Any) -> Any:
 
 
 def cosine_y(case: PropagationCase, p: Any, e: Any) -> Any:
-    """q along y of the ray from lens row e with p along x to the window centre.
+    """Direction cosine q along y of the ray from lens row e to the window centre.
 
     Args:
         case: geometry of the propagation.
+        p: direction cosine along x.
+        e: lens row, um.
     """
-    far = e - case.centre_um[1]
-    pairs = case.media.layers
-    return far / media.reach_per_direction(
-        pairs, media.solve_direction_square(pairs, far * far, p * p)
+    row_offset = e - case.centre_um[1]
+    layers = case.media.layers
+    return row_offset / media.reach_per_direction(
+        layers, media.solve_direction_square(layers, row_offset * row_offset, p * p)
     )
 
 
@@ -220,31 +234,40 @@ def residual_path(
         X: offset along x from the window centre, um.
         Y: offset along y from the window centre, um.
     """
-    far = e - case.centre_um[1]
-    w0, g, more = _from_ray(case, p, far, X, Y)
-    w, away = media.path_difference(
-        case.media.layers, w0, (p * g) ** 2 + far * far, more
+    row_offset = e - case.centre_um[1]
+    w0, reach_per_p, change = _from_ray(case, p, row_offset, X, Y)
+    w, difference = media.path_difference(
+        case.media.layers, w0, (p * reach_per_p) ** 2 + row_offset * row_offset, change
     )
     level = ray_amplitude(case.media, case.wavenumber, w, case.reach_um)
-    return level, away + p * X + far / g * Y
+    return level, difference + p * X + row_offset / reach_per_p * Y
 
 
 def _from_ray(
-    case: PropagationCase, p: Any, far: Any, X: Any, Y: Any
+    case: PropagationCase, p: Any, row_offset: Any, X: Any, Y: Any
 ) -> tuple[Any, Any, Any]:
-    """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x
-    from ``far`` rows away.
+    """(w, reach / p, change of reach²) for the ray with p along x from a lens row.
+
+    The change is from the window centre to the offset (X, Y).
+
+    Args:
+        case: geometry of the propagation.
+        p: n sin θ along x.
+        row_offset: lens row less window centre, um.
+        X, Y: offset from the window centre, um.
     """
     pairs = case.media.layers
-    w0 = media.solve_direction_square(pairs, far * far, p * p)
-    g = media.reach_per_direction(pairs, w0)
-    return w0, g, X * X + Y * Y - 2 * (g * p * X + far * Y)
+    w0 = media.solve_direction_square(pairs, row_offset * row_offset, p * p)
+    reach_per_p = media.reach_per_direction(pairs, w0)
+    return w0, reach_per_p, X * X + Y * Y - 2 * (reach_per_p * p * X + row_offset * Y)
 
 
 def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
-    """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x
-    and y, at fixed pillar;
-    the medium behind the pillars takes what the distance gains; by complex steps.
+    """(3, …) logarithmic derivatives of the kernel in sensor distance and in window
+    centre x and y, at a fixed pillar.
+
+    By complex steps. A change of the distance changes the thickness of the medium
+    behind the pillars.
 
     Args:
         case: geometry of the propagation.
@@ -253,36 +276,38 @@ def kernel_derivatives(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) ->
         X: offset along x from the window centre, um.
         Y: offset along y from the window centre, um.
     """
-    h, behind, far = 1e-30, case.media, e - case.centre_um[1]
-    _, g, more = _from_ray(case, p, far, X, Y)
-    reach2 = (p * g) ** 2 + far * far + more
-    across, down = X - g * p, Y - far
-    out = []
+    tiny, behind, row_offset = 1e-30, case.media, e - case.centre_um[1]
+    _, g, change = _from_ray(case, p, row_offset, X, Y)
+    reach2 = (p * g) ** 2 + row_offset * row_offset + change
+    x_offset, y_offset = X - g * p, Y - row_offset
+    derivatives = []
     for step in (0, 1, 2):
         pairs: media.Pairs = behind.layers
-        moved = reach2 + 0j
+        stepped_reach2 = reach2 + 0j
         if step == 0:
             pairs = [
-                (n, t + (1j * h if n == behind.index[0] else 0))
+                (n, t + (1j * tiny if n == behind.index[0] else 0))
                 for n, t in behind.layers
             ]
             if not any(n == behind.index[0] for n, _ in pairs):
-                pairs = [*pairs, (behind.index[0], 1j * h)]
+                pairs = [*pairs, (behind.index[0], 1j * tiny)]
         else:
-            moved = moved + 2j * h * (across, down)[step - 1]
-        w = media.solve_direction_square(pairs, moved)
-        level, ahead, aside = ray_amplitude_parts(
+            stepped_reach2 = stepped_reach2 + 2j * tiny * (x_offset, y_offset)[step - 1]
+        w = media.solve_direction_square(pairs, stepped_reach2)
+        level, in_phase, quadrature = ray_amplitude_parts(
             behind, case.wavenumber, pairs, w, case.reach_um
         )
-        rate = level.imag / level.real + (ahead.imag + 1j * aside.imag) / (
-            ahead.real + 1j * aside.real
+        rate = level.imag / level.real + (in_phase.imag + 1j * quadrature.imag) / (
+            in_phase.real + 1j * quadrature.real
         )
-        out.append((rate + 1j * case.wavenumber * media.whole_path(pairs, w).imag) / h)
-    return np.stack(np.broadcast_arrays(*out))
+        derivatives.append(
+            (rate + 1j * case.wavenumber * media.whole_path(pairs, w).imag) / tiny
+        )
+    return np.stack(np.broadcast_arrays(*derivatives))
 
 
 def probe_positions() -> Array:
-    """Positions along an axis at which a smooth function is looked at."""
+    """Positions along an axis, in half widths, at which a smooth function is sampled."""
     return np.array([-1.0, 0.0, 1.0])
 
 
@@ -296,28 +321,32 @@ def rayleigh_sommerfeld_kernel(
         case: geometry of the propagation.
         inverse: 1 / depth of the source, 1/um.
     """
-    level, away = ray_to_offset(case, x, y, X, Y)
-    path = away + from_source(case, x, y, case.tangents, inverse)
+    level, sensor_path = ray_to_offset(case, x, y, X, Y)
+    path = sensor_path + from_source(case, x, y, case.tangents, inverse)
     path = path - from_source(case, x, y, case.tangents, reference_depth(case))
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
 
 
 def direction_range(case: PropagationCase, rows_um: Array) -> tuple[float, float]:
-    """(least, largest) p = n sin θ cos φ over the lens, for the row nodes given; never
-    of zero width.
+    """(least, largest) p = n sin θ cos φ of rays from the lens rows to the window
+    centre, with a margin.
 
     Args:
         case: geometry of the propagation.
         rows_um: (row,) positions of lens rows.
     """
     high_x = case.half_size_um[1]
-    edge = np.array([-high_x, high_x]) - case.centre_um[0]
-    far = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
-    p = ray_cosines(case, edge, np.array([[np.abs(far).min()], [np.abs(far).max()]]))
+    column_offsets = np.array([-high_x, high_x]) - case.centre_um[0]
+    row_offsets = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
+    p = ray_cosines(
+        case,
+        column_offsets,
+        np.array([[np.abs(row_offsets).min()], [np.abs(row_offsets).max()]]),
+    )
     low, high = float(p.min()), float(p.max())
-    spare = max(1e-9, 1e-6 * (high - low))
-    most = case.media.layers[0][0]
-    return max(low - spare, -most + 1e-15), min(high + spare, most - 1e-15)
+    margin = max(1e-9, 1e-6 * (high - low))
+    largest = case.media.layers[0][0]
+    return max(low - margin, -largest + 1e-15), min(high + margin, largest - 1e-15)
 
 
 def plane_wave_residual(case: PropagationCase, p: Any, e: Any, X: Any, Y: Any) -> Array:
@@ -346,10 +375,10 @@ def over_blocks(case: PropagationCase) -> Callable[[Any, Any], Array]:
     inverse = np.array(
         [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
     )
-    X, Y, v = (
-        g.reshape(-1, 1, 1, 1)
-        for g in np.meshgrid(
+    X, Y, inverse_grid = (
+        grid.reshape(-1, 1, 1, 1)
+        for grid in np.meshgrid(
             probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
         )
     )
-    return lambda y, x: rayleigh_sommerfeld_kernel(case, x, y, X, Y, v)
+    return lambda y, x: rayleigh_sommerfeld_kernel(case, x, y, X, Y, inverse_grid)

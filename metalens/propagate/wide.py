@@ -35,27 +35,25 @@ from metalens.propagate.paths import (
 )
 from metalens.propagate.window import depth_basis
 
-RAYS = 33  # along an axis, whose reach the quadratic follows
+RAYS = 33  # along an axis, to whose reach the quadratic is fitted
 
 
-SPARE = 1.2  # grid of the lens over the least that the kernel's band asks for
+SPARE = 1.2  # ratio of the lens grid's density to the least for the kernel's band
 
 
 MOST = 20000  # points of a transform along an axis
 
 
-# points of the lens that a window asks for, and half-waves in it, from which no other
-# method does as well; below some
-# 35 the fading and the grid beyond the lens's rim are as wide as lens and window, and
-# errors miss any setting (on
-# random lenses of 20 to 120 pillars by up to 3e-2; their estimates say so)
+# Least number of lens points and of half-waves in the window for which this method is
+# the best. Below some 35 the fading and the grid beyond the lens's rim are as wide as
+# lens and window, and errors miss any setting (on random lenses of 20 to 120 pillars by
+# up to 3e-2; their estimates say so).
 WIDE = 120
 
 
-# of the digits asked for that fading keeps where it does most: on light of the lens's
-# far rim at the far end of the
-# window, which weighs little; light that is even over both misses the setting, as the
-# estimate says, and is done again
+# Share of the requested digits that fading keeps where it acts most: on light of the
+# lens's rim at the opposite end of the window, which weighs little. Light that is even
+# over both misses the setting, as the estimate says, and is computed again.
 FADED = 0.4
 
 
@@ -66,16 +64,13 @@ STEEPEST = 0.93  # |p| of a ray, fading included, in units of the rarest index
 class WideAxis:
     """One axis of a wide window.
 
-    count, first_um, step_um: of the even grid over the lens, which stands over by
-    ``taps`` on both sides; ``over``: as
-    fine as the kernel asks for, times this. first: points of the first transform, of
-    which the middle ``size`` are over
-    the padded window, and go on. fine: of the last one, whose step is that
-    of the window's samples or a whole part of it, ``every``. middle, reach_um,
-    stretch_um: p0, A, D of the module.
-    most, guard: largest |p - p0| of a ray to the window; band beyond it in which the
-    light is faded out; sharp: half of
-    that in standard deviations. steepest: |p| of a ray to the window.
+    count, first_um, step_um: even grid over the lens, ``taps`` points larger on both
+    sides. over: its density over the least for the kernel. first: points of the first
+    transform; its middle ``size`` points cover the padded window. fine: points of the
+    last transform, whose step is the window's step divided by ``every``. middle,
+    reach_um, stretch_um: p0, A, D of the module. most: largest |p - p0| of a ray to the
+    window. guard: band beyond it in which the light is faded out. sharp: half of that
+    in standard deviations. steepest: |p| of a ray to the window.
     """
 
     count: int
@@ -98,9 +93,11 @@ class WideAxis:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticFit:
-    """The quadratic along one axis: p0, A, D of the module; most: largest |p - p0| of a
-    ray to the window; extra: what
-    the quadratic leaves of its reach; steepest: |p| of any ray."""
+    """Quadratic path along one axis: the reach of a ray is A + D (p - p0).
+
+    middle, reach_um, stretch_um: p0, A, D. most: largest |p - p0| of a ray to the
+    window. extra_um: largest residual of the reach. steepest: |p| of any ray.
+    """
 
     middle: float
     reach_um: float
@@ -114,14 +111,16 @@ class QuadraticFit:
 def wide_axes(
     case: PropagationCase, tolerance: float
 ) -> tuple[WideAxis, WideAxis] | None:
-    """(y, x) grids for a window; None where its rays are too steep or too far from
-    quadratic for the method.
+    """(y, x) grids of a wide window; None if its rays are too steep or not quadratic.
+
+    The quadratics are fitted twice more, each time to the window enlarged by the
+    residual of the last fit. Then the width of the fading and the grids follow.
 
     Args:
         case: geometry of the propagation.
         tolerance: relative error of the field.
     """
-    fits, extra = _fitted(case, list(case.half_window_um)), [0.0, 0.0]
+    fits = _fit_quadratics(case, list(case.half_window_um))
     for _ in range(2):
         if fits is None:
             return None
@@ -133,7 +132,7 @@ def wide_axes(
             )
         ):
             return None
-        fits = _fitted(
+        fits = _fit_quadratics(
             case, [w + e for w, e in zip(case.half_window_um, extra, strict=True)]
         )
     if fits is None:
@@ -149,37 +148,42 @@ def wide_axes(
     ]
     if fits[0].steepest + max(guards) > STEEPEST * case.media.layers[0][0]:
         return None
-    beyond = _beyond(case, fits, guards)
+    strays = _stray_reach(case, fits, guards)
     axes = [
-        _axis(case, i, fits[i], (guards[i], sharp, beyond[i]), tolerance)
+        _axis(case, i, fits[i], (guards[i], sharp, strays[i]), tolerance)
         for i in (0, 1)
     ]
     return None if axes[0] is None or axes[1] is None else (axes[0], axes[1])
 
 
-def _beyond(
+def _stray_reach(
     case: PropagationCase, fits: tuple[QuadraticFit, QuadraticFit], guards: list[float]
 ) -> list[float]:
-    """What the quadratic leaves of the reach of the light that is faded out, along y
-    and x.
+    """Largest residual of the quadratic reach in the faded band, along y and x, um.
+
+    Args:
+        case: geometry of the propagation.
+        fits: (y, x) quadratics.
+        guards: (y, x) widths of the faded band, in p.
     """
     y, x = (
-        f.middle + np.linspace(-1, 1, RAYS) * (f.most + g)
-        for f, g in zip(fits, guards, strict=True)
+        fit.middle + np.linspace(-1, 1, RAYS) * (fit.most + guard)
+        for fit, guard in zip(fits, guards, strict=True)
     )
-    w = y[:, None] ** 2 + x**2
-    inside = w <= (fits[0].steepest + max(guards)) ** 2
-    bend = media.reach_per_direction(case.media.layers, np.where(inside, w, 0.0))
+    squared = y[:, None] ** 2 + x**2
+    in_band = squared <= (fits[0].steepest + max(guards)) ** 2
+    reach_per_p = media.reach_per_direction(
+        case.media.layers, np.where(in_band, squared, 0.0)
+    )
     excess = []
     for fit, p in zip(fits, (y[:, None], x), strict=True):
-        left = p * bend - fit.reach_um - fit.stretch_um * (p - fit.middle)
-        excess.append(float(np.abs(np.where(inside, left, 0)).max()))
+        residual = p * reach_per_p - fit.reach_um - fit.stretch_um * (p - fit.middle)
+        excess.append(float(np.abs(np.where(in_band, residual, 0)).max()))
     return excess
 
 
 def is_wide(case: PropagationCase, tolerance: float) -> bool:
-    """Whether the method is the quickest without a look at the others, whose plans take
-    long for such windows.
+    """Whether this method is certainly the fastest, so that the others need no plan.
 
     Args:
         case: geometry of the propagation.
@@ -195,76 +199,104 @@ def is_wide(case: PropagationCase, tolerance: float) -> bool:
     return min(*waves, *(axis.count - 2 * axis.taps for axis in axes)) > WIDE
 
 
-def _fitted(
+def _fit_quadratics(
     case: PropagationCase, half: list[float]
 ) -> tuple[QuadraticFit, QuadraticFit] | None:
-    """Along y and x, for rays to ``half`` about the window's middle."""
-    unit = np.cos(np.pi * (np.arange(RAYS) + 0.5) / RAYS)
+    """Quadratics along y and x, fitted to rays from the lens to the window; None if
+    rays are too steep.
+
+    The reach of each ray is fitted by a line in its direction cosine, A + D (p - p0).
+
+    Args:
+        case: geometry of the propagation.
+        half: (y, x) half sizes of the window, um.
+    """
+    chebyshev = np.cos(np.pi * (np.arange(RAYS) + 0.5) / RAYS)
     centre = case.centre_um[::-1]
     y, x = (
-        c + unit * (w + h)
-        for c, w, h in zip(centre, half, case.half_size_um, strict=True)
+        middle + chebyshev * (w + h)
+        for middle, w, h in zip(centre, half, case.half_size_um, strict=True)
     )
-    both = [
-        np.asarray(ray_cosines(case, *at)) for at in ((y[:, None], x), (x, y[:, None]))
+    cosines = [
+        np.asarray(ray_cosines(case, *point))
+        for point in ((y[:, None], x), (x, y[:, None]))
     ]
-    steepest = float(np.sqrt((both[0] ** 2 + both[1] ** 2).max()))
+    steepest = float(np.sqrt((cosines[0] ** 2 + cosines[1] ** 2).max()))
     if steepest > STEEPEST * case.media.layers[0][0]:
         return None
-    out = []
-    for along, p in zip((y[:, None], x), both, strict=True):
+    fits = []
+    for along, p in zip((y[:, None], x), cosines, strict=True):
         reach = np.broadcast_to(along, p.shape)
         p0 = float(p.min() + p.max()) / 2
-        slope, level = np.polyfit((p - p0).ravel(), reach.ravel(), 1)
-        left = float(np.abs(reach - level - slope * (p - p0)).max())
-        out.append(
+        slope, intercept = np.polyfit((p - p0).ravel(), reach.ravel(), 1)
+        residual = float(np.abs(reach - intercept - slope * (p - p0)).max())
+        fits.append(
             QuadraticFit(
                 p0,
-                float(level),
+                float(intercept),
                 float(slope),
                 float(np.abs(p - p0).max()),
-                left,
+                residual,
                 steepest,
             )
         )
-    return out[0], out[1]
+    return fits[0], fits[1]
 
 
 def _axis(
     case: PropagationCase,
     i: int,
     fit: QuadraticFit,
-    faded: tuple[float, float, float],
+    fade: tuple[float, float, float],
     tolerance: float,
 ) -> WideAxis | None:
-    """The grids of an axis; faded: width in p of what is faded out, half of it in
-    standard deviations, and how far
-    that light goes astray."""
-    guard, sharp, beyond = faded
+    """Grids of one axis; None if a transform would exceed ``MOST`` points.
+
+    The first transform grows until its lens grid is dense enough for the kernel's band
+    and it holds the whole lens.
+
+    Args:
+        case: geometry of the propagation.
+        i: 0 for y, 1 for x.
+        fit: quadratic along the axis.
+        fade: width of the faded band in p; half of it in standard deviations; how far
+            its light strays, um.
+        tolerance: relative error of the field.
+    """
+    guard, sharp, stray = fade
     coarse = case.wavelength_um / 2 / (fit.most + guard)
     every = math.ceil(case.step_um / coarse)
     width = (
-        2 * (case.half_window_um[i] + beyond) + 4 * sharp**2 / case.wavenumber / guard
+        2 * (case.half_window_um[i] + stray) + 4 * sharp**2 / case.wavenumber / guard
     )
-    fine = _quick(width * every / case.step_um)
+    fine = _fast_size(width * every / case.step_um)
     period = fine * case.step_um / every
-    size = min(_quick(period / coarse), fine)
-    least = (
-        case.wavelength_um * fit.stretch_um * size / period
-    )  # grid step of the lens times points of the first transform
-    band, first = _band(case, i, fit.extra_um), size
+    size = min(_fast_size(period / coarse), fine)
+    # grid step of the lens times points of the first transform
+    lens_unit = case.wavelength_um * fit.stretch_um * size / period
+    band = _band(case, i, fit.extra_um)
+    first = size
     while first <= MOST:
-        over = case.wavelength_um / (2 * band) * first / least
+        over = case.wavelength_um / (2 * band) * first / lens_unit
         if over >= SPARE:
             taps = math.ceil(
                 1 + math.log(10 / tolerance) * over / (math.pi * (over - 1))
             )
-            count = math.ceil(2 * case.half_size_um[i] * first / least) + 2 * taps + 1
+            count = (
+                math.ceil(2 * case.half_size_um[i] * first / lens_unit) + 2 * taps + 1
+            )
             if count <= first:
-                low = -(count - 1) / 2 * least / first
-                grid = count, low, least / first, taps, over, first, size, fine, every
+                first_um = -(count - 1) / 2 * lens_unit / first
                 return WideAxis(
-                    *grid,
+                    count,
+                    first_um,
+                    lens_unit / first,
+                    taps,
+                    over,
+                    first,
+                    size,
+                    fine,
+                    every,
                     fit.middle,
                     fit.reach_um,
                     fit.stretch_um,
@@ -273,39 +305,53 @@ def _axis(
                     sharp,
                     fit.steepest,
                 )
-        first = _quick(max(first + 1, min(SPARE / over, 1.5) * first))
+        first = _fast_size(max(first + 1, min(SPARE / over, 1.5) * first))
     return None
 
 
-def _quick(points: float) -> int:
+def _fast_size(points: float) -> int:
     """Size of a transform: the next multiple of 4 with small prime factors."""
     return int(4 * next_fast_len(math.ceil((points - 1e-9) / 4)))
 
 
 def _band(case: PropagationCase, i: int, extra: float) -> float:
-    """Largest |d path / d x| along an axis of the kernel without its carrier, over
-    lens, window and depths.
+    """Largest |d path / d x| along an axis of the kernel without its carrier.
+
+    The sum of two parts: the change of the sensor ray over the window, and the slope of
+    the source path between its extreme and its reference depth.
+
+    Args:
+        case: geometry of the propagation.
+        i: 0 for y, 1 for x.
+        extra: enlargement of the window along the axis, um.
     """
-    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, hx = case.half_size_um
+    wy, wx = case.half_window_um
     ends = np.array([-1.0, 0.0, 1.0])
     y, x, Y, X = np.meshgrid(ends * hy, ends * hx, ends * wy, ends * wx, indexing="ij")
-    Y, X = (Y + np.sign(Y) * extra, X) if i == 0 else (Y, X + np.sign(X) * extra)
-    far = [(case.centre_um[1] - y, Y), (case.centre_um[0] - x, X)]
-    away, beside = far[i], far[1 - i]
-    turned = ray_cosines(case, away[0] + away[1], beside[0] + beside[1]) - ray_cosines(
-        case, away[0], beside[0]
+    if i == 0:
+        Y = Y + np.sign(Y) * extra
+    else:
+        X = X + np.sign(X) * extra
+    offsets = [(case.centre_um[1] - y, Y), (case.centre_um[0] - x, X)]
+    along, across = offsets[i], offsets[1 - i]
+    turn = ray_cosines(case, along[0] + along[1], across[0] + across[1]) - ray_cosines(
+        case, along[0], across[0]
     )
-    tiny = np.array([-0.5, 0.5])[:, None, None] * 1e-3
-    at = [ends[:, None] * hy, ends * hx]
-    at[i] = at[i] + tiny
-    steep = 0.0
+    half_steps = np.array([-0.5, 0.5])[:, None, None] * 1e-3
+    lens_axes = [ends[:, None] * hy, ends * hx]
+    lens_axes[i] = lens_axes[i] + half_steps
+    steepest = 0.0
     for inverse in (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)):
-        path = from_source(case, at[1], at[0], case.tangents, inverse)
+        path = from_source(case, lens_axes[1], lens_axes[0], case.tangents, inverse)
         path = np.asarray(
-            path - from_source(case, at[1], at[0], case.tangents, reference_depth(case))
+            path
+            - from_source(
+                case, lens_axes[1], lens_axes[0], case.tangents, reference_depth(case)
+            )
         )
-        steep = max(steep, float(np.abs(path[1] - path[0]).max() / 1e-3))
-    return max(float(np.abs(turned).max()) + steep, 1e-6)
+        steepest = max(steepest, float(np.abs(path[1] - path[0]).max() / 1e-3))
+    return max(float(np.abs(turn).max()) + steepest, 1e-6)
 
 
 def grid_um(axis: WideAxis) -> Array:
@@ -318,8 +364,10 @@ def grid_um(axis: WideAxis) -> Array:
 
 
 def spread_weights(axis: WideAxis, places_um: Array) -> Array:
-    """(place, grid) sinc under Kaiser's window: f(x) = Σ_m weight f(x_m) for what the
-    kernel's band holds.
+    """(place, grid) interpolation weights, a sinc under a Kaiser window: f(x) = Σ_m
+    weight f(x_m).
+
+    Exact to the tolerance for functions within the kernel's band.
 
     Args:
         axis: grids along one axis.
@@ -335,12 +383,11 @@ def spread_weights(axis: WideAxis, places_um: Array) -> Array:
     )
 
 
-BAND_BYTES = 3e6  # of the depths that are mixed at once
+BAND_BYTES = 3e6  # of the rows whose depths are mixed at once
 
 
-EVERY = (
-    3  # point of the grid of the lens whose light says which depth fields are needed
-)
+# step of the samples of the lens grid whose light selects the depth fields
+EVERY = 3
 
 
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
@@ -348,12 +395,12 @@ CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WidePlan:
-    """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x)
-    depth fields on the grid of the
-    lens, its phases included; coefficients: (depth, b); chirp, transfer: (X, Y) behind
-    the first and second transform,
-    as light lies in memory between them.
-    left: of the light of all depths that fewer fields may leave out, root mean square.
+    """Plan of a wide window: everything that depends on the geometry alone.
+
+    axes: (y, x). fields: (b, y, x) depth fields on the lens grid, its phases included.
+    coefficients: (depth, b). chirp, transfer: (X, Y) factors after the first and second
+    transform, in the memory order of the light. left: relative root mean square of the
+    light of all depths that a reduced basis may omit.
     """
 
     case: PropagationCase
@@ -381,7 +428,7 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
         dtype: of the maps and of the transforms.
 
     Raises:
-        PropagationError: rays too steep, or too unlike a quadratic, for the method.
+        PropagationError: rays too steep, or too far from a quadratic, for the method.
     """
     with one_blas_thread():
         axes = wide_axes(case, tolerance)
@@ -399,46 +446,61 @@ def plan_wide(case: PropagationCase, tolerance: float, dtype: torch.dtype) -> Wi
             sums=dtype,
             nodes=max(axis.count for axis in axes) // 2,
         )
-        kind = torch.complex64 if dtype == torch.float32 else torch.complex128
+        complex_dtype = torch.complex64 if dtype == torch.float32 else torch.complex128
         fields, coefficients = _depth_fields(case, axes, tolerance / 2)
         lens = _lens_phase(case, axes)
         arrays = (
             coefficients,
-            *(np.ascontiguousarray(a.T) for a in _behind(case, axes)),
+            *(np.ascontiguousarray(a.T) for a in _window_factors(case, axes)),
         )
-        given = [torch.tensor(a, dtype=kind) for a in arrays]
-        table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind)
-        for one, field in zip(table, fields, strict=True):
-            one.copy_(torch.from_numpy(field * lens))
-    return WidePlan(case, axes, pillars, table, given[0], given[1], given[2], tolerance)
+        tensors = [torch.tensor(a, dtype=complex_dtype) for a in arrays]
+        table = torch.empty((coefficients.shape[1], *lens.shape), dtype=complex_dtype)
+        for slot, field in zip(table, fields, strict=True):
+            slot.copy_(torch.from_numpy(field * lens))
+    return WidePlan(
+        case, axes, pillars, table, tensors[0], tensors[1], tensors[2], tolerance
+    )
 
 
 def _depth_fields(
     case: PropagationCase, axes: tuple[WideAxis, WideAxis], tolerance: float
 ) -> tuple[Iterator[Array], Array]:
-    """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth,
-    b) coefficients.
+    """Depth fields (b, y, x) on the lens grid, one by one, and coefficients.
+
+    The basis is computed on a coarse Legendre grid and interpolated.
+
+    Args:
+        case: geometry of the propagation.
+        axes: (y, x) grids.
+        tolerance: relative root mean square error of the basis.
     """
     grids = [grid_um(axis) for axis in axes]
-    counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
+    counts = [min(_coarse_nodes(case, i, g), len(g)) for i, g in enumerate(grids)]
     e, x = (
         legendre.mapped_nodes(n, g[0], g[-1])
         for n, g in zip(counts, grids, strict=True)
     )
     depths = depth_basis(case, (e, x), tolerance)
-    to = [
+    matrices = [
         legendre.interpolation_matrix(n, g / g[-1])
         for n, g in zip(counts, grids, strict=True)
     ]
-    return (to[0] @ one @ to[1].T for one in depths.basis), depths.coefficients
+    fields = (matrices[0] @ field @ matrices[1].T for field in depths.basis)
+    return fields, depths.coefficients
 
 
-def _coarse(case: PropagationCase, i: int, grid: Array) -> int:
-    """Legendre nodes that hold the phase of the extreme depths along an axis: two a
-    turn, and some.
+def _coarse_nodes(case: PropagationCase, i: int, grid: Array) -> int:
+    """Legendre nodes along an axis that resolve the phase of the extreme depths.
+
+    24 plus six per wavelength of path difference.
+
+    Args:
+        case: geometry of the propagation.
+        i: 0 for y, 1 for x.
+        grid: lens grid along the axis, um.
     """
-    far = [np.array([0.0, *case.half_size_um])[:, None], grid[[0, -1]]]
-    y, x = (far[1], far[0]) if i == 0 else (far[0], far[1])
+    axes = [np.array([0.0, *case.half_size_um])[:, None], grid[[0, -1]]]
+    y, x = (axes[1], axes[0]) if i == 0 else (axes[0], axes[1])
     turns = 0.0
     for inverse in (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)):
         path = from_source(case, x, y, case.tangents, inverse)
@@ -448,29 +510,34 @@ def _coarse(case: PropagationCase, i: int, grid: Array) -> int:
 
 
 def _lens_phase(case: PropagationCase, axes: tuple[WideAxis, WideAxis]) -> Array:
-    """(y, x) what the light of the grid is multiplied by before the first transform,
-    all constants included.
+    """(y, x) complex factor on the light of the lens grid, before the first transform.
+
+    It holds the quadratic phase of both axes less the carrier's, the shift of the
+    transform's orders, and all constants.
+
+    Args:
+        case: geometry of the propagation.
+        axes: (y, x) grids.
     """
-    k, lam = case.wavenumber, case.wavelength_um
-    total, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
-    for i, (axis, c) in enumerate(zip(axes, case.centre_um[::-1], strict=True)):
-        x, x0 = grid_um(axis), c - axis.reach_um
-        path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (c - x)
+    k, wavelength_um = case.wavenumber, case.wavelength_um
+    path_sum, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
+    for i, (axis, centre) in enumerate(zip(axes, case.centre_um[::-1], strict=True)):
+        x, x0 = grid_um(axis), centre - axis.reach_um
+        path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (centre - x)
         turn = np.exp(
             2j * np.pi * (axis.size // 2) * np.arange(axis.count) / axis.first
         )
-        total, ramp = (
-            (total + path[:, None], ramp * turn[:, None])
-            if i == 0
-            else (total + path, ramp * turn)
-        )
+        if i == 0:
+            path, turn = path[:, None], turn[:, None]
+        path_sum = path_sum + path
+        ramp = ramp * turn
     y, x = (grid_um(axis) for axis in axes)
-    away = np.asarray(to_sensor(case, x, y[:, None]))
+    removed = np.asarray(to_sensor(case, x, y[:, None]))
     scale = case.area_um2 / (
-        1j * lam * math.sqrt(axes[0].stretch_um * axes[1].stretch_um)
+        1j * wavelength_um * math.sqrt(axes[0].stretch_um * axes[1].stretch_um)
     )
     start = float(_phase_path(case, axes[0].middle ** 2 + axes[1].middle ** 2))
-    return np.asarray(scale * ramp * np.exp(1j * k * (total - away + start)))
+    return np.asarray(scale * ramp * np.exp(1j * k * (path_sum - removed + start)))
 
 
 def _phase_path(case: PropagationCase, w: Any) -> Any:
@@ -478,22 +545,29 @@ def _phase_path(case: PropagationCase, w: Any) -> Any:
     return sum(t * (n * n - w) ** 0.5 for n, t in case.media.layers)
 
 
-def _behind(
+def _window_factors(
     case: PropagationCase, axes: tuple[WideAxis, WideAxis]
 ) -> tuple[Array, Array]:
-    """(Y, X) chirp of the window behind the first transform, and transfer of what the
-    quadratic leaves.
+    """(Y, X) chirp after the first transform, and transfer function after the second.
+
+    The transfer function corrects the path from its quadratic to the exact one, applies
+    the transmission of the layers, and fades steep rays out.
+
+    Args:
+        case: geometry of the propagation.
+        axes: (y, x) grids.
     """
     k = case.wavenumber
     chirps, ramps, squares, paths = [], [], [], []
-    for axis, samples, c in zip(axes, case.samples, case.centre_um[::-1], strict=True):
+    for axis, samples, centre in zip(
+        axes, case.samples, case.centre_um[::-1], strict=True
+    ):
         period = axis.fine * case.step_um / axis.every
         n = np.arange(axis.size) - axis.size // 2
         width = period / axis.size
-        place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
-        turns = n * (
-            axis.size // 2 / axis.size - place / axis.first
-        )  # the lowest order of the next transform is first
+        place = (axis.first_um - (centre - axis.reach_um)) / axis.step_um
+        # the lowest order of the next transform is first
+        turns = n * (axis.size // 2 / axis.size - place / axis.first)
         chirps.append(
             np.exp(
                 1j * k * (n * width) ** 2 / (2 * axis.stretch_um) + 2j * np.pi * turns
@@ -508,28 +582,31 @@ def _behind(
         )
         squares.append((axis.middle + u) ** 2)
         paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
-    w = squares[0][:, None] + squares[1]
-    narrow = max(axes, key=lambda axis: axis.guard)
-    inside = w < (narrow.steepest + 1.1 * narrow.guard) ** 2
-    w = np.where(inside, w, 0.0)
-    psi = _phase_path(case, w) - _phase_path(
+    squared = squares[0][:, None] + squares[1]
+    fading = max(axes, key=lambda axis: axis.guard)
+    in_band = squared < (fading.steepest + 1.1 * fading.guard) ** 2
+    squared = np.where(in_band, squared, 0.0)
+    path_left = _phase_path(case, squared) - _phase_path(
         case, axes[0].middle ** 2 + axes[1].middle ** 2
     )
-    psi = psi + paths[0][:, None] + paths[1]
-    level = _fade(narrow, np.sqrt(w) - narrow.steepest)
-    level = level * np.sqrt(media.passed_at(case.media.order, w))
+    path_left = path_left + paths[0][:, None] + paths[1]
+    level = _fade(fading, np.sqrt(squared) - fading.steepest)
+    level = level * np.sqrt(media.passed_at(case.media.order, squared))
     transfer = np.where(
-        inside, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0
+        in_band, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * path_left), 0
     )
     return chirps[0][:, None] * chirps[1], transfer
 
 
-def _fade(axis: WideAxis, past: Array) -> Array:
-    """1 for rays to the window, 0 past the end of the band, by the integral of a
-    Gaussian between.
+def _fade(axis: WideAxis, excess: Array) -> Array:
+    """Weight of rays at an excess |p| over the steepest to the window: 1 at 0, 0 at the
+    guard's end.
+
+    Half of erfc((2 excess / guard - 1) sharp / √2).
     """
     return np.asarray(
-        scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * past / axis.guard - 1)) / 2
+        scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * excess / axis.guard - 1))
+        / 2
     )
 
 
@@ -538,14 +615,16 @@ def light_wide(
     plan: WidePlan,
     pupils: Pupils | None = None,
 ) -> tuple[torch.Tensor, Array, list[float]]:
-    """Irradiance on the window (depth, y, x); light of every map on the even grid of the
-    lens; sums of squares of the transmissions.
-
-    Differentiable once in the maps.
+    """Irradiance on a wide window, Σ_c sign_c |field_c|², once differentiable.
 
     Args:
-        maps: (map, y, x) phase and transmission. plan: of :func:`plan_wide`.
+        maps: (map, y, x) phase in rad, and transmission.
+        plan: of :func:`plan_wide`.
         pupils: factors on the light of the maps; None for the |U|² of one map.
+
+    Returns:
+        Irradiance (depth, y, x); light of every map on the lens grid; sums of squares
+        of the transmissions.
     """
     reduced = [
         reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
@@ -553,45 +632,58 @@ def light_wide(
     grid, total = torch.stack([g for g, _ in reduced]), None
     for sign, light in mix_components(grid, pupils, plan.judged_um):
         mixture, coefficients = (
-            (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
+            (None, plan.coefficients)
+            if light.requires_grad
+            else _fewer_fields(light, plan)
         )
-        here = _mixed(fields_wide(light, plan, mixture), coefficients)
-        here = here if sign == 1 else sign * here
-        total = here if total is None else total + here
+        irradiance = _mix_depths(fields_wide(light, plan, mixture), coefficients)
+        irradiance = irradiance if sign == 1 else sign * irradiance
+        total = irradiance if total is None else total + irradiance
     powers = [power for _, power in reduced]
     return torch.as_tensor(total), grid.detach().numpy().astype(complex), powers
 
 
-def _fewer(light: torch.Tensor, plan: WidePlan) -> tuple[torch.Tensor, torch.Tensor]:
-    """(fewer, b) mixtures of the depth fields and (depth, fewer) coefficients for this
-    light on the grid of the lens:
-    a round lens leaves the corners of its square dark, where depths differ most.
+def _fewer_fields(
+    light: torch.Tensor, plan: WidePlan
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Reduced depth basis for this light: mixtures (r, b), coefficients (depth, r).
 
-        F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L,    U: first eigenvectors of C G Cᴴ,    G_ij = Σ_x |L|² B_i B_j*
+        F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L, U: leading eigenvectors of C G Cᴴ,
+        G_ij = Σ_x |L|² B_i B_j*
+
+    A round lens leaves the corners of its square dark, where depths differ most.
+
+    Args:
+        light: (y, x) light L on the lens grid.
+        plan: of :func:`plan_wide`.
     """
-    some = (
+    samples = (
         (plan.fields[:, ::EVERY, ::EVERY] * light[::EVERY, ::EVERY])
         .flatten(1)
         .to(torch.complex128)
     )
-    c = plan.coefficients.to(torch.complex128)
-    power, axes = torch.linalg.eigh(c @ (some @ some.mH) @ c.mH)
-    lost = torch.cumsum(power.clamp_min(0), 0)  # ascending
-    first = min(int((lost <= plan.left**2 * lost[-1]).sum()), len(lost) - 1)
-    kept = axes[:, first:]
-    return (kept.mH @ c).to(plan.coefficients), kept.to(plan.coefficients)
+    coefficients = plan.coefficients.to(torch.complex128)
+    power, axes = torch.linalg.eigh(
+        coefficients @ (samples @ samples.mH) @ coefficients.mH
+    )
+    omitted = torch.cumsum(power.clamp_min(0), 0)  # ascending
+    first = min(int((omitted <= plan.left**2 * omitted[-1]).sum()), len(omitted) - 1)
+    vectors = axes[:, first:]
+    mixtures = vectors.mH @ coefficients
+    return mixtures.to(plan.coefficients), vectors.to(plan.coefficients)
 
 
 def fields_wide(
     gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """(b, y, x) field of every depth field, or of every mixture (fewer, b) of them, on
-    the window from the light on the
-    grid of the lens, up to a phase of each sample that all share.
+    """(b, y, x) field on the window of every depth field, by three Fourier transforms.
+
+    A phase of each sample, common to all fields, is left out.
 
     Args:
-        gathered: (y, x) light on the grid of the lens.
+        gathered: (y, x) light on the lens grid.
         plan: of :func:`plan_wide`.
+        mixture: (fewer, b) mixtures to propagate in place of the depth fields.
     """
     y, x = plan.axes
     my, mx = plan.case.samples
@@ -603,10 +695,9 @@ def fields_wide(
     count = len(fields)
     out = None if gathered.requires_grad else gathered.new_empty((count, my, mx))
     for start in range(0, count, step):
-        some = slice(start, start + step)
-        light = torch.fft.fft(fields[some] * gathered, n=x.first)[
-            ..., : x.size
-        ].mT  # every transform is along the last
+        chunk = slice(start, start + step)
+        # every transform is along the last axis
+        light = torch.fft.fft(fields[chunk] * gathered, n=x.first)[..., : x.size].mT
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
         light = torch.fft.fft2(light)
         light *= plan.transfer
@@ -619,20 +710,26 @@ def fields_wide(
         if out is None:
             parts.append(field)
         else:
-            out[some] = field
+            out[chunk] = field
     return torch.cat(parts) if out is None else out
 
 
-def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """(depth, y, x) |Σ_b coefficients[depth, b] fields[b]|², some rows at a time."""
-    depths, (count, my, mx) = len(coefficients), fields.shape
+def _mix_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+    """(depth, y, x) irradiance |Σ_b coefficients[depth, b] fields[b]|², by rows.
+
+    Args:
+        fields: (b, y, x) complex.
+        coefficients: (depth, b).
+    """
+    depths = len(coefficients)
+    count, my, mx = fields.shape
     step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
     bands = []
     out = None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
     for start in range(0, my, step):
-        some = fields[:, start : start + step]
+        rows = fields[:, start : start + step]
         field = torch.view_as_real(
-            (coefficients @ some.reshape(count, -1)).view(depths, -1, mx)
+            (coefficients @ rows.reshape(count, -1)).view(depths, -1, mx)
         )
         if out is None:
             bands.append(field.square().sum(-1))

@@ -45,8 +45,8 @@ MOST_NODES = 400
 MOST_TABLE = 4e6
 
 
-# by which the error of a truncated series at the corner of a tile, where a PSF may lie,
-# exceeds its mean
+# ratio of the error of a truncated series at the corner of a tile, where a PSF may lie,
+# to its mean
 EDGE = 8
 
 
@@ -74,8 +74,11 @@ class NodeCounts:
 
 @dataclass(frozen=True, slots=True)
 class WindowLayout:
-    """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
-    sizes: of every tile."""
+    """Nodes and tiles of a windowed propagation.
+
+    nodes: (y, x) over the lens for the whole window. parts: tiles along each axis.
+    sizes: counts of every tile.
+    """
 
     nodes: tuple[int, int]
     parts: int
@@ -84,11 +87,10 @@ class WindowLayout:
 
 @functools.lru_cache(maxsize=1024)
 def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
-    """Nodes over the lens and tiles of the window; None where no cut brings the tables
-    down to some 100 MB.
+    """Nodes over the lens and tiles of the window; None if tables exceed 100 MB.
 
-    The work on the window falls with the tiles along an axis, that of handing light
-    down to them rises: near a quarter of √nodes their sum is least.
+    With more tiles along an axis the work on the window falls, and that of passing
+    light to the tiles rises. Their sum is least for about √nodes / 4 tiles.
 
     Args:
         case: geometry of the propagation.
@@ -100,39 +102,46 @@ def plan_layout(case: PropagationCase, tolerance: float) -> WindowLayout | None:
     """
     nodes = lens_nodes(case, tolerance / 4)
     parts = max(1, round(math.sqrt(max(nodes)) / 4))
-    most = max(case.samples)
+    most_tiles = max(case.samples)
     while True:
-        parts = min(parts, most)
+        parts = min(parts, most_tiles)
         rows = window_tiles(case, parts)[1]
         corners = {
-            _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
+            _mirrored(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
         }
-        sizes = _largest([node_counts(tile, tolerance) for tile in corners])
+        sizes = _largest_counts([node_counts(tile, tolerance) for tile in corners])
         if sizes.table <= MOST_TABLE:
             return WindowLayout(nodes, parts, sizes)
-        if parts in (most, MOST_PARTS):
+        if parts in (most_tiles, MOST_PARTS):
             return None
         parts = min(2 * parts, MOST_PARTS)
 
 
-def _alike(tile: PropagationCase) -> PropagationCase:
-    """The tile, or its mirror image, which needs the same counts, where the source is
-    straight ahead along an axis.
+def _mirrored(tile: PropagationCase) -> PropagationCase:
+    """The tile with its centre mirrored to positive coordinates, along every axis
+    without a source tangent.
+
+    By symmetry the mirror image needs the same counts.
     """
     x, y = (
-        abs(c) if slope == 0 else c
-        for c, slope in zip(tile.centre_um, tile.tangents, strict=True)
+        abs(centre) if tangent == 0 else centre
+        for centre, tangent in zip(tile.centre_um, tile.tangents, strict=True)
     )
     return replace(tile, centre_um=(x, y))
 
 
-def _largest(counts: list[NodeCounts]) -> NodeCounts:
-    """Counts that do for all."""
-    pairs = [
-        tuple(max(getattr(s, name)[i] for s in counts) for i in (0, 1))
+def _largest_counts(counts: list[NodeCounts]) -> NodeCounts:
+    """Elementwise maximum of the counts."""
+    largest_pairs = [
+        tuple(max(getattr(c, name)[i] for c in counts) for i in (0, 1))
         for name in ("nodes", "window", "lens")
     ]
-    return NodeCounts(pairs[0], max(s.directions for s in counts), pairs[1], pairs[2])
+    return NodeCounts(
+        largest_pairs[0],
+        max(c.directions for c in counts),
+        largest_pairs[1],
+        largest_pairs[2],
+    )
 
 
 def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
@@ -143,8 +152,10 @@ def lens_nodes(case: PropagationCase, tolerance: float) -> tuple[int, int]:
         tolerance: relative error of the field.
     """
     high_y, high_x = case.half_size_um
-    rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
-    return rows, _count(
+    rows = _needed_nodes(
+        lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows"
+    )
+    return rows, _needed_nodes(
         lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns"
     )
 
@@ -159,34 +170,55 @@ def node_counts(case: PropagationCase, tolerance: float) -> NodeCounts:
     Raises:
         PropagationError: more than 400 nodes would be needed.
     """
-    share = tolerance / 4
+    quarter = tolerance / 4
     high_y = case.half_size_um[0]
-    nodes = lens_nodes(case, share)
-    low, high = direction_range(case, legendre.mapped_nodes(nodes[0], -high_y, high_y))
-    middle, reach = (low + high) / 2, (high - low) / 2
-    directions = _count(
-        lambda t: _over_directions(case, middle + reach * t), share, "directions"
+    nodes = lens_nodes(case, quarter)
+    row_nodes = legendre.mapped_nodes(nodes[0], -high_y, high_y)
+    low, high = direction_range(case, row_nodes)
+    middle, half_range = (low + high) / 2, (high - low) / 2
+    directions = _needed_nodes(
+        lambda t: _over_directions(case, middle + half_range * t), quarter, "directions"
     )
     wy, wx = case.half_window_um
-    edge = max(share / EDGE, min(share, 1e-13))  # rounding leaves no smaller tails
-    window_x = _count(
-        lambda t: _over_window(case, (low, high), X=t * wx), edge, "window columns"
+    edge_tolerance = max(
+        quarter / EDGE, min(quarter, 1e-13)
+    )  # rounding leaves no smaller tails
+    window_x = _needed_nodes(
+        lambda t: _over_window(case, (low, high), X=t * wx),
+        edge_tolerance,
+        "window columns",
     )
-    window_y = _count(
-        lambda t: _over_window(case, (low, high), Y=t * wy), edge, "window rows"
+    window_y = _needed_nodes(
+        lambda t: _over_window(case, (low, high), Y=t * wy),
+        edge_tolerance,
+        "window rows",
     )
-    lens_p = _count(
-        lambda t: _over_window(case, (low, high), p=middle + reach * t),
-        edge,
+    lens_p = _needed_nodes(
+        lambda t: _over_window(case, (low, high), p=middle + half_range * t),
+        edge_tolerance,
         "correction directions",
     )
-    lens_e = _count(
-        lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows"
+    lens_e = _needed_nodes(
+        lambda t: _over_window(case, (low, high), e=t * high_y),
+        edge_tolerance,
+        "correction rows",
     )
     return NodeCounts(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
-def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
+def _needed_nodes(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
+    """Legendre nodes that interpolate a function on [-1, 1] to a relative tolerance.
+
+    The number of trial nodes is doubled until it suffices.
+
+    Args:
+        lines: (node,) positions to values (line, node).
+        tolerance: relative error of the interpolation.
+        what: name of the axis, for the error.
+
+    Raises:
+        PropagationError: more than 400 nodes.
+    """
     count = 32
     while count <= 1.5 * MOST_NODES:
         needed = legendre.needed_node_count(
@@ -202,24 +234,43 @@ def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
 
 
 def _over_lens(case: PropagationCase, x: Array | None, y: Array | None) -> Array:
-    """(line, node) of the kernel along lens columns (x given) or rows (y given)."""
-    (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
+    """(line, node) kernel along lens columns (``x`` set) or lens rows (``y`` set).
+
+    The lines cover three positions across, window probes, and the two extreme depths.
+
+    Args:
+        case: geometry of the propagation.
+        x, y: (node,) positions on the lens, um; one of them None.
+    """
+    hy, hx = case.half_size_um
+    wy, wx = case.half_window_um
     inverse = np.array(
         [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
     )
-    other = np.array([-0.9, 0.0, 0.9])
+    cross_probes = np.array([-0.9, 0.0, 0.9])
     grid = np.meshgrid(
-        other, probe_positions() * wx, probe_positions() * wy, inverse, indexing="ij"
+        cross_probes,
+        probe_positions() * wx,
+        probe_positions() * wy,
+        inverse,
+        indexing="ij",
     )
-    o, X, Y, v = (g.reshape(-1, 1) for g in grid)
-    return rayleigh_sommerfeld_kernel(
-        case, o * hx if x is None else x, o * hy if y is None else y, X, Y, v
-    )
+    cross, X, Y, v = (g.reshape(-1, 1) for g in grid)
+    if x is None:
+        x = cross * hx
+    if y is None:
+        y = cross * hy
+    return rayleigh_sommerfeld_kernel(case, x, y, X, Y, v)
 
 
 def _over_directions(case: PropagationCase, p: Array) -> Array:
-    """(line, direction) of the window kernel along p at fixed lens rows."""
-    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    """(line, direction) kernel from a lens row to a window point, along the direction
+    cosine p.
+
+    The lines cover three lens rows and the window probes.
+    """
+    hy, _ = case.half_size_um
+    wy, wx = case.half_window_um
     grid = np.meshgrid(
         np.array([-0.9, 0.0, 0.9]) * hy,
         probe_positions() * wx,
@@ -235,24 +286,32 @@ def _over_directions(case: PropagationCase, p: Array) -> Array:
 def _over_window(
     case: PropagationCase, span: tuple[float, float], **line: Array
 ) -> Array:
-    """(line, node) of the correction along one of X, Y, p, e, the others on a few
-    probes.
+    """(line, node) residual of the plane waves along one of X, Y (window), p
+    (direction), e (lens row).
+
+    Args:
+        case: geometry of the propagation.
+        span: lowest and highest p.
+        line: (node,) values of the one variable; the others take a few probe values.
     """
-    (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
+    hy, _ = case.half_size_um
+    wy, wx = case.half_window_um
     low, high = span
-    middle, reach = (low + high) / 2, (high - low) / 2
+    middle, half_range = (low + high) / 2, (high - low) / 2
     probes = {
         "X": probe_positions() * wx,
         "Y": probe_positions() * wy,
-        "p": middle + reach * probe_positions(),
+        "p": middle + half_range * probe_positions(),
         "e": probe_positions() * hy,
     }
     names = [n for n in probes if n not in line]
     grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
-    at: dict[str, Any] = {
+    positions: dict[str, Any] = {
         n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)
     } | line
-    return plane_wave_residual(case, at["p"], at["e"], at["X"], at["Y"])
+    return plane_wave_residual(
+        case, positions["p"], positions["e"], positions["X"], positions["Y"]
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -305,15 +364,17 @@ def depth_basis(
     *,
     moving: bool = False,
 ) -> DepthBasis:
-    """Few fields that span the curvatures of all depths.
+    """Orthonormal basis of the lens fields exp(i k (s_z - s_ref)) of all depths, by a
+    truncated SVD.
 
-    With ``moving`` they also span the derivatives in inverse depth and tangents.
-    Orthonormal under the quadrature of
-    the nodes; truncated at ``tolerance`` root mean square.
+    Orthonormal under the quadrature of the nodes. With ``moving`` the basis also spans
+    the derivatives in inverse depth and tangents.
 
     Args:
         case: geometry of the propagation.
         nodes_um: (e,) and (x,) positions on the lens.
+        tolerance: relative root mean square error of the truncation.
+        moving: whether derivatives are included.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(
@@ -324,80 +385,90 @@ def depth_basis(
     )
     inverse = np.array(case.inverse_depths_per_um)
     count = 48
-    # until the rank says that no depth lies between the nodes: they need pi a period,
-    # the fields two
+    # Depth nodes are doubled until the rank shows that they resolve all depths: nodes
+    # need pi a period, the fields two.
     while True:
-        few = len(inverse) > count
-        training = (
-            np.clip(legendre.mapped_nodes(count, inverse.min(), inverse.max()), 0, None)
-            if few
-            else inverse
-        )
-        fields = (
-            np.exp(
-                1j * depth_factors(case, e, x, case.tangents, training[:, None, None])
-            )
-            * weight
-        )
+        is_sampled = len(inverse) > count
+        samples = inverse
+        if is_sampled:
+            samples = legendre.mapped_nodes(count, inverse.min(), inverse.max())
+            samples = np.clip(samples, 0, None)
+        samples = samples[:, None, None]
+        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, samples)) * weight
         if moving:
-            fields = np.concatenate(
-                [fields, *_tangents(case, e, x, training[:, None, None], fields)]
-            )
-        _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
-        tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
+            derivatives = _depth_derivatives(case, e, x, samples, fields)
+            fields = np.concatenate([fields, *derivatives])
+        _, singular, right = np.linalg.svd(
+            fields.reshape(len(fields), -1), full_matrices=False
+        )
+        tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1] / (singular**2).sum())
         rank = int(max(1, (tail > tolerance).sum()))
-        if not few or rank <= 2 / np.pi * count:
+        if not is_sampled or rank <= 2 / np.pi * count:
             break
         count *= 2
-    basis = v[:rank].reshape(rank, len(e), len(x))
+    basis = right[:rank].reshape(rank, len(e), len(x))
     coefficients = np.empty((len(inverse), rank), complex)
     for start in range(0, len(inverse), 16):
-        part = inverse[start : start + 16, None, None]
-        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
+        chunk = inverse[start : start + 16, None, None]
+        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, chunk)) * weight
         coefficients[start : start + 16] = (
-            fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
+            fields.reshape(len(chunk), -1) @ basis.reshape(rank, -1).conj().T
         )
     return DepthBasis(
-        np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
+        np.asarray(basis / weight),
+        coefficients,
+        np.asarray(singular[:rank] / singular[0]),
     )
 
 
-def _tangents(
+def _depth_derivatives(
     case: PropagationCase, e: Array, x: Array, inverse: Array, fields: Array
 ) -> list[Array]:
-    """Derivatives of the depth fields in inverse depth and the tangents, each of the
-    fields' own norm; complex step.
+    """Derivatives of the depth fields in inverse depth and both tangents, by the
+    complex step.
+
+    Each is scaled to the norm of the fields; those that vanish are left out.
+
+    Args:
+        case: geometry of the propagation.
+        e, x: (e, 1) and (x,) positions on the lens, um.
+        inverse: (depth, 1, 1) inverse depths, 1/um.
+        fields: (depth, e, x).
     """
-    out = []
-    h = 1e-30
-    for step in ((0, 0, 1j * h), (1j * h, 0, 0), (0, 1j * h, 0)):
+    derivatives = []
+    tiny = 1e-30
+    for step in ((0, 0, 1j * tiny), (1j * tiny, 0, 0), (0, 1j * tiny, 0)):
         tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
         slope = (
             case.wavenumber
             * from_source(case, x, e, tangents, inverse + step[2]).imag
-            / h
+            / tiny
         )
         slope = np.broadcast_to(slope, fields.shape)
         scale = np.sqrt(
             (np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum()
         )
         if scale > 0:
-            out.append(1j * slope / scale * fields)
-    return out
+            derivatives.append(1j * slope / scale * fields)
+    return derivatives
 
 
 def significant_pairs(strength: Array, size: Array, tolerance: float) -> Array:
-    """(2, n) pairs (correction term, depth field) whose joint strength matters; the
-    rest sums below tolerance.
+    """(2, n) pairs (correction term, depth field) with a significant product of
+    strengths.
+
+    The omitted pairs sum to less than the tolerance, root mean square.
 
     Args:
-        size: strengths of the depth fields.
+        strength: (r,) of the correction terms.
+        size: (b,) of the depth fields.
+        tolerance: relative, in the root mean square.
     """
     joint = (np.outer(strength, size) ** 2).ravel()
     order = np.argsort(joint)
-    least = np.cumsum(joint[order]) <= tolerance**2 * joint.sum()
-    kept = np.sort(order[~least])
-    return np.stack(np.unravel_index(kept, (len(strength), len(size))))
+    negligible = np.cumsum(joint[order]) <= tolerance**2 * joint.sum()
+    significant = np.sort(order[~negligible])
+    return np.stack(np.unravel_index(significant, (len(strength), len(size))))
 
 
 def build_operators(
@@ -407,22 +478,26 @@ def build_operators(
     *,
     slope: int | None = None,
 ) -> TileOperators:
-    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
-    window centre x, y instead.
+    """Operators of a tile: lens nodes to directions, and directions to the window.
+
+    With ``slope`` 0, 1, 2 they give the derivative in sensor distance, window centre x,
+    y.
 
     Args:
-        case: geometry of the propagation.
+        case: geometry of the tile.
         chosen: counts of nodes and directions.
         tolerance: relative error of the field.
+        slope: derivative to compute; None: the field.
     """
-    (ny, nx), m = chosen.nodes, chosen.directions
+    ny, nx = chosen.nodes
+    directions = chosen.directions
     high_y, high_x = case.half_size_um
     e = legendre.mapped_nodes(ny, -high_y, high_y)
     x = legendre.mapped_nodes(nx, -high_x, high_x)
     low, high = direction_range(case, e)
-    p = legendre.mapped_nodes(m, low, high)
-    far = (e - case.centre_um[1])[:, None]
-    towards = ray_cosines(case, x - case.centre_um[0], far)
+    p = legendre.mapped_nodes(directions, low, high)
+    row_offset = (e - case.centre_um[1])[:, None]
+    cosines = ray_cosines(case, x - case.centre_um[0], row_offset)
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = cosine_y(case, p[:, None], e[None, :])
@@ -431,7 +506,7 @@ def build_operators(
     )
     return TileOperators(
         to_directions=legendre.interpolation_matrix(
-            m, (2 * towards - low - high) / (high - low)
+            directions, (2 * cosines - low - high) / (high - low)
         ),
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
         along_x=np.exp(-1j * k * x_um[:, None] * p),
@@ -446,22 +521,38 @@ def _low_rank(
     chosen: NodeCounts,
     tolerance: float,
     span: tuple[float, float],
-    slope: int | None,
+    derivative: int | None,
 ) -> tuple[Array, Array, Array]:
-    """Correction as Σ_r lens_terms[p, e, r] window_terms[X, Y, r], pillar area
-    included; and strengths (r,).
+    """Low-rank factors of the correction times the pillar area: Σ_r lens_terms[p, e, r]
+    window_terms[X, Y, r].
+
+    The correction is tabulated on small Legendre grids, factorised, and interpolated.
+
+    Args:
+        case: geometry of the propagation.
+        chosen: counts of the grids.
+        tolerance: relative error in the Frobenius norm.
+        span: lowest and highest direction cosine p.
+        derivative: 0, 1, 2 for that in sensor distance, window centre x, y; or None.
+
+    Returns:
+        lens_terms (p, e, r), window_terms (X, Y, r) and strengths (r,).
     """
-    (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
-    (my, mx), (me, mp) = chosen.window, chosen.lens
+    wy, wx = case.half_window_um
+    hy, _ = case.half_size_um
+    my, mx = chosen.window
+    me, mp = chosen.lens
     Y = legendre.mapped_nodes(my, -wy, wy)
     X = legendre.mapped_nodes(mx, -wx, wx)
     e = legendre.mapped_nodes(me, -hy, hy)
     p = legendre.mapped_nodes(mp, *span)
-    at = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
-    table = plane_wave_residual(case, *at)
-    if slope is not None:
-        table = table * kernel_derivatives(case, *at)[slope]
-    left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
+    positions = (p[:, None], e[None, :], X[:, None, None], Y[:, None, None, None])
+    table = plane_wave_residual(case, *positions)
+    if derivative is not None:
+        table = table * kernel_derivatives(case, *positions)[derivative]
+    left, right = _randomized_svd(
+        table.reshape(my * mx, mp * me) * case.area_um2, tolerance
+    )
     y_um, x_um = case.window_um
     Iy = legendre.interpolation_matrix(my, y_um / wy)
     Ix = legendre.interpolation_matrix(mx, x_um / wx)
@@ -478,15 +569,22 @@ def _low_rank(
     return lens_terms, window_terms, np.linalg.norm(left, axis=0)
 
 
-def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
-    """table ≈ left (row, r) @ right (r, column) within ``tolerance`` in the Frobenius
-    norm; randomised range finder.
+def _randomized_svd(table: Array, tolerance: float) -> tuple[Array, Array]:
+    """Factors of table ≈ left (row, r) @ right (r, column), by a randomised SVD.
+
+    The range is sampled with random vectors, doubled in number until they capture it.
+
+    Args:
+        table: (row, column).
+        tolerance: relative error in the Frobenius norm.
     """
-    random = np.random.default_rng(0)
+    generator = np.random.default_rng(0)
     total = np.linalg.norm(table)
     rank = min(16, *table.shape)
     while True:
-        left = np.linalg.qr(table @ random.standard_normal((table.shape[1], rank)))[0]
+        left = np.linalg.qr(table @ generator.standard_normal((table.shape[1], rank)))[
+            0
+        ]
         right = left.conj().T @ table
         if (
             rank == min(table.shape)
@@ -494,22 +592,21 @@ def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
         ):
             break
         rank = min(2 * rank, *table.shape)
-    u, size, v = np.linalg.svd(right, full_matrices=False)
-    tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1]) / total
-    keep = int(max(1, (tail > tolerance).sum()))
-    return left @ u[:, :keep] * size[:keep], v[:keep]
+    u, singular, v = np.linalg.svd(right, full_matrices=False)
+    tail = np.sqrt(np.cumsum(singular[::-1] ** 2)[::-1]) / total
+    needed = int(max(1, (tail > tolerance).sum()))
+    return left @ u[:, :needed] * singular[:needed], v[:needed]
 
 
-SMOOTH = (
-    4,
-    2,
-)  # nodes more over the lens, and in a block, where light is multiplied by such factors there
+# additional nodes over the lens, and in a block, where smooth factors (``Pupils``)
+# multiply the light
+SMOOTH = (4, 2)
 
 
-MORE = 8  # orders of the moments beyond those used, for the posterior error
+MORE = 8  # additional orders of the moments, for the posterior error
 
 
-BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
+BUDGET_BYTES = 8e6  # of the operands of one product: larger blocks leave the cache
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -518,7 +615,7 @@ class WindowPlan:
 
     The moments go ``MORE`` orders beyond what the method uses, for the error estimate.
     tensors: the operators, those of the tiles stacked (tile, …); ``turn`` (tile, e, x)
-    is the phase from the window's centre to the tile's own on the nodes of the whole
+    is the phase between the window's centre and the tile's, on the nodes of the whole
     window.
     """
 
@@ -542,8 +639,8 @@ class WindowPlan:
 
     @property
     def judged_um(self) -> tuple[Array, Array]:
-        """(e,), (x,) positions of the nodes that its moments stand for, ``MORE`` than
-        those.
+        """(e,), (x,) positions of the nodes of all its moments, ``MORE`` than for the
+        whole window.
         """
         ny, nx = self.layout.nodes
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
@@ -551,9 +648,11 @@ class WindowPlan:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MovingGeometry:
-    """Geometry that carries gradients, float64 tensors: tangents (2,), inverse depths
-    (depth,), sensor distance (),
-    window centre (2,). Values must be those of the plan's case."""
+    """Geometry that carries gradients, float64 tensors.
+
+    tangents: (2,). inverse_depths: (depth,), 1/um. distance: (), um. centre: (2,) of
+    the window, um. Values must equal those of the plan's case.
+    """
 
     tangents: torch.Tensor
     inverse_depths: torch.Tensor
@@ -570,7 +669,7 @@ def plan_window(
     *,
     smooth: bool = False,
 ) -> WindowPlan:
-    """Plan a windowed propagation; those used last are kept.
+    """Plan of a windowed propagation; the last 64 are cached.
 
     Args:
         case, tolerance: geometry, and relative error of the field.
@@ -603,7 +702,7 @@ def plan_window(
         depths = depth_basis(
             case, _nodes_um(case, layout.sizes.nodes), tolerance / 2, moving=moving
         )
-        tensors = _shared(case, layout, depths) | _stacked(
+        tensors = _window_tensors(case, layout, depths) | _tile_tensors(
             case, layout, depths, tolerance
         )
     return WindowPlan(case, tolerance, layout, depths, pillars, tensors)
@@ -627,76 +726,97 @@ def legendre_bases(
 
 
 def _nodes_um(case: PropagationCase, counts: tuple[int, int]) -> tuple[Array, Array]:
-    hy, hx = case.half_size_um
-    return np.asarray(legendre.mapped_nodes(counts[0], -hy, hy)), np.asarray(
-        legendre.mapped_nodes(counts[1], -hx, hx)
+    """(e,), (x,) positions of Legendre nodes on the lens, um; counts: (y, x)."""
+    e, x = (
+        np.asarray(legendre.mapped_nodes(count, -half_um, half_um))
+        for count, half_um in zip(counts, case.half_size_um, strict=True)
     )
+    return e, x
 
 
-def _shared(
+def _window_tensors(
     case: PropagationCase, layout: WindowLayout, depths: DepthBasis
 ) -> dict[str, torch.Tensor]:
-    """Moments to the nodes of the window, those to the nodes of the tiles, and the
-    depths.
+    """Tensors of the whole window, complex128.
+
+    ``rows_to_nodes``, ``columns_to_nodes``: moments to window nodes. ``rows_to_tile``,
+    ``columns_to_tile``: window nodes to tile nodes. ``turn``: phases of the tiles.
+    ``basis``, ``coefficients``: of the depths.
     """
     arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
-    for name, all_, few in zip(
+    for name, window_count, tile_count in zip(
         ("rows", "columns"), layout.nodes, layout.sizes.nodes, strict=True
     ):
-        arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
+        arrays[f"{name}_to_nodes"] = legendre.to_nodes(window_count)
         arrays[f"{name}_to_tile"] = legendre.interpolation_matrix(
-            few, legendre.gauss_legendre_nodes(all_)[0]
+            tile_count, legendre.gauss_legendre_nodes(window_count)[0]
         )
     e, x = _nodes_um(case, layout.nodes)
     parts = [part for row in window_tiles(case, layout.parts)[1] for part in row]
-    away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
-    arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
+    paths = [to_sensor(one_case, x, e[:, None]) for one_case in (case, *parts)]
+    arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(paths[1:]) - paths[0]))
     return {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
 
 
-def _stacked(
+def _tile_tensors(
     case: PropagationCase,
     layout: WindowLayout,
     depths: DepthBasis,
     tolerance: float,
     slope: int | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any
-    of them needs; ``fields`` are
-    the depth fields of the pairs."""
-    parts = [part for row in window_tiles(case, layout.parts)[1] for part in row]
+    """Operators of all tiles, stacked (tile, …), for all significant pairs.
+
+    A pair is a correction term and a depth field. ``fields`` holds the depth field of
+    each pair.
+
+    Args:
+        case: geometry of the propagation.
+        layout: tiles and counts.
+        depths: basis of the depth fields.
+        tolerance: relative error of the field.
+        slope: as for :func:`build_operators`.
+    """
+    tiles = [tile for row in window_tiles(case, layout.parts)[1] for tile in row]
     operators = [
-        build_operators(part, layout.sizes, tolerance, slope=slope) for part in parts
+        build_operators(tile, layout.sizes, tolerance, slope=slope) for tile in tiles
     ]
-    most = max(len(one.strength) for one in operators)
-    strength = np.max([_padded(one.strength, most) for one in operators], axis=0)
-    kept = significant_pairs(strength, depths.strength, tolerance / 2)
+    terms = max(len(operator.strength) for operator in operators)
+    strength = np.max(
+        [_padded(operator.strength, terms) for operator in operators], axis=0
+    )
+    pairs = significant_pairs(strength, depths.strength, tolerance / 2)
     arrays = {
-        name: np.stack([getattr(one, name) for one in operators])
+        name: np.stack([getattr(operator, name) for operator in operators])
         for name in ("along_y", "along_x")
     }
     for name in ("lens_terms", "window_terms"):
         arrays[name] = np.stack(
-            [_padded(getattr(one, name), most)[..., kept[0]] for one in operators]
+            [
+                _padded(getattr(operator, name), terms)[..., pairs[0]]
+                for operator in operators
+            ]
         )
-    out = {name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()}
-    directions = np.concatenate([one.to_directions for one in operators])
-    out["to_directions"] = torch.tensor(directions)
-    out["fields"] = torch.tensor(kept[1])
-    return out
+    tensors = {
+        name: torch.tensor(a, dtype=torch.complex128) for name, a in arrays.items()
+    }
+    to_directions = np.concatenate([operator.to_directions for operator in operators])
+    tensors["to_directions"] = torch.tensor(to_directions)
+    tensors["fields"] = torch.tensor(pairs[1])
+    return tensors
 
 
 def _padded(array: Array, count: int) -> Array:
-    """With zeros to ``count`` along the last axis."""
+    """Array with zeros appended to ``count`` along the last axis."""
     return np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count - array.shape[-1])])
 
 
-def _slope(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
+def _derivative_tensors(plan: WindowPlan, axis: int) -> dict[str, torch.Tensor]:
     """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2);
-    kept with the plan.
+    cached in the plan.
     """
     if axis not in plan.slopes:
-        plan.slopes[axis] = _stacked(
+        plan.slopes[axis] = _tile_tensors(
             plan.case, plan.layout, plan.depths, plan.tolerance, axis
         )
     return plan.slopes[axis]
@@ -720,29 +840,34 @@ def light_windowed(
     moving: MovingGeometry | None,
     pupils: Pupils | None,
 ) -> tuple[torch.Tensor, Array, list[float]]:
-    """Irradiance on the window (depth, y, x); light of every map on the nodes of the
-    posterior error; sums of squares of the transmissions.
-
-    Differentiable once in the maps, and in ``moving`` where given.
+    """Irradiance on the window, Σ_c sign_c |field_c|², differentiable once.
 
     Args:
-        maps: (map, y, x) phase and transmission. plan: of :func:`plan_window`.
-        moving: geometry with gradients. pupils: factors on the light of the maps, for a
-            plan made ``smooth``; None for the |U|² of one map.
+        maps: (map, y, x) phase in rad, and transmission.
+        plan: of :func:`plan_window`.
+        moving: geometry with gradients, or None.
+        pupils: factors on the light of the maps, for a ``smooth`` plan; None for the
+            |U|² of one map.
+
+    Returns:
+        Irradiance (depth, y, x); light of every map on the nodes of the posterior
+        error; sums of squares of the transmissions.
     """
     reduced = [
-        reduce_to_moments(p, t, plan.moments) for p, t in zip(*maps, strict=True)
+        reduce_to_moments(phase, transmission, plan.moments)
+        for phase, transmission in zip(*maps, strict=True)
     ]
-    moments = torch.stack([m for m, _ in reduced])
+    moments = torch.stack([one_map for one_map, _ in reduced])
     powers = [power for _, power in reduced]
     parts = mix_components(_on_nodes(moments, plan), pupils, plan.whole_um)
     total: Any = 0
     for sign, light in parts:
         field = _from_nodes(light, plan, moving)
         total = total + sign * (field.real**2 + field.imag**2)
-    fine, (m, n) = moments.detach().numpy(), moments.shape[-2:]
+    m, n = moments.shape[-2:]
     with one_blas_thread():
-        return total, legendre.to_nodes(m).T @ fine @ legendre.to_nodes(n), powers
+        rows, columns = legendre.to_nodes(m).T, legendre.to_nodes(n)
+        return total, rows @ moments.detach().numpy() @ columns, powers
 
 
 def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
@@ -758,24 +883,34 @@ def _on_nodes(gathered: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
 def _from_nodes(
     light: torch.Tensor, plan: WindowPlan, moving: MovingGeometry | None
 ) -> torch.Tensor:
-    """(depth, y, x) field on the window from the light on its nodes."""
-    t = plan.tensors
-    fewer = t["rows_to_tile"].T @ (light * t["turn"]) @ t["columns_to_tile"]
-    coefficients = t["coefficients"] if moving is None else _coefficients(plan, moving)
-    given = fewer[:, None] * t["basis"]
-    field = _at_depths(zoom_to_tiles(given, t), coefficients)
+    """(depth, y, x) field on the window from the light on the window's lens nodes.
+
+    Args:
+        light: (e, x) complex.
+        plan: of :func:`plan_window`.
+        moving: geometry with gradients, or None.
+    """
+    tensors = plan.tensors
+    tile_light = (
+        tensors["rows_to_tile"].T
+        @ (light * tensors["turn"])
+        @ tensors["columns_to_tile"]
+    )
+    coefficients = (
+        tensors["coefficients"] if moving is None else _depth_coefficients(plan, moving)
+    )
+    fields = tile_light[:, None] * tensors["basis"]
+    field = _at_depths(zoom_to_tiles(fields, tensors), coefficients)
     if moving is not None:
-        for axis, value in enumerate(
-            (moving.distance, moving.centre[0], moving.centre[1])
-        ):
+        values = (moving.distance, moving.centre[0], moving.centre[1])
+        for axis, value in enumerate(values):
             if value.requires_grad:
                 rate = _at_depths(
-                    zoom_to_tiles(given, _slope(plan, axis)), coefficients
+                    zoom_to_tiles(fields, _derivative_tensors(plan, axis)), coefficients
                 )
-                field = (
-                    field + (value - value.detach()) * rate
-                )  # adds nothing but the derivative
-    return _joined(field, plan)
+                # adds nothing but the derivative
+                field = field + (value - value.detach()) * rate
+    return _join_tiles(field, plan)
 
 
 def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
@@ -783,12 +918,14 @@ def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor
     return (fields @ coefficients.T).permute(0, 3, 2, 1)
 
 
-def _joined(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
-    """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where
-    the next one begins.
+def _join_tiles(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
+    """(depth, y, x) field of the window from its overlapping tiles (tile, depth, Y, X).
+
+    Each tile is cut where the next one begins.
     """
     (rows, columns), _ = window_tiles(plan.case, plan.layout.parts)
-    (my, mx), n = plan.case.samples, len(columns)
+    my, mx = plan.case.samples
+    n = len(columns)
     heights = np.diff([*rows, my]).tolist()
     widths = np.diff([*columns, mx]).tolist()
     bands = [
@@ -800,8 +937,12 @@ def _joined(field: torch.Tensor, plan: WindowPlan) -> torch.Tensor:
     return torch.cat(bands, -2)
 
 
-def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
-    """(depth, b) of the depth basis, differentiable in the source's position."""
+def _depth_coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
+    """(depth, b) coefficients of the depth basis, differentiable in the source's
+    position.
+
+    Projections of exp(i depth factors) on the basis, under the quadrature of the nodes.
+    """
     e, x = (torch.tensor(v) for v in plan.nodes_um)
     ny, nx = plan.layout.sizes.nodes
     inverse = moving.inverse_depths[:, None, None]
@@ -818,44 +959,50 @@ def _coefficients(plan: WindowPlan, moving: MovingGeometry) -> torch.Tensor:
 
 
 def zoom_to_tiles(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Light on the lens nodes, a field for every tile and basis function (tile, b, e,
-    x), to (tile, X, Y, b).
+    """Propagate fields on the lens nodes to the window of their tile: (tile, b, e, x)
+    to (tile, X, Y, b).
+
+    Columns x are interpolated to directions p. Then each pair of a correction term and
+    a depth field is summed over p and e with its plane waves.
 
     Args:
-        light: (..., y, x) irradiance.
+        light: (tile, b, e, x) complex; b counts the depth fields.
+        t: tensors of the tiles.
     """
-    count, b, e, _ = light.shape
-    p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]
-    real = (
-        torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
+    tiles, b, e, _ = light.shape
+    p = t["to_directions"].shape[2]
+    X, Y = t["window_terms"].shape[1:3]
+    parts = (
+        torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(tiles * e, 2 * b, -1)
     )
     cosines = (
-        torch.bmm(real, t["to_directions"])
-        .view(count, e, b, 2, p)
+        torch.bmm(parts, t["to_directions"])
+        .view(tiles, e, b, 2, p)
         .permute(0, 4, 1, 2, 3)
         .contiguous()
     )
     spread = torch.view_as_complex(cosines)
     pairs = len(t["fields"])
-    many = max(
-        1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size()))
-    )  # pairs of one tile at once
-    step, few = min(pairs, many), max(1, many // pairs)
-    found = []
-    for first in range(0, count, few):
-        tile = slice(first, first + few)
-        out = light.new_zeros((len(spread[tile]), X, Y, b))
-        for start in range(0, pairs, step):
-            fields = t["fields"][start : start + step]
-            terms = t["lens_terms"][tile, ..., start : start + step] * spread[
+    pairs_at_once = max(1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size())))
+    pair_step = min(pairs, pairs_at_once)
+    tiles_at_once = max(1, pairs_at_once // pairs)
+    windows = []
+    for first in range(0, tiles, tiles_at_once):
+        tile = slice(first, first + tiles_at_once)
+        window = light.new_zeros((len(spread[tile]), X, Y, b))
+        for start in range(0, pairs, pair_step):
+            fields = t["fields"][start : start + pair_step]
+            terms = t["lens_terms"][tile, ..., start : start + pair_step] * spread[
                 tile
             ].index_select(3, fields)
             columns = t["along_y"][tile].flatten(0, 1) @ terms.flatten(0, 1)
-            window = (t["along_x"][tile] @ columns.view(len(out), p, -1)).view(
-                len(out), X, Y, -1
+            contribution = (t["along_x"][tile] @ columns.view(len(window), p, -1)).view(
+                len(window), X, Y, -1
             )
-            out = out.index_add(
-                3, fields, window * t["window_terms"][tile, ..., start : start + step]
+            window = window.index_add(
+                3,
+                fields,
+                contribution * t["window_terms"][tile, ..., start : start + pair_step],
             )
-        found.append(out)
-    return torch.cat(found)
+        windows.append(window)
+    return torch.cat(windows)

@@ -124,14 +124,17 @@ def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
     """
     area = frame.along * frame.across / (2 if frame.centred else 1)
     radius = harmonics / np.sqrt(area)
-    most = radius * (1 + 1e-9)
-    reach = (int(most * frame.along), int(most * frame.across))
+    radius_rounded_up = radius * (1 + 1e-9)
+    reach = (
+        int(radius_rounded_up * frame.along),
+        int(radius_rounded_up * frame.across),
+    )
     spans = (np.arange(-r, r + 1) for r in reach)
     m, n = (a.ravel() for a in np.meshgrid(*spans, indexing="ij"))
-    keep = (m / frame.along) ** 2 + (n / frame.across) ** 2 <= radius**2 * (1 + 1e-9)
+    inside = (m / frame.along) ** 2 + (n / frame.across) ** 2 <= radius**2 * (1 + 1e-9)
     if frame.centred:
-        keep &= (m + n) % 2 == 0
-    m, n = m[keep], n[keep]
+        inside &= (m + n) % 2 == 0
+    m, n = m[inside], n[inside]
     ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
     links = tuple(
         _link(rows, columns, frame.operations, reach)
@@ -143,17 +146,24 @@ def reduced_orders(harmonics: float, frame: LatticeFrame) -> ReducedOrders:
 def _reduced(
     m: Array, n: Array, operations: tuple[Operation, ...], field: int
 ) -> OrderSet:
-    """One order of each orbit, without those that an operation maps to themselves with
-    the field reversed: they vanish.
+    """One order of each orbit under the symmetry operations.
+
+    Orders vanish, and are left out, if an operation maps them to themselves with the
+    field reversed.
+
+    Args:
+        m, n: (k,) all orders.
+        operations: symmetries.
+        field: 0 to 3 for Ex, Ey, Ez, Hz.
     """
     images = np.stack([(sx * m) * 4096 + sy * n for sx, sy, _ in operations])
-    own = images[0]
+    codes = images[0]
     signs = tuple(sign[field] for _, _, sign in operations)
-    first = own == images.max(axis=0)
-    vanishes = ((images == own) & (np.array(signs)[:, None] < 0)).any(axis=0)
-    keep = first & ~vanishes
-    size = np.array([len(set(column)) for column in images[:, keep].T], int)
-    return OrderSet(m[keep], n[keep], size, signs)
+    first = codes == images.max(axis=0)
+    vanishes = ((images == codes) & (np.array(signs)[:, None] < 0)).any(axis=0)
+    retained = first & ~vanishes
+    size = np.array([len(set(column)) for column in images[:, retained].T], int)
+    return OrderSet(m[retained], n[retained], size, signs)
 
 
 def _link(
@@ -162,7 +172,12 @@ def _link(
     operations: tuple[Operation, ...],
     reach: tuple[int, int],
 ) -> tuple[Array, Array]:
-    """How a function that all operations leave as it is couples two sets."""
+    """Coupling of two order sets by a function with all symmetries.
+
+    Returns:
+        (k, l, operations) places in the flat table of its Fourier coefficients, and
+        their weights.
+    """
     dm, dn = (
         np.stack([row[:, None] - s * column for s in flips], axis=-1)
         for row, column, flips in (
@@ -214,7 +229,10 @@ class PlaneWaves:
 
 
 def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> PlaneWaves:
-    """p and s waves around the zero order.
+    """p and s waves of the reduced orders, around the zero order.
+
+    k = k_tangential + (m λ / px, n λ / py) over k0. A p wave has its electric field
+    along k, an s wave across it. ``fold`` maps their amplitudes to Ex and Ey.
 
     Args:
         space: reduced orders. cell: its lattice gives the steps of k.
@@ -226,8 +244,8 @@ def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> Plan
     ex, ey, ez, hz = (s.has_zero for s in (space.ex, space.ey, space.ez, space.hz))
     along_y = 0
     if light.normal:
-        fits = not (ez and not ex) and not (hz and not ey)
-        along_y = int(not fits or not (ez or hz or ex))
+        x_fits = not (ez and not ex) and not (hz and not ey)
+        along_y = int(not x_fits or not (ez or hz or ex))
     p_in, s_in = (ey, ex) if along_y else (ex, ey)
     bare_p = int(light.normal and p_in and not ez)
     bare_s = int(light.normal and s_in and not hz)
@@ -241,16 +259,18 @@ def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> Plan
     wavelength = light.wavelength_um
     k = np.stack([light.kx + wavelength / px * m, light.ky + wavelength / py * n])
     kappa = np.hypot(*k)
-    turn = light.azimuth_rad + along_y * math.pi / 2
-    straight = np.array([round(math.cos(turn), 15), round(math.sin(turn), 15)])[:, None]
-    along = np.where(kappa > 0, k / np.where(kappa > 0, kappa, 1.0), straight)
+    zero_azimuth = light.azimuth_rad + along_y * math.pi / 2
+    zero_direction = np.array(
+        [round(math.cos(zero_azimuth), 15), round(math.sin(zero_azimuth), 15)]
+    )[:, None]
+    along = np.where(kappa > 0, k / np.where(kappa > 0, kappa, 1.0), zero_direction)
     is_p = np.arange(len(m)) < p_count
     e = np.where(is_p, along, np.stack([-along[1], along[0]]))
 
-    def placed(rows: OrderSet) -> Array:
+    def selects(rows: OrderSet) -> Array:
         return np.asarray((rows.m[:, None] == m) & (rows.n[:, None] == n), float)
 
-    fold = np.concatenate([placed(space.ex) * e[0], placed(space.ey) * e[1]])
+    fold = np.concatenate([selects(space.ex) * e[0], selects(space.ey) * e[1]])
     zero: dict[int, tuple[int, float]] = {}
     for place in np.flatnonzero((m == 0) & (n == 0)).tolist():
         if light.normal:
@@ -262,7 +282,7 @@ def plane_waves(space: ReducedOrders, cell: Cell, light: TangentialWave) -> Plan
 
 
 def normal_component(kappa: Array, index: complex) -> Array:
-    """kz / k0 = sqrt(n^2 - kappa^2) of outgoing or decaying waves (imaginary part >= 0).
+    """kz / k0 = sqrt(n^2 - kappa^2) of outgoing or decaying waves, Im(kz) >= 0.
 
     Args:
         kappa: (n,) |k| / k0. index: refractive index n of the medium.
@@ -273,7 +293,7 @@ def normal_component(kappa: Array, index: complex) -> Array:
 
 
 def half_space(waves: PlaneWaves, index: complex) -> tuple[Array, Array]:
-    """(u, w) of outgoing waves of unit electric amplitude; (u, -w) are the incoming ones.
+    """(u, w) of outgoing waves of unit electric amplitude; incoming waves have (u, -w).
 
     Args:
         waves: p and s waves. index: refractive index of the half-space.

@@ -135,25 +135,30 @@ class _Stack:
         return np.asarray(np.searchsorted(self.ends, self.k0 * z_um + on, "right"))
 
     def points(self, grid: FieldGrid) -> list[tuple[Array, Array | None]]:
-        """For substrate, slabs and cover: eps (ny, nx), and N n n^T of (2) as (xx, yy,
-        xy), None where it is homogeneous.
+        """Permittivity and normal field on the grid, for substrate, slabs and cover.
+
+        For each, eps (ny, nx), and N n n^T of (2) as (xx, yy, xy); None for a
+        homogeneous slab.
         """
         cell, media = self.problem.cell, self.problem.media
         y, x = np.meshgrid(grid.y_um, grid.x_um, indexing="ij")
-        found: list[tuple[Array, Array | None]] = []
-        ends = _Slab(media.substrate, None, 0.0), _Slab(media.cover, None, 0.0)
-        for slab in (ends[0], *self.slabs, ends[1]):
+        tables: list[tuple[Array, Array | None]] = []
+        half_spaces = _Slab(media.substrate, None, 0.0), _Slab(media.cover, None, 0.0)
+        for slab in (half_spaces[0], *self.slabs, half_spaces[1]):
             if slab.section is None:
-                found.append((np.full(x.shape, slab.index**2, complex), None))
+                tables.append((np.full(x.shape, slab.index**2, complex), None))
                 continue
             normal = normals_at(slab.section.outlines, cell, x, y)
-            found.append((permittivity_at(slab.section, cell, x, y), normal))
-        return found
+            tables.append((permittivity_at(slab.section, cell, x, y), normal))
+        return tables
 
 
 def _stack(problem: CellProblem, steps: int) -> _Stack:
-    """Films under the pillar, sections from the foot up, films over it; a tilted wall
-    in equal steps.
+    """Slabs of a cell, foot first: films under the pillar, its sections, films over it.
+
+    Args:
+        problem: cell and light.
+        steps: of the staircase of a tilted wall.
     """
     cell, wavelength_um = problem.cell, problem.light.wavelength_um
     k0, media = 2 * math.pi / wavelength_um, problem.media
@@ -205,7 +210,8 @@ def near_fields(
     Accuracy: ``error`` is 2.5 times the largest change from the four truncations before
         the last (six where something is narrow), more below seven harmonics. Within a
         few nm of an edge along z the field has no bound and no truncation is near. A
-        tilted wall is a staircase of twelve steps; half as many tell what it leaves.
+        tilted wall is a staircase of twelve steps; its error is the change from six
+        steps.
     """
     check_tolerance(tolerance)
     count = sum(math.prod(grid.shape) for grid in grids)
@@ -219,29 +225,31 @@ def near_fields(
     )
     sequence = truncation_sequence(problem, harmonics)
     steps = _STEPS if cell.sidewall_rad else 1
-    stack, left = _stack(problem, steps), np.zeros(len(grids))
+    stack, staircase_error = _stack(problem, steps), np.zeros(len(grids))
     if steps > 1:
         coarse = min(sequence.reaches[-1], sequence.reaches[0] + 2)
-        half = _fields(_stack(problem, steps // 2), light, grids, coarse)
-        left = _differences(half, _fields(stack, light, grids, coarse))
+        half_steps = _fields(_stack(problem, steps // 2), light, grids, coarse)
+        staircase_error = _differences(half_steps, _fields(stack, light, grids, coarse))
     history: list[list[tuple[Array, Array]]] = []
     for reach in sequence.reaches:
-        found = _fields(stack, light, grids, reach)
-        changes = [_differences(one, found) for one in history]
+        fields = _fields(stack, light, grids, reach)
+        changes = [_differences(earlier, fields) for earlier in history]
         largest = np.max(changes or [np.ones(len(grids))], axis=0)
         factor = _SAFETY if reach >= _ENOUGH else safety_factor(reach)
-        error = np.minimum(sequence.factor * factor * largest + left, 2.0)
+        error = np.minimum(sequence.factor * factor * largest + staircase_error, 2.0)
         if len(history) >= sequence.compared and error.max() <= tolerance:
             break
-        history = [*history, found][-sequence.compared :]
+        history = [*history, fields][-sequence.compared :]
     m = np.arange(-reach, reach + 1)
     orders = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
     results = []
-    for grid, (e, h), bar in zip(grids, found, error.tolist(), strict=True):
+    for grid, (e, h), grid_error in zip(grids, fields, error.tolist(), strict=True):
         points = stack.points(grid)
         eps = np.stack([points[i][0] for i in stack.indices(np.asarray(grid.z_um))])
         results.append(
-            NearField(grid, e, h, np.sqrt(eps), bar, orders, bar <= tolerance)
+            NearField(
+                grid, e, h, np.sqrt(eps), grid_error, orders, grid_error <= tolerance
+            )
         )
     return results
 
@@ -270,13 +278,16 @@ def near_field(
 
 
 def _differences(
-    some: list[tuple[Array, Array]], others: list[tuple[Array, Array]]
+    fields: list[tuple[Array, Array]], references: list[tuple[Array, Array]]
 ) -> Array:
-    """For every grid the root-mean-square difference of e, over that of the second."""
+    """(grid,) norm of the difference of e over the norm of the reference e.
+
+    fields, references: (e, h) of every grid.
+    """
     return np.array(
         [
-            np.linalg.norm(one - other) / np.linalg.norm(other)
-            for (one, _), (other, _) in zip(some, others, strict=True)
+            np.linalg.norm(field - reference_field) / np.linalg.norm(reference_field)
+            for (field, _), (reference_field, _) in zip(fields, references, strict=True)
         ]
     )
 
@@ -284,30 +295,40 @@ def _differences(
 def _fields(
     stack: _Stack, light: Incidence, grids: Sequence[FieldGrid], reach: int
 ) -> list[tuple[Array, Array]]:
-    """(3, nz, ny, nx) e and h of every grid, at one truncation."""
+    """(3, nz, ny, nx) e and h of every grid, at one truncation.
+
+    The orders of every symmetry class are summed on the points. Then e is replaced
+    along the normals by D / eps: e += N n n^T (D / eps - e) for the x and y components.
+
+    Args:
+        stack: slabs and half-spaces.
+        light: plane wave.
+        grids: points.
+        reach: harmonics.
+    """
     problem = stack.problem
-    found = [
+    totals = [
         tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
     ]
     for operations in problem.classes:
-        one = _solve_class(stack, light, reach, operations)
-        if one is None:
+        solved = _solve_class(stack, light, reach, operations)
+        if solved is None:
             continue
-        for grid, fields in zip(grids, found, strict=True):
-            sums = _PointSums(problem, operations, one.space.reach, grid)
-            orders = one.orders_at(np.asarray(grid.z_um))
+        for grid, fields in zip(grids, totals, strict=True):
+            sums = _PointSums(problem, operations, solved.space.reach, grid)
+            orders = solved.orders_at(np.asarray(grid.z_um))
             for field, components in zip(fields, orders, strict=True):
                 for i, (order_set, amplitude) in enumerate(components):
                     field[i] += sums(order_set, amplitude)
-    for grid, (e, _, d) in zip(grids, found, strict=True):
+    for grid, (e, _, displacement) in zip(grids, totals, strict=True):
         points = stack.points(grid)
-        for i, place in enumerate(stack.indices(np.asarray(grid.z_um))):
-            eps, normal = points[place]
+        for i, slab in enumerate(stack.indices(np.asarray(grid.z_um))):
+            eps, normal = points[slab]
             if normal is not None:
                 xx, yy, xy = normal
-                x, y = d[:, i] / eps - e[:2, i]
+                x, y = displacement[:, i] / eps - e[:2, i]
                 e[:2, i] += np.stack([xx * x + xy * y, xy * x + yy * y])
-    return [(e, h) for e, h, _ in found]
+    return [(e, h) for e, h, _ in totals]
 
 
 Components = list[tuple[OrderSet, Array]]
@@ -328,8 +349,16 @@ class _SolvedClass:
     fields: TangentialFields
 
     def orders_at(self, z_um: Array) -> tuple[Components, Components, Components]:
-        """Components of E, H (times the impedance of vacuum) and D (x and y), each an
-        order set with amplitudes (nz, k), by (1).
+        """Components of E, H (times the impedance of vacuum) and D (x and y), by (1).
+
+        u and w give the tangential fields. Ez follows from 1/eps of each medium times
+        the curl of H, Hz from the curl of E, D from Q of the slab.
+
+        Args:
+            z_um: (nz,) heights over the foot.
+
+        Returns:
+            For E, H and D a list of (order set, amplitudes (nz, k)).
         """
         waves = self.waves
         space = self.space
@@ -337,15 +366,15 @@ class _SolvedClass:
         u, w = self._tangential(z_um)
         ez = np.zeros((len(z_um), len(space.ez.m)), complex)
         d = np.zeros_like(u)
-        p = slice(waves.bare, waves.p_count)
+        p_waves = slice(waves.bare, waves.p_count)
         curl = np.where(waves.is_p, 0.0, waves.kappa**2)  # R R^T: of s waves alone
-        for i, place in enumerate(self.stack.indices(z_um)):
-            along = waves.kappa[p] * w[i, p]
-            if 0 < place <= len(self.layers):
-                ez[i] = -self.inverse_z[place - 1] @ along
-                d[i] = self.layers[place - 1].Q @ u[i] + curl * u[i]
+        for i, slab in enumerate(self.stack.indices(z_um)):
+            along = waves.kappa[p_waves] * w[i, p_waves]
+            if 0 < slab <= len(self.layers):
+                ez[i] = -self.inverse_z[slab - 1] @ along
+                d[i] = self.layers[slab - 1].Q @ u[i] + curl * u[i]
             else:
-                ez[i] = -along / (media.cover if place else media.substrate) ** 2
+                ez[i] = -along / (media.cover if slab else media.substrate) ** 2
         hz = (waves.kappa * u)[:, len(waves.kappa) - len(space.hz.m) :]
         e, h, d = (values @ waves.fold.T for values in (u, w, d))
         count = len(space.ex.m)
@@ -356,25 +385,30 @@ class _SolvedClass:
         )
 
     def _tangential(self, z_um: Array) -> tuple[Array, Array]:
-        """(nz, n) amplitudes u and w of the waves at every height."""
+        """(nz, n) amplitudes u and w of the waves at every height.
+
+        In a slab u = W (up + down), w = V (up - down), with modes exp(i q z) from its
+        foot upwards and from its top downwards. z_um: (nz,) heights over the foot.
+        """
         ends = self.stack.ends
         u, w = (np.zeros((len(z_um), len(self.incident)), complex) for _ in range(2))
         places = self.stack.indices(z_um)
-        for i, (place, z) in enumerate(zip(places, self.stack.k0 * z_um, strict=True)):
-            if 0 < place <= len(self.layers):
-                modes, foot = self.layers[place - 1], ends[place - 1]
+        for i, (slab, z) in enumerate(zip(places, self.stack.k0 * z_um, strict=True)):
+            if 0 < slab <= len(self.layers):
+                modes, foot = self.layers[slab - 1], ends[slab - 1]
                 rise = np.exp(1j * modes.q * max(z - foot, 0.0))
-                fall = np.exp(1j * modes.q * (ends[place] - z))
-                up = rise * self.fields.up[place - 1]
-                down = fall * self.fields.down[place - 1]
+                fall = np.exp(1j * modes.q * (ends[slab] - z))
+                up = rise * self.fields.up[slab - 1]
+                down = fall * self.fields.down[slab - 1]
                 u[i], w[i] = modes.W @ (up + down), modes.V @ (up - down)
-            elif place:
+            elif slab:
                 u[i], w[i] = self._in_cover(max(z - ends[-1], 0.0))
             else:
                 u[i], w[i] = self._in_substrate(z - ends[0])
         return u, w
 
     def _in_cover(self, height: float) -> tuple[Array, Array]:
+        """(n,) u and w at a height (times k0) over the top of the slabs."""
         index = self.stack.problem.media.cover
         U, V = half_space(self.waves, index)
         kz = normal_component(self.waves.kappa, index)
@@ -383,33 +417,39 @@ class _SolvedClass:
         return U * up, V * up
 
     def _in_substrate(self, height: float) -> tuple[Array, Array]:
+        """(n,) u and w at a height (times k0, negative) from the foot of the slabs."""
         index = self.stack.problem.media.substrate
         incident = self.incident
         U, V = half_space(self.waves, index)
         kz = normal_component(self.waves.kappa, index)
         up = incident.copy()
-        places = np.flatnonzero(incident)
-        up[places] *= np.exp(1j * kz[places] * height)
+        incident_waves = np.flatnonzero(incident)
+        up[incident_waves] *= np.exp(1j * kz[incident_waves] * height)
         fields = self.fields
-        back = outgoing_amplitudes(
+        reflected = outgoing_amplitudes(
             (U, V), fields.u - U * incident, V * incident - fields.w
         )
-        down = back * np.exp(-1j * kz * height)
+        down = reflected * np.exp(-1j * kz * height)
         return U * (up + down), V * (up - down)
 
 
 def _solve_class(
     stack: _Stack, light: Incidence, reach: int, operations: tuple[Operation, ...]
 ) -> _SolvedClass | None:
-    """Waves, modes and fields of one symmetry class; None where the light has no part
-    in it.
+    """Waves, modes and fields of one symmetry class; None if the light excites none.
+
+    Args:
+        stack: slabs and half-spaces.
+        light: plane wave.
+        reach: harmonics.
+        operations: of the class.
     """
     problem, cell = stack.problem, stack.problem.cell
     space = reduced_orders(reach, lattice_frame(cell, operations))
     waves = plane_waves(space, cell, problem.light)
     incident = np.zeros(len(waves.kappa), complex)
-    for column, (place, sign) in waves.zero.items():
-        incident[place] = sign * _incident_amplitudes(light)[column]
+    for column, (zero_order, sign) in waves.zero.items():
+        incident[zero_order] = sign * _incident_amplitudes(light)[column]
     if not incident.any():
         return None
     symmetric = cell.outline(problem.size_um).keeps(-1, -1)
@@ -423,20 +463,18 @@ def _solve_class(
         layers.append(solve_eigenmodes(P, Q, symmetric=symmetric))
         eps, _ = permittivity_coefficients(slab.section, cell, space.reach)
         inverse_z.append(np.linalg.inv(toeplitz_matrix(space, eps, EZ)))
-    below, above = (
+    substrate, cover = (
         half_space(waves, index)
         for index in (problem.media.substrate, problem.media.cover)
     )
     heights = tuple(slab.height for slab in stack.slabs)
-    source = 2 * below[0] * below[1] * incident
-    fields = match_layers(layers, heights, above, below, source)
+    source = 2 * substrate[0] * substrate[1] * incident
+    fields = match_layers(layers, heights, cover, substrate, source)
     return _SolvedClass(stack, space, waves, layers, inverse_z, incident, fields)
 
 
 def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
-    """Amplitudes of the incident wave along x and y at normal incidence, of s and p
-    else.
-    """
+    """Amplitudes of the incident wave along (x, y) at normal incidence, else of (s, p)."""
     c, s = math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
     polarization = light.polarization
     if light.angle_rad == 0:
@@ -451,8 +489,9 @@ def _incident_amplitudes(light: Incidence) -> tuple[float, float]:
 
 
 class _PointSums:
-    """Sums of orders on the points of a grid: amplitudes (nz, k), unfolded by the
-    symmetries, to (nz, ny, nx).
+    """Sums of orders on the points of a grid, for one symmetry class.
+
+    Reduced amplitudes are unfolded by the symmetry operations before the sum.
     """
 
     def __init__(
@@ -462,6 +501,7 @@ class _PointSums:
         reach: tuple[int, int],
         grid: FieldGrid,
     ) -> None:
+        """Phases exp(i k x) of all orders up to ``reach`` on both axes of the grid."""
         light, cell = problem.light, problem.cell
         k0 = 2 * math.pi / light.wavelength_um
         self.operations, self.reach = operations, reach
@@ -478,6 +518,7 @@ class _PointSums:
         )
 
     def __call__(self, orders: OrderSet, amplitude: Array) -> Array:
+        """(nz, ny, nx) field of amplitudes (nz, k), with the images of all orders."""
         mx, my = self.reach
         table = np.zeros((len(amplitude), 2 * my + 1, 2 * mx + 1), complex)
         for (sx, sy, _), sign in zip(self.operations, orders.signs, strict=True):

@@ -26,8 +26,8 @@ from metalens.rcwa.basis import (
 Flips = tuple[tuple[int, int], ...]
 FLIPS: Flips = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _GRID = 192  # points along the pitch on which normals are sampled
-_KEPT = 32  # coefficients of normals are kept for a multiple of so many orders
-# share of the largest distance to a boundary at which the weight w falls to 1/2
+_KEPT = 32  # coefficients of normals are cached for a multiple of this many orders
+# distance to a boundary at which the weight w falls to 1/2, over the largest distance
 _FAR = 0.5
 _TIE = 1e-9  # relative difference of distances that are equal
 
@@ -100,9 +100,9 @@ def permittivity_coefficients(
     inverse = direct.copy()
     centre = 2 * reach[0], 2 * reach[1]
     direct[centre], inverse[centre] = section.outside, 1 / section.outside
-    beyond = (*section.inside[1:], section.outside)
-    steps = zip(section.outlines, section.inside, beyond, strict=True)
-    for outline, inner, outer in steps:
+    next_permittivities = (*section.inside[1:], section.outside)
+    boundaries = zip(section.outlines, section.inside, next_permittivities, strict=True)
+    for outline, inner, outer in boundaries:
         factor = outline.fourier(gx[:, None], gy) / area
         direct += (inner - outer) * factor
         inverse += (1 / inner - 1 / outer) * factor
@@ -126,11 +126,14 @@ def normal_tables(
     radius_um = _disc_radius_um(outlines, cell)
     if radius_um:
         return _disc_normal_tables(radius_um / cell.pitch_um, reach)
-    most = tuple(_KEPT * math.ceil(2 * r / _KEPT) for r in reach)
+    sampled_reach = tuple(_KEPT * math.ceil(2 * r / _KEPT) for r in reach)
     rows, columns = (
-        slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True)
+        slice(m - 2 * r, m + 2 * r + 1)
+        for m, r in zip(sampled_reach, reach, strict=True)
     )
-    tables = _sampled_normals(outlines, cell, (most[0], most[1]), flips)
+    tables = _sampled_normals(
+        outlines, cell, (sampled_reach[0], sampled_reach[1]), flips
+    )
     xx, yy, xy = (without_rounding(table[rows, columns]) for table in tables)
     return xx, yy, xy
 
@@ -163,37 +166,40 @@ def _disc_normal_tables(
     square = mx**2 + my**2
     x = 2 * np.pi * radius * np.sqrt(square)
     small = x < 0.01
-    y = np.where(small, 1.0, x)
-    share = np.pi * radius**2
-    second = jv(2, y)
-    a = share * np.where(small, 0.25 - x**2 / 48, 2 * second / y**2)
-    b = -share * np.where(small, x**2 / 96, (2 - 2 * j0(y) - 4 * second) / y**2)
-    cos2, sin2 = (
-        part / np.where(square == 0, 1, square) for part in (mx**2 - my**2, 2 * mx * my)
+    safe = np.where(small, 1.0, x)
+    disc_area = np.pi * radius**2
+    bessel2 = jv(2, safe)
+    a = disc_area * np.where(small, 0.25 - x**2 / 48, 2 * bessel2 / safe**2)
+    b = -disc_area * np.where(
+        small, x**2 / 96, (2 - 2 * j0(safe) - 4 * bessel2) / safe**2
     )
-    whole = even[np.abs(mx), np.abs(my)]
-    mixed = odd[np.abs(mx), np.abs(my)] * np.sign(mx) * np.sign(my)
-    return whole - a - b * cos2, whole.T - a + b * cos2, mixed - b * sin2
+    cos2, sin2 = (
+        product / np.where(square == 0, 1, square)
+        for product in (mx**2 - my**2, 2 * mx * my)
+    )
+    radial = even[np.abs(mx), np.abs(my)]
+    radial_xy = odd[np.abs(mx), np.abs(my)] * np.sign(mx) * np.sign(my)
+    return radial - a - b * cos2, radial.T - a + b * cos2, radial_xy - b * sin2
 
 
 @lru_cache(maxsize=32)
-def _radial_field(most: int) -> tuple[Array, Array]:
+def _radial_field(largest_order: int) -> tuple[Array, Array]:
     """Fourier coefficients of x^2/r^2 and x y/r^2 over the unit cell, orders 0 to
-    ``most`` on both axes.
+    ``largest_order`` on both axes.
 
     Each eighth of the cell is mapped to a square (x = s, y = s v), where the field
     depends on v alone and the integrand is smooth: Gauss-Legendre is exact to rounding.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(3 * most // 2 + 30)
+    nodes, weights = np.polynomial.legendre.leggauss(3 * largest_order // 2 + 30)
     s, ws = (nodes + 1) / 4, weights / 4
     v, wv = (nodes + 1) / 2, weights / 2
-    angle = 2 * np.pi * np.arange(most + 1)
+    angle = 2 * np.pi * np.arange(largest_order + 1)
     along = angle[:, None] * s
     across = angle[:, None, None] * (s[:, None] * v)
     area = 4 * ws * s
-    near, far = wv / (1 + v * v), wv * v * v / (1 + v * v)  # x > y, and y > x
-    even = (np.cos(along) * area) @ (np.cos(across) @ near).T + (
-        np.cos(across) @ far
+    weight_x, weight_y = wv / (1 + v * v), wv * v * v / (1 + v * v)  # x > y, and y > x
+    even = (np.cos(along) * area) @ (np.cos(across) @ weight_x).T + (
+        np.cos(across) @ weight_y
     ) @ (np.cos(along) * area).T
     mixed = (np.sin(along) * area) @ (np.sin(across) @ (wv * v / (1 + v * v))).T
     return even, -(mixed + mixed.T)
@@ -203,14 +209,23 @@ def _radial_field(most: int) -> tuple[Array, Array]:
 def _sampled_normals(
     outlines: tuple[Outline, ...],
     cell: Cell,
-    most: tuple[int, int],
+    reach: tuple[int, int],
     flips: Flips | None,
 ) -> tuple[Array, Array, Array]:
-    """As :func:`normal_tables` by samples, over m, n from -most to most."""
+    """As :func:`normal_tables`, by the FFT of samples; orders from -reach to reach.
+
+    The weight 1 / (1 + (d / d0)^4) falls with the distance d to the boundary. The
+    coefficients are averaged over the mirror images, which cancels rounding.
+
+    Args:
+        outlines: whose boundaries count. cell: its lattice.
+        reach: orders (m, n).
+        flips: as there.
+    """
     x, y = cell.lattice.periods_um(cell.pitch_um)
     counts = [
         max(2 * m + 2, math.ceil(_GRID * edge / min(x, y) - 1e-6))
-        for m, edge in zip(most, (x, y), strict=True)
+        for m, edge in zip(reach, (x, y), strict=True)
     ]
     counts = [count + count % 2 for count in counts]
     px, py = np.meshgrid(
@@ -221,15 +236,15 @@ def _sampled_normals(
     px, py = px - x * (px > x / 2), py - y * (py > y / 2)
     products, distance = _nearest(outlines, cell, px, py)
     weight = 1 / (1 + (distance / (_FAR * distance.max())) ** 4)
-    kept = flips or [
+    mirrors = flips or [
         flip for flip in FLIPS if all(outline.keeps(*flip) for outline in outlines)
     ]
 
     def table(values: Array, *, odd: bool = False) -> Array:
         spectrum = np.fft.fft2(values) / values.size
-        m, k = (np.arange(-reach, reach + 1) for reach in most)
-        whole = spectrum[m[:, None] % counts[0], k % counts[1]]
-        images = [(sx * sy if odd else 1) * whole[::sx, ::sy] for sx, sy in kept]
+        m, k = (np.arange(-r, r + 1) for r in reach)
+        centred = spectrum[m[:, None] % counts[0], k % counts[1]]
+        images = [(sx * sy if odd else 1) * centred[::sx, ::sy] for sx, sy in mirrors]
         return np.asarray(np.mean(images, axis=0))
 
     xx, yy, xy = weight * products
@@ -239,9 +254,15 @@ def _sampled_normals(
 def _nearest(
     outlines: tuple[Outline, ...], cell: Cell, px: Array, py: Array
 ) -> tuple[Array, Array]:
-    """(3, ...) nx nx, ny ny, nx ny of the nearest boundary point of any pillar, the mean
-    over points that are equally near, and (...) its distance; points in the middle
-    rectangle.
+    """(3, ...) products nx nx, ny ny, nx ny of the normal at the nearest boundary
+    point, and (...) its distance, um.
+
+    The mean is taken over two points at equal distance. All pillars of the lattice
+    count.
+
+    Args:
+        outlines: whose boundaries count. cell: its lattice.
+        px, py: (...) points in the middle rectangle, um.
     """
     sites = _sites(cell)
     parts = [part for outline in outlines for part in outline.parts]
@@ -252,38 +273,48 @@ def _nearest(
     from scipy.spatial import cKDTree
 
     step_um = min(cell.lattice.periods_um(cell.pitch_um)) / 200
-    found = [outline.boundary(step_um) for outline in outlines]
-    points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
+    boundaries = [outline.boundary(step_um) for outline in outlines]
+    points, normals = (
+        np.concatenate(arrays) for arrays in zip(*boundaries, strict=True)
+    )
     copies = (points[None] + sites[:, None]).reshape(-1, 2)
-    near, place = cKDTree(copies).query(np.stack([px, py], axis=-1), k=2)
-    nx, ny = np.tile(normals, (len(sites), 1))[place].transpose(3, 0, 1, 2)
+    distances, nearest = cKDTree(copies).query(np.stack([px, py], axis=-1), k=2)
+    nx, ny = np.tile(normals, (len(sites), 1))[nearest].transpose(3, 0, 1, 2)
     products = np.stack([nx**2, ny**2, nx * ny])
-    tie = near[..., 1] - near[..., 0] < _TIE * cell.pitch_um
+    tie = distances[..., 1] - distances[..., 0] < _TIE * cell.pitch_um
     mean = np.where(tie, products.mean(axis=-1), products[..., 0])
-    return mean, np.asarray(near[..., 0])
+    return mean, np.asarray(distances[..., 0])
 
 
 def _nearest_circle(
     centres: Array, radii: Array, px: Array, py: Array
 ) -> tuple[Array, Array]:
-    """As :func:`_nearest`, for circles (k, 2) and (k,): normals lie on their radii."""
-    least = np.full(px.shape, np.inf)
-    total, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
+    """As :func:`_nearest`, for circles, whose normals are radial.
+
+    Circles at equal distance count with their mean. At a centre the products are those
+    of a random direction.
+
+    Args:
+        centres: (k, 2), um. radii: (k,), um.
+        px, py: (...) points, um.
+    """
+    least_distance = np.full(px.shape, np.inf)
+    products_sum, count = np.zeros((3, *px.shape)), np.zeros(px.shape)
     for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True):
         dx, dy = px - x, py - y
         square = dx**2 + dy**2
         distance = np.abs(np.sqrt(square) - radius)
-        nearer = distance < least - _TIE * radius
-        near = distance < least + _TIE * radius
-        total = np.where(nearer, 0.0, total)
+        nearer = distance < least_distance - _TIE * radius
+        nearest = distance < least_distance + _TIE * radius
+        products_sum = np.where(nearer, 0.0, products_sum)
         count = np.where(nearer, 0.0, count)
-        middle = square < (_TIE * radius) ** 2  # no direction is preferred there
-        scale = np.where(middle, 1.0, square)
+        at_centre = square < (_TIE * radius) ** 2  # no direction is preferred there
+        scale = np.where(at_centre, 1.0, square)
         products = np.stack([dx * dx, dy * dy, dx * dy]) / scale
-        products[:2, middle] = 0.5
-        total, count = total + near * products, count + near
-        least = np.minimum(least, distance)
-    return total / count, least
+        products[:2, at_centre] = 0.5
+        products_sum, count = products_sum + nearest * products, count + nearest
+        least_distance = np.minimum(least_distance, distance)
+    return products_sum / count, least_distance
 
 
 def _sites(cell: Cell) -> Array:
@@ -291,8 +322,8 @@ def _sites(cell: Cell) -> Array:
     rectangle.
     """
     steps = np.array([(0.0, 0.0), *cell.lattice.steps_um(cell.pitch_um)])
-    most = 1.6 * max(cell.lattice.periods_um(cell.pitch_um))
-    return np.asarray(steps[np.abs(steps).max(axis=1) < most])
+    largest = 1.6 * max(cell.lattice.periods_um(cell.pitch_um))
+    return np.asarray(steps[np.abs(steps).max(axis=1) < largest])
 
 
 def _wrapped(cell: Cell, x_um: Array, y_um: Array) -> tuple[Array, Array]:
@@ -315,9 +346,11 @@ def normals_at(
         np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / min(edges)))
         for edge in edges
     )
-    far = _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
+    half_distance = (
+        _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
+    )
     products, distance = _nearest(outlines, cell, *_wrapped(cell, x_um, y_um))
-    return np.asarray(products / (1 + (distance / far) ** 4))
+    return np.asarray(products / (1 + (distance / half_distance) ** 4))
 
 
 def permittivity_at(
@@ -352,6 +385,9 @@ def section_operators(
 ) -> tuple[Array, Array]:
     """Operators P and Q (see :mod:`metalens.rcwa.basis`) of a section, (n, n) each.
 
+    D = ([[eps]] - (Δ N + N Δ) / 2) E with Δ = [[eps]] - [[1/eps]]^-1 and the normal
+    products N, for x and y and their coupling. For Ez, [[eps]]^-1 is used.
+
     Args:
         space, waves: reduced orders, and the waves made of them.
         section: outlines and permittivities. cell: its lattice.
@@ -362,25 +398,29 @@ def section_operators(
     outlines = section.outlines if normals is None else normals
     xx, yy, xy = normal_tables(outlines, cell, space.reach, flips)
     laurent = [toeplitz_matrix(space, direct, link) for link in (EX, EY)]
-    delta = [
-        part - np.linalg.inv(toeplitz_matrix(space, inverse, link))
-        for part, link in zip(laurent, (EX, EY), strict=True)
+    excess = [
+        matrix - np.linalg.inv(toeplitz_matrix(space, inverse, link))
+        for matrix, link in zip(laurent, (EX, EY), strict=True)
     ]
     nx, ny, mixed = (
         toeplitz_matrix(space, table, link)
         for table, link in ((xx, EX), (yy, EY), (xy, MIXED))
     )
-    top = laurent[0] - (delta[0] @ nx + nx @ delta[0]) / 2
-    bottom = laurent[1] - (delta[1] @ ny + ny @ delta[1]) / 2
-    side = -(delta[0] @ mixed + mixed @ delta[1]) / 2
-    back = mixed.conj().T
-    under = -(delta[1] @ back + back @ delta[0]) / 2
-    Q = waves.fold.T @ np.block([[top, side], [under, bottom]]) @ waves.fold
-    s = np.arange(waves.p_count, len(waves.kappa))
-    Q[s, s] -= waves.kappa[s] ** 2
+    upper_left = laurent[0] - (excess[0] @ nx + nx @ excess[0]) / 2
+    lower_right = laurent[1] - (excess[1] @ ny + ny @ excess[1]) / 2
+    upper_right = -(excess[0] @ mixed + mixed @ excess[1]) / 2
+    mixed_adjoint = mixed.conj().T
+    lower_left = -(excess[1] @ mixed_adjoint + mixed_adjoint @ excess[0]) / 2
+    Q = (
+        waves.fold.T
+        @ np.block([[upper_left, upper_right], [lower_left, lower_right]])
+        @ waves.fold
+    )
+    s_waves = np.arange(waves.p_count, len(waves.kappa))
+    Q[s_waves, s_waves] -= waves.kappa[s_waves] ** 2
     P = np.eye(len(waves.kappa), dtype=Q.dtype)
-    z = slice(waves.bare, waves.p_count)
-    kappa = waves.kappa[z]
-    upright = np.linalg.inv(toeplitz_matrix(space, direct, EZ))
-    P[z, z] -= kappa[:, None] * upright * kappa
+    with_ez = slice(waves.bare, waves.p_count)
+    kappa = waves.kappa[with_ez]
+    inverse_z = np.linalg.inv(toeplitz_matrix(space, direct, EZ))
+    P[with_ez, with_ez] -= kappa[:, None] * inverse_z * kappa
     return P, Q

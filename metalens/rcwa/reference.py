@@ -1,4 +1,4 @@
-"""Textbook RCWA: what the engine computes, in one page, without its shortcuts."""
+"""Textbook RCWA: the engine's result in one page, without its shortcuts."""
 
 import math
 from dataclasses import dataclass
@@ -57,8 +57,8 @@ def solve_textbook_rcwa(
 
     >>> from metalens.cell import Cell, Index
     >>> cell = Cell(0.35, 0.5, pillar=Index(2.0), substrate=Index(1.45))
-    >>> found = solve_textbook_rcwa(cell, 0.2, 0.85, harmonics=3)
-    >>> round(float((found.transmitted + found.reflected)[:, 0].sum()), 9)
+    >>> orders = solve_textbook_rcwa(cell, 0.2, 0.85, harmonics=3)
+    >>> round(float((orders.transmitted + orders.reflected)[:, 0].sum()), 9)
     1.0
     """
     k0 = 2 * math.pi / wavelength_um
@@ -68,19 +68,21 @@ def solve_textbook_rcwa(
     sine = math.sin(angle_rad)
     kx = sine * math.cos(azimuth_rad) + m * wavelength_um / px
     ky = sine * math.sin(azimuth_rad) + n * wavelength_um / py
-    one = np.eye(len(m))
+    identity = np.eye(len(m))
 
     def matrices(eps: Array) -> tuple[Array, Array]:
+        """P and Q of a layer with the Toeplitz matrix eps."""
         inverse = np.linalg.inv(eps)
         x, y = np.diag(kx), np.diag(ky)
         P = [
-            [x @ inverse @ y, one - x @ inverse @ x],
-            [y @ inverse @ y - one, -y @ inverse @ x],
+            [x @ inverse @ y, identity - x @ inverse @ x],
+            [y @ inverse @ y - identity, -y @ inverse @ x],
         ]
         Q = [[-x @ y, x @ x - eps], [eps - y @ y, y @ x]]
         return np.block(P), np.block(Q)
 
     def modes(eps: Array) -> tuple[Array, Array, Array]:
+        """q (n,), and columns e (W) and h (V) of the upward modes: P Q W = W q^2."""
         P, Q = matrices(eps)
         square, W = np.linalg.eig(P @ Q)
         q = np.sqrt(square.astype(complex))
@@ -88,11 +90,13 @@ def solve_textbook_rcwa(
         return q, W, Q @ W / q
 
     def half_space(index_of: complex) -> tuple[Array, Array]:
+        """kz of the orders, and V with h = V e of waves that leave."""
         kz = np.sqrt(index_of**2 - kx**2 - ky**2 + 0j)
         kz = np.where(kz == 0, 1e-9, kz)
-        return kz, matrices(index_of**2 * one)[1] / np.concatenate([kz, kz])
+        return kz, matrices(index_of**2 * identity)[1] / np.concatenate([kz, kz])
 
     def toeplitz(layer: Layer) -> Array:
+        """Toeplitz matrix of the permittivity of a section (Laurent's rule)."""
         gx = 2 * np.pi / px * (m[:, None] - m)
         gy = 2 * np.pi / py * (n[:, None] - n)
         inside = index(layer.material or cell.pillar, wavelength_um) ** 2
@@ -102,10 +106,11 @@ def solve_textbook_rcwa(
         sites = 1 + np.exp(1j * (gx * px + gy * py) / 2) if cell.lattice.centred else 1
 
         def pattern(grow_um: float) -> Array:
+            """Toeplitz matrix of the indicator function of the grown outline."""
             outline = cell.outline(size_um, grow_um=grow_um)
             return np.asarray(sites * outline.fourier(gx, gy) / (px * py))
 
-        eps = around * one + (inside - around) * pattern(layer.grow_um)
+        eps = around * identity + (inside - around) * pattern(layer.grow_um)
         if layer.coat is not None:
             film = index(layer.coat, wavelength_um) ** 2
             side = -2 if cell.shape.hole else 2
@@ -116,7 +121,7 @@ def solve_textbook_rcwa(
         return np.asarray(eps)
 
     def film_eps(material: object) -> Array:
-        return index(material, wavelength_um) ** 2 * one  # type: ignore[arg-type]
+        return index(material, wavelength_um) ** 2 * identity  # type: ignore[arg-type]
 
     slabs = [(modes(film_eps(f.material)), f.thickness_um) for f in cell.under]
     for layer in staircase_layers(cell, steps):
@@ -127,45 +132,52 @@ def solve_textbook_rcwa(
         half_space(index(side, wavelength_um)) for side in (cell.substrate, cell.cover)
     )
     size = 2 * len(m)
-    unit = np.eye(size)
+    unity = np.eye(size)
     # unknowns: reflected e, (up, down) amplitudes of each slab, transmitted e
     total = size * (2 + 2 * len(slabs))
     system = np.zeros((total, total), complex)
-    system[: 2 * size, :size] = np.vstack([-unit, V_s])
+    system[: 2 * size, :size] = np.vstack([-unity, V_s])
     for i, ((q, W, V), height) in enumerate(slabs):
-        fade = np.exp(1j * q * height * k0)
+        decay = np.exp(1j * q * height * k0)
         row, column = 2 * size * i, size * (1 + 2 * i)
-        foot = np.block([[W, W * fade], [V, -V * fade]])
-        top = np.block([[W * fade, W], [V * fade, -V]])
+        foot = np.block([[W, W * decay], [V, -V * decay]])
+        top = np.block([[W * decay, W], [V * decay, -V]])
         system[row : row + 2 * size, column : column + 2 * size] = foot
         system[row + 2 * size : row + 4 * size, column : column + 2 * size] = -top
-    system[-2 * size :, -size:] += np.vstack([unit, V_c])
+    system[-2 * size :, -size:] += np.vstack([unity, V_c])
 
     zero = int(np.flatnonzero((m == 0) & (n == 0))[0])
     direction = np.eye(2)
     if angle_rad:
         c, s = math.cos(azimuth_rad), math.sin(azimuth_rad)
         direction = np.array([[-s, c], [c, s]])  # s, then p along the layers
-    come = np.zeros((size, 2), complex)
-    come[[zero, zero + len(m)]] = direction.T
+    incoming = np.zeros((size, 2), complex)
+    incoming[[zero, zero + len(m)]] = direction.T
     source = np.zeros((total, 2), complex)
-    source[: 2 * size] = np.vstack([come, V_s @ come])
-    found = np.linalg.solve(system, source)
-    back, on = found[:size], found[-size:]
+    source[: 2 * size] = np.vstack([incoming, V_s @ incoming])
+    amplitudes = np.linalg.solve(system, source)
+    reflected_e, transmitted_e = amplitudes[:size], amplitudes[-size:]
 
     def power(e: Array, V: Array) -> Array:
+        """(k, 2) power of each order along z, Re(ex hy* - ey hx*)."""
         h = V @ e
         k = len(m)
         return np.asarray((e[:k] * h[k:].conj() - e[k:] * h[:k].conj()).real)
 
-    incident = power(come, V_s)[zero]
-    pair = [zero, zero + len(m)]
-    own = _admittance(index(cell.substrate, wavelength_um), kz_s[zero], angle_rad)
-    leaving = _admittance(index(cell.cover, wavelength_um), kz_c[zero], angle_rad)
-    t = np.sqrt(leaving[:, None] / own) * (direction @ on[pair])
-    r = np.sqrt(own[:, None] / own) * (direction @ back[pair])
-    reflected = -power(back, -V_s) / incident
-    return OrderResponse(m, n, t, r, power(on, V_c) / incident, reflected)
+    incident = power(incoming, V_s)[zero]
+    zero_pair = [zero, zero + len(m)]
+    from_substrate = _admittance(
+        index(cell.substrate, wavelength_um), kz_s[zero], angle_rad
+    )
+    into_cover = _admittance(index(cell.cover, wavelength_um), kz_c[zero], angle_rad)
+    t = np.sqrt(into_cover[:, None] / from_substrate) * (
+        direction @ transmitted_e[zero_pair]
+    )
+    r = np.sqrt(from_substrate[:, None] / from_substrate) * (
+        direction @ reflected_e[zero_pair]
+    )
+    reflected = -power(reflected_e, -V_s) / incident
+    return OrderResponse(m, n, t, r, power(transmitted_e, V_c) / incident, reflected)
 
 
 def _admittance(medium: complex, kz: complex, angle_rad: float) -> Array:

@@ -16,7 +16,7 @@ Sample = Callable[[float], tuple[Array, Array]]
 # ends of the panels as shares of the height: shorter towards foot and top
 EDGES = (0.0, 0.025, 0.09, 0.26, 0.5, 0.74, 0.91, 0.975, 1.0)
 FEWEST, MOST = 4, 10  # Gauss points: 4 leave 2e-3 of t, each more a hundredth of that
-_NODES = 8  # cross-sections whose polynomial stands for a tilted section
+_NODES = 8  # cross-sections through which the polynomial of a tilted section runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +51,27 @@ def wall_sections(
             width = grow_um + (share - 0.5) * width_slope(cell) * layer.height_um
             if shift:
                 width += float(shift(size_um + width))
-            here = pillar_section(cell, layer, size_um, wavelength_um, grow_um=width)
-            return operators(here, i)
+            cross_section = pillar_section(
+                cell, layer, size_um, wavelength_um, grow_um=width
+            )
+            return operators(cross_section, i)
 
         height = layer.height_um * 2 * math.pi / wavelength_um
         return WallSection(
             _interpolated(sample) if cell.sidewall_rad else sample, height
         )
 
-    return [section(i, *one) for i, one in enumerate(sections_with_growth(cell))]
+    return [
+        section(i, layer, grow_um)
+        for i, (layer, grow_um) in enumerate(sections_with_growth(cell))
+    ]
 
 
 def _interpolated(sample: Sample) -> Sample:
-    """P and Q from polynomials through their values at Chebyshev points."""
+    """P and Q at any height, from polynomials through ``_NODES`` Chebyshev points.
+
+    The values at the points are computed on the first call and cached.
+    """
     chebvander = np.polynomial.chebyshev.chebvander
     nodes = -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
@@ -87,14 +95,14 @@ def width_slope(cell: Cell) -> float:
 
 
 def sections_with_growth(cell: Cell) -> list[tuple[Layer, float]]:
-    """Sections of a ``cell``, foot first, with the widening at the middle of each by the
-    tilted wall, um.
+    """Sections of a ``cell``, foot first, with the widening at the middle of each by
+    the tilted wall, um.
     """
-    found, foot = [], -cell.height_um / 2
+    sections, foot = [], -cell.height_um / 2
     for layer in cell.sections:
-        found.append((layer, width_slope(cell) * (foot + layer.height_um / 2)))
+        sections.append((layer, width_slope(cell) * (foot + layer.height_um / 2)))
         foot += layer.height_um
-    return found
+    return sections
 
 
 def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
@@ -102,14 +110,14 @@ def staircase_layers(cell: Cell, steps: int) -> list[Layer]:
     into ``steps`` upright ones of equal height.
     """
     count = steps if cell.sidewall_rad else 1
-    found = []
+    layers = []
     for layer, grow in sections_with_growth(cell):
         step_um = layer.height_um / count
         for i in range(count):
-            lift = (i + 0.5 - count / 2) * step_um * width_slope(cell)
-            width = layer.grow_um + grow + lift
-            found.append(replace(layer, height_um=step_um, grow_um=width))
-    return found
+            step_growth = (i + 0.5 - count / 2) * step_um * width_slope(cell)
+            width = layer.grow_um + grow + step_growth
+            layers.append(replace(layer, height_um=step_um, grow_um=width))
+    return layers
 
 
 @functools.lru_cache(maxsize=8)
@@ -127,31 +135,34 @@ def gauss_collocation(stages: int) -> tuple[Array, Array, Array]:
 def panel_transfer(section: WallSection, low: float, high: float, stages: int) -> Array:
     """(2 n, 2 n) transfer matrix of (u, w) from the upper to the lower end of a panel.
 
+    Gauss collocation of u' = i P w, w' = i Q u, with the stage values of u eliminated
+    from one linear system.
+
     Args:
         section: of the wall. low, high: ends of the panel, shares of the height.
         stages: number of Gauss points.
     """
     c, b, a = gauss_collocation(stages)
     samples = [section.sample(float(high - x * (high - low))) for x in c]
-    P, Q = (np.stack(part) for part in zip(*samples, strict=True))
+    P, Q = (np.stack(matrices) for matrices in zip(*samples, strict=True))
     step = -1j * section.reduced_height * (high - low)
     n = P.shape[-1]
 
-    def integrated(part: Array) -> Array:
-        blocks = a[:, None, :, None] * part.transpose(1, 0, 2)[None]
+    def stage_integrals(matrices: Array) -> Array:
+        blocks = a[:, None, :, None] * matrices.transpose(1, 0, 2)[None]
         return np.asarray(blocks.reshape(stages * n, stages * n))
 
-    p, q = integrated(P), integrated(Q)
-    start = np.tile(np.eye(n), (stages, 1))
-    # u = u_0 + step p w with w = w_0 + step q u put in
-    given = np.concatenate([start, step * (p @ start)], axis=1)
-    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), given)
-    w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
+    p, q = stage_integrals(P), stage_integrals(Q)
+    identities = np.tile(np.eye(n), (stages, 1))
+    # u = u_0 + step p w, with w = w_0 + step q u inserted
+    right_side = np.concatenate([identities, step * (p @ identities)], axis=1)
+    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), right_side)
+    w = np.concatenate([np.zeros_like(identities), identities], axis=1) + step * (q @ u)
     transfer = np.eye(2 * n, dtype=complex)
-    for rows, part, field in ((slice(n), P, w), (slice(n, None), Q, u)):
-        inner = field.reshape(stages, n, -1)
+    for rows, matrices, field in ((slice(n), P, w), (slice(n, None), Q, u)):
+        stage_fields = field.reshape(stages, n, -1)
         transfer[rows] += step * np.einsum(
-            "k,kij,kjl->il", b, part, inner, optimize=True
+            "k,kij,kjl->il", b, matrices, stage_fields, optimize=True
         )
     return transfer
 
@@ -189,16 +200,17 @@ def match_walls(
 def choose_stage_count(
     respond_at: Callable[[int], Array], tolerance: float
 ) -> tuple[int, float]:
-    """Gauss points that leave less than a tenth of the tolerance, and the error they
-    leave: the change by the last one.
+    """Fewest Gauss points with an error below a tenth of the tolerance, and that error.
+
+    The error is the change of t and r by the last point added.
 
     Args:
         respond_at: t and r with this many points. tolerance: of t and r.
     """
-    stages, t = FEWEST, respond_at(FEWEST)
+    stages, amplitudes = FEWEST, respond_at(FEWEST)
     while True:
         finer = respond_at(stages + 1)
-        left = float(np.abs(finer - t).max())
-        stages, t = stages + 1, finer
-        if left <= tolerance / 10 or stages >= MOST:
-            return stages, left
+        change = float(np.abs(finer - amplitudes).max())
+        stages, amplitudes = stages + 1, finer
+        if change <= tolerance / 10 or stages >= MOST:
+            return stages, change

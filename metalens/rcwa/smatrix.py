@@ -124,29 +124,30 @@ def scatter_zero_order(
     *,
     match: Matcher | None = None,
 ) -> ScatteredAmplitudes:
-    """Transmitted and reflected orders of a stack for the zero order from the substrate.
+    """Transmitted and reflected orders of a stack for the zero order from the
+    substrate.
 
     Args:
         waves: of the basis. media: half-spaces, films and heights.
         layers: modes of the patterned layers, foot first; none: a stack of films.
         zero: place of the incident wave.
-        match: what matches the fields in place of the layers, given the pairs above and
-            below and the source.
+        match: function that matches the fields in place of the layers, of the pairs
+            above and below and the source.
     """
     below = half_space(waves, media.substrate)
     above = half_space(waves, media.cover)
-    top, lift = _through_films(waves, above, tuple(reversed(media.over)))
-    foot, drop = _through_films(waves, below, media.under)
+    top, decay_above = _through_films(waves, above, tuple(reversed(media.over)))
+    foot, decay_below = _through_films(waves, below, media.under)
     source = np.zeros(len(waves.kappa), complex)
-    source[zero] = 2 * below[0][zero] * below[1][zero] * drop[zero]
+    source[zero] = 2 * below[0][zero] * below[1][zero] * decay_below[zero]
     fields = (
         match(top, foot, source)
         if match
         else match_layers(layers, media.heights, top, foot, source)
     )
     incident = power_flux(below)[zero]
-    t = outgoing_amplitudes(top, fields.u_top, fields.w_top) * lift
-    r = _reflected(waves, media, foot, drop, fields, zero)
+    t = outgoing_amplitudes(top, fields.u_top, fields.w_top) * decay_above
+    r = _reflected(waves, media, foot, decay_below, fields, zero)
     return ScatteredAmplitudes(
         t * np.sqrt(power_flux(above) / incident),
         r * np.sqrt(power_flux(below) / incident),
@@ -154,8 +155,8 @@ def scatter_zero_order(
 
 
 def outgoing_amplitudes(pair: Pair, u: Array, w: Array) -> Array:
-    """Amplitudes a of a diagonal ``pair`` (U, V) with u = U a, w = V a, from whichever
-    of the two is large.
+    """Amplitudes a of a diagonal ``pair`` (U, V) with u = U a, w = V a, by least
+    squares.
     """
     norm = np.abs(pair[0]) ** 2 + np.abs(pair[1]) ** 2
     return np.asarray((np.conj(pair[0]) * u + np.conj(pair[1]) * w) / norm)
@@ -168,8 +169,11 @@ def match_layers(
     foot: Pair,
     source: Array,
 ) -> TangentialFields:
-    """Fields that radiate into ``top`` above the layers, and whose incident part gives
-    foot V u + U w = source.
+    """Fields that radiate into ``top`` above the layers and satisfy foot V u + U w =
+    source below.
+
+    From the top down, the reflection of every layer gives an outgoing pair at its foot.
+    From the foot up, the amplitudes of the modes follow.
 
     Args:
         layers: modes, foot first. heights: of the layers.
@@ -178,22 +182,22 @@ def match_layers(
     if not layers:
         a = source / (foot[1] * top[0] + foot[0] * top[1])
         return TangentialFields(top[0] * a, top[1] * a, top[0] * a, top[1] * a, [], [])
-    pair, passes = top, []
+    pair, reflections = top, []
     for modes, height in zip(reversed(layers), reversed(heights), strict=True):
-        back, fade = _layer_reflection(modes, height, pair)
-        passes.append((back, fade))
-        pair = _foot_pair(modes, back, fade)
+        reflection, fade = _layer_reflection(modes, height, pair)
+        reflections.append((reflection, fade))
+        pair = _foot_pair(modes, reflection, fade)
     a = np.linalg.solve(foot[1][:, None] * pair[0] + foot[0][:, None] * pair[1], source)
     u, w = pair[0] @ a, pair[1] @ a
     u_top, w_top, ups, downs = u, w, [], []
-    for i, (modes, (back, fade)) in enumerate(
-        zip(layers, reversed(passes), strict=True)
+    for i, (modes, (reflection, fade)) in enumerate(
+        zip(layers, reversed(reflections), strict=True)
     ):
         if i:
             a = (np.linalg.solve(modes.W, u_top) + np.linalg.solve(modes.V, w_top)) / 2
-        kept = len(fade)
-        down = back @ a[:kept]
-        up = np.concatenate([fade * a[:kept], np.zeros_like(a[kept:])])
+        reaching = len(fade)
+        down = reflection @ a[:reaching]
+        up = np.concatenate([fade * a[:reaching], np.zeros_like(a[reaching:])])
         u_top, w_top = modes.W @ (up + down), modes.V @ (up - down)
         ups.append(a)
         downs.append(down)
@@ -203,54 +207,67 @@ def match_layers(
 def _layer_reflection(
     modes: FourierModes, height: float, pair: Pair
 ) -> tuple[Array, Array]:
-    """Downward amplitudes at the top for each upward one at the foot, of the modes that
-    reach the top at all; their factors exp(iqh).
+    """Reflection matrix from upward amplitudes at the foot of a layer to downward ones
+    at its top, and the factors exp(iqh).
+
+    Only modes whose amplitude at the top is not negligible have a column.
+
+    Args:
+        modes: of the layer. height: of the layer, times k0.
+        pair: (U, V) of outgoing waves above it, diagonal or matrices.
     """
     exponent = modes.q * height
-    kept = int(np.count_nonzero(exponent.imag < _FADED))
-    fade = np.exp(1j * exponent[:kept])
+    reaching = int(np.count_nonzero(exponent.imag < _FADED))
+    fade = np.exp(1j * exponent[:reaching])
     if not modes.symmetric:
         # up + down = W^-1 U a and up - down = V^-1 V' a of the pair (U, V') above
         U, V = (np.diag(side) if side.ndim == 1 else side for side in pair)
         total = np.linalg.solve(modes.W, U)
         difference = np.linalg.solve(modes.V, V)
-        back = (total - difference) @ np.linalg.inv(total + difference)
-        return back[:, :kept] * fade, fade
+        reflection = (total - difference) @ np.linalg.inv(total + difference)
+        return reflection[:, :reaching] * fade, fade
     wv = _transposed_product(pair[0], modes.V)
     vw = _transposed_product(pair[1], modes.W)
-    return np.linalg.solve(wv + vw, (wv - vw)[:, :kept] * fade), fade
+    return np.linalg.solve(wv + vw, (wv - vw)[:, :reaching] * fade), fade
 
 
-def _foot_pair(modes: FourierModes, back: Array, fade: Array) -> Pair:
+def _foot_pair(modes: FourierModes, reflection: Array, fade: Array) -> Pair:
     """The upward-radiating pair at the foot of a layer; its columns are the upward
     modes there.
     """
-    kept = len(fade)
+    reaching = len(fade)
     U, V = modes.W.astype(complex), modes.V.astype(complex)
-    trip = fade[:, None] * back[:kept]
-    U[:, :kept] += modes.W[:, :kept] @ trip
-    V[:, :kept] -= modes.V[:, :kept] @ trip
+    round_trip = fade[:, None] * reflection[:reaching]
+    U[:, :reaching] += modes.W[:, :reaching] @ round_trip
+    V[:, :reaching] -= modes.V[:, :reaching] @ round_trip
     return U, V
 
 
 def _through_films(
     waves: PlaneWaves, pair: Pair, films: tuple[tuple[complex, float], ...]
 ) -> tuple[Pair, Array]:
-    """An outgoing pair seen through films, nearest to its half-space first, and the
-    decay of its waves on the way.
+    """Outgoing pair (u, w) on the other side of films, and the factors exp(i kz d) of
+    its waves through them.
+
+    u and w are scaled by that factor, so that nothing grows.
+
+    Args:
+        waves: of the basis.
+        pair: (n,) u and w at the half-space.
+        films: (index, thickness times k0), from the half-space outwards.
     """
     u, w = pair
     fade = np.ones(len(waves.kappa), complex)
     for index, thickness in films:
         kz = normal_component(waves.kappa, index)
-        once = np.exp(1j * kz * thickness)
-        cosine = (1 + once**2) / 2
+        phase = np.exp(1j * kz * thickness)
+        cosine = (1 + phase**2) / 2
         safe = np.where(kz == 0, 1, kz)
         sine = np.where(kz == 0, thickness, np.expm1(2j * kz * thickness) / (2j * safe))
         alpha = np.where(waves.is_p, index**2, kz**2)
         beta = np.where(waves.is_p, kz**2 / index**2, 1.0)
         u, w = cosine * u - 1j * beta * sine * w, cosine * w - 1j * alpha * sine * u
-        fade = fade * once
+        fade = fade * phase
     return (u, w), fade
 
 
@@ -258,26 +275,31 @@ def _reflected(
     waves: PlaneWaves,
     media: StackMedia,
     foot: Pair,
-    drop: Array,
+    decay: Array,
     fields: TangentialFields,
     zero: int,
 ) -> Array:
-    """Reflected amplitudes in the substrate, from the fields above the films under the
-    pillar.
+    """Reflected amplitudes (n,) in the substrate, from the fields above its films.
 
-    Without the pillar the films would pass the incident wave on into a medium like the
-    substrate; what the fields differ from that comes from above, and radiates downwards.
+    Without the pillar the films would transmit the incident wave into a medium like the
+    substrate. The difference of the fields from that wave radiates downwards.
+
+    Args:
+        waves: of the basis. media: half-spaces and films.
+        foot: outgoing pair of the substrate above the lower films.
+        decay: (n,) factors of its waves through the films.
+        fields: at the foot of the pillar. zero: place of the incident wave.
     """
     U, V = half_space(waves, media.substrate)
     (u, w), fade = _through_films(waves, (U, V), tuple(reversed(media.under)))
-    whole = V[zero] * u[zero] + U[zero] * w[zero]
-    passed = np.zeros(len(U), complex)
-    passed[zero] = fade[zero] * 2 * U[zero] * V[zero] / whole
-    back = drop * outgoing_amplitudes(
-        foot, fields.u - U * passed, V * passed - fields.w
+    denominator = V[zero] * u[zero] + U[zero] * w[zero]
+    incident = np.zeros(len(U), complex)
+    incident[zero] = fade[zero] * 2 * U[zero] * V[zero] / denominator
+    reflected = decay * outgoing_amplitudes(
+        foot, fields.u - U * incident, V * incident - fields.w
     )
-    back[zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / whole
-    return np.asarray(back)
+    reflected[zero] += (V[zero] * u[zero] - U[zero] * w[zero]) / denominator
+    return np.asarray(reflected)
 
 
 def power_flux(pair: Pair) -> Array:
@@ -289,4 +311,5 @@ def power_flux(pair: Pair) -> Array:
 
 
 def _transposed_product(left: Array, matrix: Array) -> Array:
+    """left^T matrix; a vector ``left`` stands for its diagonal matrix."""
     return left[:, None] * matrix if left.ndim == 1 else left.T @ matrix

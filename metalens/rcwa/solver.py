@@ -95,10 +95,10 @@ class JonesResponse:
 
 @dataclass(frozen=True, slots=True)
 class CellProblem:
-    """A cell at one size and light, its media, and the symmetry classes that its
-    polarisations have.
+    """A cell at one size and light, its media, and the symmetry classes of its
+    polarisations.
 
-    columns: polarisations that are wanted, 0: x or s, 1: y or p.
+    columns: polarisations to solve, 0: x or s, 1: y or p.
     normals: for each section the outlines of its normal field; none: its own.
     shift: change of width of a cross-section, um, by its diameter; None: none.
     """
@@ -147,7 +147,7 @@ def cell_problem(
 
 
 def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
-    """Indices of half-spaces and films of a ``cell``, thicknesses times k0.
+    """Refractive indices of half-spaces and films, with thicknesses times k0.
 
     Raises:
         CellError: no zero order of the ``light`` in the substrate. MaterialError: a
@@ -157,8 +157,11 @@ def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
 
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
         return tuple(
-            (materials.index(f.material, light.wavelength_um), f.thickness_um * k0)
-            for f in stack
+            (
+                materials.index(film.material, light.wavelength_um),
+                film.thickness_um * k0,
+            )
+            for film in stack
         )
 
     below, above = (
@@ -175,8 +178,8 @@ def stack_media(cell: Cell, light: TangentialWave) -> StackMedia:
 
 
 def check_size(cell: Cell, size_um: float) -> None:
-    """Refuse sizes that leave nothing or overlap, for every section of a ``cell``;
-    round pillars may touch, or have no diameter.
+    """Raise for sizes at which a section of a ``cell`` vanishes or overlaps its
+    neighbour; round pillars may touch, or have no diameter.
 
     Raises:
         CellError: says where the pillar of ``size_um`` is too wide or too thin.
@@ -211,7 +214,8 @@ def check_size(cell: Cell, size_um: float) -> None:
 def symmetry_classes(
     cell: Cell, size_um: float, light: TangentialWave
 ) -> tuple[tuple[Operation, ...], ...]:
-    """Symmetry operations of the fields: one set for all polarisations, or one for each.
+    """Symmetry operations of the fields: one set for all polarisations, or one for
+    each.
 
     Args:
         cell, size_um: the pillar, whose mirrors count. light: its direction.
@@ -232,7 +236,7 @@ def symmetry_classes(
 
 
 def polarization_column(light: Incidence) -> int:
-    """Place of a polarisation in Jones matrices: 0 for x or s, 1 for y or p.
+    """Index of a polarisation in Jones matrices: 0 for x or s, 1 for y or p.
 
     Args:
         light: at normal incidence p lies along the axis that its azimuth is nearest to.
@@ -297,9 +301,8 @@ def solve(
             sin(angle_rad).
         azimuth_rad: of the plane of incidence, from +x to +y.
         polarization: s or p; x and y where the plane of incidence contains an axis.
-        tolerance: wanted bound of |t - exact|; beyond what the largest truncation
-            reaches, the result comes with its larger ``t_error`` and ``converged``
-            False.
+        tolerance: bound of |t - exact|. If the largest truncation does not reach it,
+            the result has its larger ``t_error`` and ``converged`` False.
         harmonics: fix the largest truncation instead, and take the estimate there.
 
     Returns:
@@ -318,16 +321,16 @@ def solve(
     )
     problem = problem_of_light(cell, float(diameter_um), light)
     column = problem.columns[0]
-    found = _refine(problem, tolerance, harmonics)
+    jones_response = _refine(problem, tolerance, harmonics)
     return Response(
-        complex(found.t[column, column]),
-        complex(found.r[column, column]),
-        found.t_error,
-        found.orders,
-        float(found.energy[column]),
-        "film" if found.orders == 1 else "rcwa",
-        found.converged,
-        found.reason,
+        complex(jones_response.t[column, column]),
+        complex(jones_response.r[column, column]),
+        jones_response.t_error,
+        jones_response.orders,
+        float(jones_response.energy[column]),
+        "film" if jones_response.orders == 1 else "rcwa",
+        jones_response.converged,
+        jones_response.reason,
     )
 
 
@@ -350,7 +353,7 @@ def jones(
         wavelength_um: in vacuum.
         angle_rad: of the light outside, in vacuum; azimuth_rad: of the plane of
             incidence, from +x to +y.
-        tolerance: wanted bound of |t - exact| and |r - exact|.
+        tolerance: bound of |t - exact| and |r - exact|.
         harmonics: fix the largest truncation instead (orders as on a square lattice of
             the same area).
 
@@ -398,17 +401,16 @@ def solve_truncation(
             for layer in other.sections
         )
         problem = dataclasses.replace(problem, normals=normals)
-    found = solve_problem(problem, harmonics, stages if cell.sidewall_rad else 0)
-    return _response(problem, harmonics, found, math.inf, False, "one truncation")
+    truncation = solve_problem(problem, harmonics, stages if cell.sidewall_rad else 0)
+    return _response(problem, harmonics, truncation, math.inf, False, "one truncation")
 
 
 @dataclass(frozen=True, slots=True)
 class TruncationSequence:
-    """Truncations to try, how many earlier ones the error estimate compares, and a
-    factor on it for gaps and walls that none resolves.
+    """Truncations to try, and how their error is estimated.
 
-    The first truncation that may be the last one has ``compared`` below it, but where
-    few are asked for.
+    reaches: harmonics. compared: number of earlier truncations that the estimate
+    compares. factor: on the estimate, for gaps and walls that no truncation resolves.
     """
 
     reaches: range
@@ -445,12 +447,14 @@ def truncation_sequence(
         compared_truncations(gap / pitch),
         *(compared_truncations(max(float(span), NARROWEST)) for span in spans),
     )
-    last = _last(problem.classes, tilted) if harmonics is None else harmonics
+    last = (
+        _largest_truncation(problem.classes, tilted) if harmonics is None else harmonics
+    )
     first = _FIRST + _COMPARED if harmonics is None else harmonics
     thin = 1 + _THIN * max(0.0, 1 - float(spans.min()) / NARROWEST)
-    near = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST * pitch))
+    touching = 1 + _TOUCHING * max(0.0, 1 - gap / (NARROWEST * pitch))
     return TruncationSequence(
-        range(max(1, first - compared), last + 1), compared, max(thin, near)
+        range(max(1, first - compared), last + 1), compared, max(thin, touching)
     )
 
 
@@ -476,35 +480,44 @@ def safety_factor(reach: int) -> float:
 def _refine(
     problem: CellProblem, tolerance: float, harmonics: int | None
 ) -> JonesResponse:
-    """The result of the smallest truncation that meets the tolerance, or of the last."""
+    """Jones matrices of the first truncation that meets the tolerance, or the last.
+
+    A homogeneous cell is solved as a stack of films. The error is that of the
+    collocation of tilted walls plus :func:`estimate_error`. While the orders do not
+    resolve the pillar, it is at least the pillar's whole effect.
+
+    Args:
+        problem: cell and light.
+        tolerance: of t and r.
+        harmonics: the largest truncation; None: one that takes about a second.
+    """
     tilted = bool(problem.cell.sidewall_rad)
     sequence = truncation_sequence(problem, harmonics, tilted=tilted)
-    empty = _film_response(problem)
+    film = _film_response(problem)
     if _is_homogeneous(problem):
         k0 = 2 * math.pi / problem.light.wavelength_um
         rounding = _ROUNDING * (1 + k0 * problem.cell.height_um)
-        return _response(
-            problem, 0, empty, rounding, True, "a homogeneous layer: exact"
-        )
-    stages, left = 0, 0.0
+        return _response(problem, 0, film, rounding, True, "a homogeneous layer: exact")
+    stages, collocation_error = 0, 0.0
     if tilted:
         coarse = min(sequence.reaches[-1], _COARSE)
-        stages, left = choose_stage_count(
+        stages, collocation_error = choose_stage_count(
             lambda count: solve_problem(problem, coarse, count).both, tolerance
         )
     history: list[Array] = []
     for reach in sequence.reaches:
-        found = solve_problem(problem, reach, stages)
-        history.append(found.both)
-        error = left + sequence.factor * estimate_error(
+        truncation = solve_problem(problem, reach, stages)
+        history.append(truncation.both)
+        error = collocation_error + sequence.factor * estimate_error(
             history, reach, sequence.compared
         )
         if reach * problem.size_um < problem.cell.pitch_um:
-            # orders that do not resolve the pillar say nothing of its effect
-            error = max(error, float(np.abs(found.both - empty.both).max()))
+            # these orders do not resolve the pillar
+            error = max(error, float(np.abs(truncation.both - film.both).max()))
         if len(history) > sequence.compared and error <= tolerance:
             break
-    largest = 1 + max(1.0, float(np.abs(found.both).max()))  # exact ones are passive
+    # the exact response is passive
+    largest = 1 + max(1.0, float(np.abs(truncation.both).max()))
     error = min(error, largest)
     met = error <= tolerance
     reason = (
@@ -513,7 +526,7 @@ def _refine(
     )
     before = [both[0] for both in history[-1 - sequence.compared : -1]]
     earlier = before[:1] * (MOST_COMPARED - sequence.compared) + before
-    response = _response(problem, reach, found, error, met, reason)
+    response = _response(problem, reach, truncation, error, met, reason)
     return dataclasses.replace(
         response, earlier=np.array(earlier, complex).reshape(-1, 2, 2)
     )
@@ -528,7 +541,7 @@ def estimate_error(history: list[Array], reach: int, compared: int) -> float:
 
     Args:
         history: results of successive truncations. reach: harmonics of the last.
-        compared: how many earlier ones count.
+        compared: how many earlier truncations count.
     """
     earlier = history[-1 - compared : -1][::-1]
     shares = [
@@ -552,16 +565,25 @@ def most_harmonics(
         cell, size_um: the pillar. angle_rad, azimuth_rad: direction of the light.
     """
     light = tangential_wave(1.0, angle_rad, azimuth_rad)
-    return _last(symmetry_classes(cell, size_um, light), bool(cell.sidewall_rad))
+    return _largest_truncation(
+        symmetry_classes(cell, size_um, light), bool(cell.sidewall_rad)
+    )
 
 
-def _last(classes: tuple[tuple[Operation, ...], ...], tilted: bool) -> int:
+def _largest_truncation(
+    classes: tuple[tuple[Operation, ...], ...], tilted: bool
+) -> int:
+    """Harmonics of the largest automatic truncation, by the least number of symmetry
+    operations of a class.
+    """
     table = _LAST_TILTED if tilted else _LAST
     return table[min(len(operations) for operations in classes)]
 
 
 def _is_square(problem: CellProblem) -> bool:
-    """Whether x and y are alike: both mirrors and a quarter turn, at normal incidence."""
+    """Whether x and y are equivalent: both mirrors and a quarter turn, normal
+    incidence.
+    """
     return (
         len(problem.classes) == 2
         and len(problem.classes[0]) == 4
@@ -572,7 +594,10 @@ def _is_square(problem: CellProblem) -> bool:
 
 
 def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
-    """t and r of the wanted polarisations at one truncation.
+    """t and r of the problem's polarisations at one truncation.
+
+    Each symmetry class is solved by itself: modes of its layers (collocation for tilted
+    walls), then the scattering of every incident polarisation that it holds.
 
     Args:
         problem: cell and light. reach: harmonics.
@@ -590,11 +615,11 @@ def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
 
         def operators(
             section: PillarSection,
-            i: int,
+            number: int,
             space: ReducedOrders = space,
             waves: PlaneWaves = waves,
         ) -> tuple[Array, Array]:
-            normals = problem.normals[i] if problem.normals else None
+            normals = problem.normals[number] if problem.normals else None
             return section_operators(space, waves, section, cell, normals=normals)
 
         walls = wall_sections(
@@ -611,21 +636,21 @@ def solve_problem(problem: CellProblem, reach: int, stages: int) -> Truncation:
             ]
             heights = tuple(wall.reduced_height for wall in walls)
             media = dataclasses.replace(media, heights=heights)
-        for column, (place, sign) in waves.zero.items():
+        for column, (incident, sign) in waves.zero.items():
             if column not in columns:
                 continue
-            found = scatter_zero_order(waves, media, layers, place, match=match)
-            energy[column] = found.energy
-            for row, (leaving, other) in waves.zero.items():
-                both[0, row, column] = sign * other * found.t[leaving]
-                both[1, row, column] = sign * other * found.r[leaving]
+            scattered = scatter_zero_order(waves, media, layers, incident, match=match)
+            energy[column] = scattered.energy
+            for row, (leaving, row_sign) in waves.zero.items():
+                both[0, row, column] = sign * row_sign * scattered.t[leaving]
+                both[1, row, column] = sign * row_sign * scattered.r[leaving]
     if square:
         both[:, 1, 1], energy[1] = both[:, 0, 0], energy[0]
     return Truncation(both, energy)
 
 
 def _film_response(problem: CellProblem) -> Truncation:
-    """Exact response of the cell with films of the surroundings in place of the pillar."""
+    """Exact t and r with each section replaced by a film of its surroundings."""
     cell, media, light = problem.cell, problem.media, problem.light
     k0 = 2 * math.pi / light.wavelength_um
     size_um = problem.size_um or cell.pitch_um / 2
@@ -638,15 +663,18 @@ def _film_response(problem: CellProblem) -> Truncation:
     waves = plane_waves(space, cell, light)
     both, energy = np.zeros((2, 2, 2), complex), np.zeros(2)
     for column in problem.columns:
-        place, _ = waves.zero[column]
-        found = scatter_zero_order(waves, media, [], place)
-        both[:, column, column] = found.t[place], found.r[place]
-        energy[column] = abs(found.t[place]) ** 2 + abs(found.r[place]) ** 2
+        incident, _ = waves.zero[column]
+        scattered = scatter_zero_order(waves, media, [], incident)
+        t, r = scattered.t[incident], scattered.r[incident]
+        both[:, column, column] = t, r
+        energy[column] = abs(t) ** 2 + abs(r) ** 2
     return Truncation(both, energy)
 
 
 def _is_homogeneous(problem: CellProblem) -> bool:
-    """Whether every layer is a film to rounding."""
+    """Whether the pillar is negligible: contrast times area share times phase, summed
+    over the sections, is below rounding.
+    """
     cell, wavelength_um = problem.cell, problem.light.wavelength_um
     if not problem.size_um:
         return True
@@ -664,13 +692,16 @@ def _is_homogeneous(problem: CellProblem) -> bool:
 def _response(
     problem: CellProblem,
     reach: int,
-    found: Truncation,
+    truncation: Truncation,
     error: float,
     converged: bool,
     reason: str,
 ) -> JonesResponse:
-    names = ("x", "y") if problem.light.normal else ("s", "p")
+    """Jones response of a truncation, with its basis and number of orders."""
+    basis = ("x", "y") if problem.light.normal else ("s", "p")
     m = np.arange(-reach, reach + 1)
     count = int(np.count_nonzero(np.hypot(m[:, None], m) <= reach))
-    t, r = found.both
-    return JonesResponse(names, t, r, error, found.energy, count, converged, reason)
+    t, r = truncation.both
+    return JonesResponse(
+        basis, t, r, error, truncation.energy, count, converged, reason
+    )

@@ -1,6 +1,5 @@
-"""Rows of different pillars as one supercell: the exact answer that the locally
-periodic
-approximation leaves out.
+"""Rows of different pillars as one supercell: the exact answer, without the locally
+periodic approximation.
 """
 
 import math
@@ -33,7 +32,7 @@ _MIRRORED = ((1, 1), (1, -1))  # rows are mirror symmetric in y
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RowResponse:
-    """What a row of pillars does to light at normal incidence from the substrate.
+    """Diffraction orders of a row of pillars, for normal incidence from the substrate.
 
     orders: (n,) diffraction orders along the row. t: (n,) transverse amplitude of each
         in the cover for unit power in, 0 where it is evanescent; the phase runs from
@@ -52,8 +51,7 @@ class RowResponse:
 
 @dataclass(frozen=True, slots=True)
 class RowBlock:
-    """What repeats along a row: a square with one pillar, or along the diagonal with
-    two.
+    """Square that repeats along a row: with one pillar, or along the diagonal with two.
 
     width_um: of the square.
     """
@@ -63,21 +61,21 @@ class RowBlock:
 
     @property
     def spacing_um(self) -> float:
-        """From pillar to pillar along the row."""
+        """Distance between neighbouring pillars along the row."""
         return self.width_um / self.pillars
 
     def places_um(self, count: int) -> Array:
         """(count, 2) x and y of the pillars of a row about its middle."""
-        order = np.arange(count)
-        across = (
-            (order % 2) * self.width_um / 2 if self.pillars > 1 else np.zeros(count)
+        position = np.arange(count)
+        y_um = (
+            (position % 2) * self.width_um / 2 if self.pillars > 1 else np.zeros(count)
         )
-        return np.stack([(order - (count - 1) / 2) * self.spacing_um, across], axis=1)
+        return np.stack([(position - (count - 1) / 2) * self.spacing_um, y_um], axis=1)
 
 
 def block_of(pitch_um: float, diagonal: bool) -> RowBlock:
-    """The square that repeats along a row of a square lattice of ``pitch_um``, or along its
-    ``diagonal``.
+    """The square that repeats along a row of a square lattice of ``pitch_um``, or along
+    its ``diagonal``.
     """
     return RowBlock(math.sqrt(2) * pitch_um, 2) if diagonal else RowBlock(pitch_um, 1)
 
@@ -91,17 +89,16 @@ def solve_row(
     harmonics: int = 4,
     diagonal: bool = False,
 ) -> RowResponse:
-    """Supercell RCWA: orders of a row of pillars of these diameters, one pitch apart,
-    repeated without end.
+    """Diffraction orders of a periodic row of pillars, by RCWA of the supercell.
 
     Args:
         wavelength_um: vacuum wavelength, um.
-        diameters_um: (n,) of the pillars, in order along x.
+        diameters_um: (n,) of the pillars along x, one pitch from each to the next.
         polarization: axis of the incident field, x along the row.
         harmonics: h; all orders within the circle that holds (2 h + 1)² orders of one
             pillar's cell.
-        diagonal: along the diagonal of the lattice, pitch / √2 apart along it; an even
-            number of pillars.
+        diagonal: whether the row follows the lattice's diagonal, with a spacing of
+            pitch / √2 along it and an even number of pillars.
 
     Accuracy: that of RCWA at this truncation, a few 1e-2 of t for silicon; differences
         between rows at one truncation are better by an order of magnitude. Energy holds
@@ -117,7 +114,7 @@ def solve_row(
     >>> round(row.energy, 9)
     1.0
     """
-    _check(cell, diameters_um)
+    _check_row(cell, diameters_um)
     block = block_of(cell.pitch_um, diagonal)
     count = len(diameters_um)
     if count % block.pillars:
@@ -131,13 +128,14 @@ def solve_row(
         lattice=Lattice("rectangular", 1 / blocks),
     )
     discs = [
-        EllipseArc(d / 2, d / 2, centre_um=(float(x), float(y)))
-        for d, (x, y) in zip(diameters_um, block.places_um(count), strict=True)
+        EllipseArc(diameter / 2, diameter / 2, centre_um=(float(x), float(y)))
+        for diameter, (x, y) in zip(diameters_um, block.places_um(count), strict=True)
     ]
-    inside, around = (
-        materials.index(one, wavelength_um) ** 2 for one in (cell.pillar, cell.fill)
+    inside, outside = (
+        materials.index(material, wavelength_um) ** 2
+        for material in (cell.pillar, cell.fill)
     )
-    slab = PillarSection((Outline(tuple(discs)),), (inside,), around)
+    slab = PillarSection((Outline(tuple(discs)),), (inside,), outside)
     light = tangential_wave(wavelength_um, 0.0, 0.0)
     operations = (IDENTITY, FLIP_Y[polarization])
     radius = (2 * harmonics + 1) / math.sqrt(math.pi)
@@ -152,18 +150,20 @@ def solve_row(
         heights=(2 * math.pi / wavelength_um * cell.height_um,),
     )
     zero, sign = waves.zero["xy".index(polarization)]
-    found = scatter_zero_order(
+    scattered = scatter_zero_order(
         waves, stack, [solve_eigenmodes(*operators, symmetric=False)], zero
     )
     # in the plane of the row, light along x is p and light along y is s
-    kept = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
-    kept = kept[np.argsort(waves.m[kept])]
+    along_row = np.flatnonzero((waves.n == 0) & (waves.is_p == (polarization == "x")))
+    along_row = along_row[np.argsort(waves.m[along_row])]
     cover = stack.cover.real
-    cosine = normal_component(waves.kappa[kept], cover).real / cover
+    cosine = normal_component(waves.kappa[along_row], cover).real / cover
     factor = np.sqrt(cosine if polarization == "x" else _inverse(cosine))
-    direction = np.where(waves.m[kept] == 0, sign, waves.along[0, kept])
+    direction = np.where(waves.m[along_row] == 0, sign, waves.along[0, along_row])
     return RowResponse(
-        waves.m[kept], sign * direction * factor * found.t[kept], found.energy
+        waves.m[along_row],
+        sign * direction * factor * scattered.t[along_row],
+        scattered.energy,
     )
 
 
@@ -172,8 +172,8 @@ def _inverse(cosine: Array) -> Array:
     return np.where(cosine > 0, 1 / np.where(cosine > 0, cosine, 1.0), 0.0)
 
 
-def _check(cell: Cell, diameters_um: Sequence[float] | Array) -> None:
-    """Refuse what is no row."""
+def _check_row(cell: Cell, diameters_um: Sequence[float] | Array) -> None:
+    """Raise for cells and diameters that make no row of upright pillars."""
     if not cell.round:
         raise CellError(
             f"rows are solved for round pillars on a square lattice, not {cell.described}"

@@ -11,8 +11,8 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 
 Point = tuple[float, float]
-_ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
-_ASIDE = 1e-4  # of an edge, from its end
+_EQUAL = 1e-9  # of the area: Fourier factors that differ less are the same
+_INSET = 1e-4  # of an edge, from its end
 _PROBES = np.array(
     [[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]]
 )  # over the radius, no two alike
@@ -102,9 +102,10 @@ class PolygonLoop:
         )
         area = _signed_area(points)
         centre = _centroid(points, area)
-        near = area * (1 - 1j * (g @ centre))
+        at_small_g = area * (1 - 1j * (g @ centre))
         return np.asarray(
-            self.sign * np.where(small, near, 1j * total / np.where(small, 1.0, square))
+            self.sign
+            * np.where(small, at_small_g, 1j * total / np.where(small, 1.0, square))
         )
 
     def vertices(self, count: int) -> Array:
@@ -114,8 +115,7 @@ class PolygonLoop:
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A section: ellipses and polygons that do not overlap but where one cuts another
-    out.
+    """A section: ellipses and polygons that overlap only where one cuts another out.
 
     parts: with signs; the first is the outermost.
     """
@@ -124,12 +124,12 @@ class Outline:
 
     @property
     def area_um2(self) -> float:
-        """Of the solid part."""
+        """Area of the solid part."""
         return sum(part.area_um2 for part in self.parts)
 
     @property
     def radius_um(self) -> float:
-        """Of the circle about the origin that holds it."""
+        """Radius of the smallest circle about the origin around the outline."""
         return max(float(np.hypot(*part.vertices(64).T).max()) for part in self.parts)
 
     def fourier(self, gx: Array, gy: Array) -> Array:
@@ -143,37 +143,44 @@ class Outline:
         return tuple((part.sign, part.vertices(count)) for part in self.parts)
 
     def turned(self, angle_rad: float) -> "Outline":
-        """The same about the origin from +x towards +y."""
-        made: list[EllipseArc | PolygonLoop] = []
+        """The outline turned about the origin, from +x towards +y."""
+        parts: list[EllipseArc | PolygonLoop] = []
         for part in self.parts:
             if isinstance(part, EllipseArc):
                 x, y = rotate_corners(np.array([part.centre_um]), angle_rad)[0].tolist()
                 angle = part.angle_rad + angle_rad
-                made.append(replace(part, angle_rad=angle, centre_um=(x, y)))
+                parts.append(replace(part, angle_rad=angle, centre_um=(x, y)))
             else:
                 corners = rotate_corners(np.array(part.corners_um), angle_rad).tolist()
-                made.append(replace(part, corners_um=tuple((x, y) for x, y in corners)))
-        return Outline(tuple(made))
+                parts.append(
+                    replace(part, corners_um=tuple((x, y) for x, y in corners))
+                )
+        return Outline(tuple(parts))
 
     def line(self, count: int = 64) -> Array:
-        """(n, 2) one closed line around the solid part, for pictures: to every hole and
-        back on the same way.
+        """(n, 2) one closed line around the solid part, for pictures.
 
+        A cut, run in both directions, joins every hole to the line at the closest
+        corners.
         It encloses the area of the section (ellipses by ``count`` corners); a mask is
         drawn from :meth:`polygons`.
         """
-        made = self.parts[0].vertices(count)
+        joined = self.parts[0].vertices(count)
         for hole in self.parts[1:]:
             inner = hole.vertices(count)[::-1]
-            apart = ((made[:, None] - inner) ** 2).sum(axis=-1)
-            here, there = np.unravel_index(int(apart.argmin()), apart.shape)
-            around = np.roll(inner, -there, axis=0)
-            made = np.concatenate([made[: here + 1], around, around[:1], made[here:]])
-        return made
+            squared_distance = ((joined[:, None] - inner) ** 2).sum(axis=-1)
+            outer_place, inner_place = np.unravel_index(
+                int(squared_distance.argmin()), squared_distance.shape
+            )
+            around = np.roll(inner, -inner_place, axis=0)
+            joined = np.concatenate(
+                [joined[: outer_place + 1], around, around[:1], joined[outer_place:]]
+            )
+        return joined
 
     def boundary(self, step_um: float) -> tuple[Array, Array]:
-        """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit
-        normals there, out of the part.
+        """Points (n, 2) on the boundary, spaced by at most ``step_um``, and their unit
+        normals, out of the part.
         """
         points, normals = [], []
         for part in self.parts:
@@ -206,10 +213,10 @@ class Outline:
         by its Fourier factors).
         """
         gx, gy = (_PROBES / self.radius_um).T
-        apart = np.abs(
+        difference = np.abs(
             self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)
         ).max()
-        return bool(apart <= _ALIKE * self.area_um2)
+        return bool(difference <= _EQUAL * self.area_um2)
 
     def repeats(self, turn_rad: float) -> bool:
         """Whether a turn in the plane leaves it as it is (judged by its Fourier
@@ -217,61 +224,69 @@ class Outline:
         """
         gx, gy = (_PROBES / self.radius_um).T
         c, s = math.cos(turn_rad), math.sin(turn_rad)
-        apart = np.abs(
+        difference = np.abs(
             self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)
         ).max()
-        return bool(apart <= _ALIKE * self.area_um2)
+        return bool(difference <= _EQUAL * self.area_um2)
 
     @property
     def narrowest_um(self) -> float:
         """Least width across, between parallel lines (of the outermost part, its
         hollows filled).
         """
-        return _across(self.parts[0].vertices(64))
+        return _least_width(self.parts[0].vertices(64))
 
     @property
     def spans_um(self) -> tuple[float, float]:
-        """Least width of what is solid (walls of rings, bars of crosses) and least
-        space within (holes, hollows; inf).
+        """Least solid width (walls of rings, bars of crosses) and least space within
+        (holes, hollows; inf), um.
 
-        Convex outlines and holes between parallel lines, all else edge to edge, where
-        one lies before the other (edges
-        that share a corner do not). Curves are taken as 64 edges of the same area: 1e-3
-        of their radius.
+        Convex outlines and holes are measured between parallel lines. All else is
+        measured between opposite edges without a common corner. Curves are taken as 64
+        edges of the same area: 1e-3 of their radius.
         """
         parts = [corners[::sign] for sign, corners in self.polygons()]
-        bends = [
-            _bends(corners[:: part.sign])
+        hollow = [
+            _is_concave(corners[:: part.sign])
             for corners, part in zip(parts, self.parts, strict=True)
         ]
         start = np.concatenate(parts)
         end = np.concatenate([np.roll(c, -1, axis=0) for c in parts])
-        of = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
+        part_number = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
         along = (end - start) / np.hypot(*(end - start).T)[:, None]
-        i, j = np.nonzero(
-            along @ along.T < -_ALIKE
-        )  # those that run against each other
-        counted = (of[i] != of[j]) | np.array(bends)[of[i]]
+        # pairs of edges that run against each other
+        i, j = np.nonzero(along @ along.T < -_EQUAL)
+        counted = (part_number[i] != part_number[j]) | np.array(hollow)[part_number[i]]
         counted &= (start[i] != end[j]).any(axis=1) & (end[i] != start[j]).any(axis=1)
         i, j = i[counted], j[counted]
         holes = [
-            _across(c) for c, bent in zip(parts[1:], bends[1:], strict=True) if not bent
+            _least_width(c)
+            for c, is_hollow in zip(parts[1:], hollow[1:], strict=True)
+            if not is_hollow
         ]
         solid, space = self.narrowest_um, min(holes, default=math.inf)
         for tip in (
-            start[i] + _ASIDE * (end - start)[i],
-            end[i] - _ASIDE * (end - start)[i],
+            start[i] + _INSET * (end - start)[i],
+            end[i] - _INSET * (end - start)[i],
         ):
-            foot, before = _foot(tip, start[j], end[j])
+            foot, is_opposite = _foot(tip, start[j], end[j])
             within = self.inside(*((tip + foot) / 2).T)
-            away = np.hypot(*(tip - foot).T)
-            solid = min(solid, float(away[before & within].min(initial=math.inf)))
-            space = min(space, float(away[before & ~within].min(initial=math.inf)))
+            distance = np.hypot(*(tip - foot).T)
+            solid = min(
+                solid, float(distance[is_opposite & within].min(initial=math.inf))
+            )
+            space = min(
+                space, float(distance[is_opposite & ~within].min(initial=math.inf))
+            )
         return solid, space
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
-        """Least distance to its copies at these lattice steps; 0 where they touch or
-        overlap (within 1 % of radius).
+        """Least distance (um) to the copies of the outline at lattice steps.
+
+        0 where they touch or overlap, within 1 % of the radius.
+
+        Args:
+            steps: (x, y) of the copies, um.
         """
         from scipy.spatial import cKDTree
 
@@ -280,10 +295,10 @@ class Outline:
         for x, y in steps:
             if math.hypot(x, y) - 2 * self.radius_um >= gap:
                 continue
-            there = points + np.array([x, y])
-            if self.inside(*there.T).any():
+            copy = points + np.array([x, y])
+            if self.inside(*copy.T).any():
                 return 0.0
-            gap = min(gap, float(tree.query(there)[0].min()))
+            gap = min(gap, float(tree.query(copy)[0].min()))
         return gap
 
 
@@ -295,15 +310,15 @@ def offset_corners(corners: Array, grow_um: float) -> tuple[Point, ...]:
     """
     points = _anticlockwise(corners)
     edge = np.roll(points, -1, axis=0) - points
-    out = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-    before = np.roll(out, 1, axis=0)
-    mitre = (out + before) / (1 + (out * before).sum(axis=1))[:, None]
-    made = points + grow_um / 2 * mitre
-    if ((np.roll(made, -1, axis=0) - made) * edge).sum(axis=1).min() <= 0:
+    normals = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    previous = np.roll(normals, 1, axis=0)
+    mitre = (normals + previous) / (1 + (normals * previous).sum(axis=1))[:, None]
+    moved = points + grow_um / 2 * mitre
+    if ((np.roll(moved, -1, axis=0) - moved) * edge).sum(axis=1).min() <= 0:
         raise CellError(
             f"an outline moved in by {-grow_um / 2:.4g} um loses an edge; need a larger size or less bias"
         )
-    return tuple((float(x), float(y)) for x, y in made)
+    return tuple((float(x), float(y)) for x, y in moved)
 
 
 def rotate_corners(corners: Array, angle_rad: float) -> Array:
@@ -312,43 +327,48 @@ def rotate_corners(corners: Array, angle_rad: float) -> Array:
     return np.asarray(corners @ np.array([[c, s], [-s, c]]))
 
 
-def _across(corners: Array) -> float:
-    """Least distance of parallel lines with a polygon between them."""
+def _least_width(corners: Array) -> float:
+    """Least width of a polygon: distance of the closest parallel lines around it."""
     edge = np.roll(corners, -1, axis=0) - corners
-    across = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
-    reach = corners @ np.concatenate([across, _DIRECTIONS]).T
+    normals = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.hypot(*edge.T)[:, None]
+    reach = corners @ np.concatenate([normals, _DIRECTIONS]).T
     return float(np.ptp(reach, axis=0).min())
 
 
-def _bends(corners: Array) -> bool:
-    """Whether an anticlockwise polygon has hollows."""
+def _is_concave(corners: Array) -> bool:
+    """Whether an anticlockwise polygon is not convex."""
     edge = np.roll(corners, -1, axis=0) - corners
-    after = np.roll(edge, -1, axis=0)
+    next_edge = np.roll(edge, -1, axis=0)
     return bool(
-        (edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]).min()
-        < -_ALIKE * np.abs(edge).max() ** 2
+        (edge[:, 0] * next_edge[:, 1] - edge[:, 1] * next_edge[:, 0]).min()
+        < -_EQUAL * np.abs(edge).max() ** 2
     )
 
 
 def _foot(tip: Array, start: Array, end: Array) -> tuple[Array, Array]:
-    """(n, 2) nearest points of lines from start to end, and whether they lie on these
-    edges.
+    """(n, 2) feet of the perpendiculars on lines, and whether they lie on the edges.
+
+    Args:
+        tip: (n, 2) points. start, end: (n, 2) of the edges.
     """
     edge = end - start
     along = ((tip - start) * edge).sum(axis=1) / (edge**2).sum(axis=1)
-    return start + along[:, None] * edge, (along > -_ALIKE) & (along < 1 + _ALIKE)
+    return start + along[:, None] * edge, (along > -_EQUAL) & (along < 1 + _EQUAL)
 
 
 def _anticlockwise(points: Array) -> Array:
+    """(n, 2) corners in anticlockwise order."""
     return points if _signed_area(points) > 0 else points[::-1]
 
 
 def _signed_area(points: Array) -> float:
+    """Area of a polygon, positive if anticlockwise (shoelace formula)."""
     x, y = points.T
     return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
 
 
 def _centroid(points: Array, area: float) -> Array:
-    after = np.roll(points, -1, axis=0)
-    cross = points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]
-    return np.asarray(((points + after) * cross[:, None]).sum(axis=0) / (6 * area))
+    """(2,) centroid of a polygon of this signed area."""
+    following = np.roll(points, -1, axis=0)
+    cross = points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]
+    return np.asarray(((points + following) * cross[:, None]).sum(axis=0) / (6 * area))

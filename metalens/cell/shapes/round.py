@@ -90,13 +90,18 @@ class Ring:
         """
         outer = _half(size_um + grow_um)
         inner = self.ratio * size_um / 2 - grow_um / 2
-        whole = EllipseArc(outer, outer)
+        rim = EllipseArc(outer, outer)
         return Outline(
-            (whole, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (whole,)
+            (rim, EllipseArc(inner, inner, sign=-1)) if inner > 0 else (rim,)
         )
 
 
 def _half(width_um: float) -> float:
+    """Half of a width, um.
+
+    Raises:
+        CellError: no width above 0.
+    """
     if not width_um > 0:
         raise CellError(
             f"an outline {width_um:.4g} um wide: nothing is left; need a larger size or less bias"

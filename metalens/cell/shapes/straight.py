@@ -19,13 +19,17 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 
 
-def _made(corners: Array, angle_rad: float, grow_um: float) -> Outline:
+def _polygon_outline(corners: Array, angle_rad: float, grow_um: float) -> Outline:
+    """Outline of corners (n, 2) turned by an angle, every edge moved out by grow_um /
+    2.
+    """
     return Outline(
         (PolygonLoop(offset_corners(rotate_corners(corners, angle_rad), grow_um)),)
     )
 
 
 def _box(width_um: float, depth_um: float) -> Array:
+    """(4, 2) corners of a rectangle about the origin, um."""
     return np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width_um / 2, depth_um / 2)
 
 
@@ -48,7 +52,7 @@ class Square:
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of this edge, wider by ``grow_um``."""
-        return _made(_box(size_um, size_um), self.angle_rad, grow_um)
+        return _polygon_outline(_box(size_um, size_um), self.angle_rad, grow_um)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,9 @@ class Rectangle:
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of this size, both edges longer by ``grow_um``."""
-        return _made(_box(size_um, self.ratio * size_um), self.angle_rad, grow_um)
+        return _polygon_outline(
+            _box(size_um, self.ratio * size_um), self.angle_rad, grow_um
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +115,7 @@ class Cross:
         """The section of this length, every edge moved out by half of ``grow_um``."""
         a, b = size_um / 2, self.ratio * size_um / 2
         corner = np.array([(b, -a), (b, -b), (a, -b)])
-        return _made(
+        return _polygon_outline(
             np.concatenate(
                 [rotate_corners(corner, quarter * math.pi / 2) for quarter in range(4)]
             ),
@@ -147,7 +153,7 @@ class RegularPolygon:
         ``grow_um``.
         """
         turn = 2 * np.pi * np.arange(self.sides) / self.sides
-        return _made(
+        return _polygon_outline(
             size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1),
             self.angle_rad,
             grow_um,
@@ -195,20 +201,26 @@ class Polygon:
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of this size, every edge moved out by half of ``grow_um``."""
-        return _made(size_um * np.array(self.corners, float), self.angle_rad, grow_um)
+        return _polygon_outline(
+            size_um * np.array(self.corners, float), self.angle_rad, grow_um
+        )
 
 
 def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
-    """Whether the edges a-b and c-d meet."""
+    """Whether the edges a-b and c-d meet.
+
+    They do if their bounding boxes overlap, and each edge has the ends of the other on
+    different sides or on its line.
+    """
 
     def side(p: Array, q: Array, r: Array) -> float:
         return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
 
-    apart = (np.maximum(a, b) < np.minimum(c, d)) | (
+    separated = (np.maximum(a, b) < np.minimum(c, d)) | (
         np.maximum(c, d) < np.minimum(a, b)
     )  # also edges of one line
     return (
-        not apart.any()
+        not separated.any()
         and side(a, b, c) * side(a, b, d) <= 0
         and side(c, d, a) * side(c, d, b) <= 0
     )
