@@ -17,7 +17,7 @@ from characterize.model import made, parameter_vector, pillar_slopes, process_st
 from codesign.adapt import correction
 from codesign.evaluate.error_budget import BudgetInputs, ErrorBudget, scatter_rad
 from codesign.optics import LensErrors, MadeLens, OpticsConfig
-from codesign.optics.lens_errors import LensError, variance_rad2
+from codesign.optics.lens_errors import DrawnLensErrors, variance_rad2
 from layout.process.process import Process
 from layout.study import tolerance
 from metalens.cell import Cell, Index
@@ -186,16 +186,16 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
     """Mean over both polarisations, of first order: a pillar wider along x by a is one
     wider all round by a / 2.
     """
-    wide = LensError({"width_nm": 6.0}).state()
-    all_round = LensError({"bias_nm": 3.0}).state()
+    wide = DrawnLensErrors({"width_nm": 6.0}).state()
+    all_round = DrawnLensErrors({"bias_nm": 3.0}).state()
     rates = OpticsConfig().phase_rates
     # the slope of the guide is that of the proxy, smoothed
     assert variance_rad2(wide, rates) == pytest.approx(
         variance_rad2(all_round, rates), rel=0.05
     )
-    assert variance_rad2(LensError({"length_nm": 6.0}).state(), rates) == pytest.approx(
-        variance_rad2(wide, rates), rel=1e-12
-    )
+    assert variance_rad2(
+        DrawnLensErrors({"length_nm": 6.0}).state(), rates
+    ) == pytest.approx(variance_rad2(wide, rates), rel=1e-12)
     for name in ("turn_deg", "pedestal_nm", "cap_nm"):
         with pytest.raises(ConfigError, match=name):
             LensErrors(**{name: 0.1})
