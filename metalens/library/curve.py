@@ -262,8 +262,8 @@ def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve
 def _fits(
     x: Array, y: Array, tolerance: float
 ) -> tuple[RationalFunction, RationalFunction]:
-    """(best, simpler) rational fits: the one of least degree that meets the data, and
-    one with a pole more.
+    """(best, simpler) rational fits: simpler is that of least degree which meets the
+    data, best has one pole more.
     """
     simpler = rational.fit_rational_aaa(x, y, tolerance=FIT_SHARE * tolerance)
     best = rational.fit_rational_aaa(

@@ -26,12 +26,9 @@ from metalens.library.proxy import MOST_ERROR, Proxy
 PLAIN = Index(3.6)
 DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
 MOST_ALONG = 1000  # samples along a size, where there are two
-USUAL = {
-    "modal": 1e-3,
-    "rcwa": 0.02,
-    "axes": 0.05,
-}  # round pillars, others (corners converge slowly), two sizes
-# a sweep ends this far below the pitch: 10 nm of bias beyond a printable gap of 60 nm
+# default tolerances: round pillars, others (corners converge slowly), two sizes
+USUAL = {"modal": 1e-3, "rcwa": 0.02, "axes": 0.05}
+# least gap of a default sweep: a printable gap of 60 nm, less 10 nm of bias
 EDGE_GAP_UM = 0.05
 
 
@@ -97,6 +94,14 @@ class Sweep:
             self._check_lengths(self.lengths_um)
 
     def _check_lengths(self, lengths: tuple[float, float]) -> None:
+        """Refuse ranges of two sizes, and settings that do not apply to them.
+
+        Args:
+            lengths: (least, largest) size along y, um.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
         for name, span in (
             ("diameters_um", self.diameters_um or (0, 0)),
             ("lengths_um", lengths),
@@ -105,12 +110,12 @@ class Sweep:
                 raise ConfigError(
                     f"{name} = {list(span)}: with lengths_um both need 0 < least < largest"
                 )
-        plain = (
+        supported = (
             self.angles_deg == (0.0,)
             and self.light == "linear"
             and self.engine != "modal"
         )
-        if not plain or self.samples > MOST_ALONG:
+        if not supported or self.samples > MOST_ALONG:
             raise ConfigError(
                 f"lengths_um = {list(lengths)}: a library over two sizes is for normal incidence (angles_deg = [0.0]), "
                 f'light = "linear", engine auto or rcwa, and at most {MOST_ALONG} samples'
@@ -131,18 +136,19 @@ class Sweep:
         return USUAL["modal"] if self.tolerance is None else self.tolerance
 
     def with_tolerance(self, cell: Cell) -> "Sweep":
-        """The same with the tolerance that pillars of such a cell have where none is
-        stated.
+        """The settings with the default tolerance of such a cell filled in where none
+        is stated.
         """
         if self.tolerance is not None:
             return self
-        usual = (
+        kind = (
             "axes" if self.lengths_um is not None else "modal" if cell.round else "rcwa"
         )
-        return dataclasses.replace(self, tolerance=USUAL[usual])
+        return dataclasses.replace(self, tolerance=USUAL[kind])
 
     def span_um(self, cell: Cell) -> tuple[float, float]:
-        """(least, largest) diameter.
+        """(least, largest) diameter of the sweep, um; the default range where none is
+        stated.
 
         Raises:
             CellError: the diameters do not fit into the cell.
@@ -236,24 +242,26 @@ class PillarLibrary:
 
     @property
     def best_converting_um(self) -> float:
-        """The size whose least conversion over the wavelengths is largest, off
-        resonances (bars within the tolerance).
+        """Size whose least conversion over the wavelengths is largest, um; only sizes
+        whose bars meet the tolerance, if there are any.
         """
-        least = np.abs(self.cross_polarized).min(axis=0)
-        sure = (self.t_error <= self.sweep.bar).all(axis=(0, 1, 2))
-        place = int(np.where(sure | ~sure.any(), least, -1.0).argmax())
+        conversion = np.abs(self.cross_polarized).min(axis=0)
+        accurate = (self.t_error <= self.sweep.bar).all(axis=(0, 1, 2))
+        place = int(np.where(accurate | ~accurate.any(), conversion, -1.0).argmax())
         return float(self.diameter_um[place])
 
     def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
         """Mean of :attr:`lost` over pillars, at the least angle of the library.
 
-        diameter_um: of the pillars, 0 where there is none. wavelength_um: the nearest
-            of the library is taken; polarisations are averaged.
+        Args:
+            diameter_um: of the pillars, um; 0 where there is none.
+            wavelength_um: the closest one of the library is taken; polarisations are
+                averaged.
         """
-        wave = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
+        nearest = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
         pillars = np.ravel(diameter_um)[np.ravel(diameter_um) > 0]
-        of_size = self.lost[:, 0, wave].mean(axis=0)
-        return float(np.interp(pillars, self.diameter_um, of_size).mean())
+        loss = self.lost[:, 0, nearest].mean(axis=0)
+        return float(np.interp(pillars, self.diameter_um, loss).mean())
 
 
 def check_sweep(cell: Cell, sweep: Sweep) -> None:
@@ -278,7 +286,7 @@ def check_sweep(cell: Cell, sweep: Sweep) -> None:
 
 def check_light(cell: Cell, sweep: Sweep) -> None:
     """Refuse wavelengths that a material does not hold, half-spaces that absorb, and
-    orders that propagate in the cover.
+    diffraction orders that propagate in the cover.
 
     Args:
         cell: unit cell with its materials, shape and lattice.

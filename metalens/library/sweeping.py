@@ -89,27 +89,29 @@ class _SweepRun:
         )
         diameters = _diameters(self.span, sweep.samples, list(self.curves.values()))
         rows = self.rows(diameters)
-        weak = [  # a curve takes some twenty solves
+        inaccurate = [  # 20 entries: a curve takes about as many solves
             light
             for light, row in rows.items()
             if light not in self.curves and self.misses(row).sum() > 20
         ]
-        if weak:
-            self.solve(weak, "more curves")
+        if inaccurate:
+            self.solve(inaccurate, "more curves")
             rows = self.rows(diameters)
         points = self.points(diameters, rows)
         solved = self.journal.run(points, self.console, "entries one by one")
-        for task, (made,) in zip(points, solved, strict=True):
+        for task, (entries,) in zip(points, solved, strict=True):
             row = rows[task.lights[0]]
-            place = np.searchsorted(diameters, made.diameter_um)
-            better = made.error < row[2, place].real
-            values = np.concatenate([made.response.T, made.error[None]])
-            row[:, place[better]] = values[:, better]
-        count = sum(len(one.nodes.diameter_um) for one in self.curves.values())
-        count += sum(len(task.sizes_um) for task in points)
-        found = self.record(diameters, rows, count)
+            index = np.searchsorted(diameters, entries.diameter_um)
+            better = entries.error < row[2, index].real
+            values = np.concatenate([entries.response.T, entries.error[None]])
+            row[:, index[better]] = values[:, better]
+        solve_count = sum(
+            len(curve.nodes.diameter_um) for curve in self.curves.values()
+        )
+        solve_count += sum(len(task.sizes_um) for task in points)
+        result = self.record(diameters, rows, solve_count)
         self.journal.finish()
-        return found
+        return result
 
     def wave(
         self, wavelength_um: float, angle_deg: float, polarization: Polarization
