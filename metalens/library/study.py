@@ -363,14 +363,14 @@ def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
         study: what is compared.
         verdicts: of all its cells.
     """
-    covering = [v for v in verdicts if v.turns > 0]
-    uncertain = [v for v in covering if v.error > study.tolerance]
+    runs = [v for v in verdicts if v.turns > 0]
+    uncertain = [v for v in runs if v.error > study.tolerance]
     if not uncertain:
         return ""
     worst = max(uncertain, key=lambda v: v.error)
     place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
     return (
-        f"on {len(uncertain)} of {len(covering)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
+        f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
         f"largest of {worst.error:.2g} ({worst.pillar}, {place})"
     )
 
@@ -461,15 +461,15 @@ def best_cell(
 
 def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
     """Markdown lines on the best cell, with each material and wavelength."""
-    wavelengths = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
+    waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
     best = best_cell(study, verdicts)
     if best is None:
-        return [f"No cell covers a full turn at {wavelengths} nm."]
+        return [f"No cell covers a full turn at {waves} nm."]
     chosen = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
     lines = [
         "## Choice",
         "",
-        f"The lowest pillars that cover a full turn at {wavelengths} nm with one cell are {1e3 * best[1]:g} nm high; among "
+        f"The lowest pillars that cover a full turn at {waves} nm with one cell are {1e3 * best[1]:g} nm high; among "
         f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
         "",
     ]
@@ -482,7 +482,7 @@ def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
         )
     _, outside = other_materials(study)
     return lines + [
-        f"- {name} was not tried: its source does not hold {wavelengths} nm"
+        f"- {name} was not tried: its source does not hold {waves} nm"
         for name in outside
     ]
 
