@@ -326,13 +326,13 @@ def _amplitudes(quantities: dict[str, _Column], where: str) -> tuple[Array, list
             f"{where}: columns of {', '.join(sorted(quantities))}; need phase with "
             "transmission or amplitude, or t_re with t_im"
         )
-    largest = float(np.abs(t).max())
-    if largest > 1.001:
+    peak = float(np.abs(t).max())
+    if peak > 1.001:
         raise DomainError(
-            f"{where}: |t| reaches {largest:.4g}; t is normalised to power, so that |t|² "
+            f"{where}: |t| reaches {peak:.4g}; t is normalised to power, so that |t|² "
             "is the share that passes (n_cover cos / n_substrate cos times |E|²)"
         )
-    return t / max(1.0, largest), notes
+    return t / max(1.0, peak), notes
 
 
 def _sizes(quantities: dict[str, _Column], where: str) -> Array:
