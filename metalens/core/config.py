@@ -40,9 +40,9 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
 
     A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its
     field says otherwise: ``signed`` (or not), ``above`` (more than that), ``most``,
-        ``may_be_inf``. A list or name has entries unless its default is empty or
-        ``may_be_empty``. A seed is any whole number from 0. What a record itself
-        refuses is reported with file and key.
+    ``may_be_inf``. A list or name has entries unless its default is empty or
+    ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses is
+    reported with file and key.
 
     Args:
         path: of the file.
@@ -556,7 +556,9 @@ def _escaped(c: str) -> str:
     """A character inside a TOML string."""
     if c in '\\"':
         return "\\" + c
-    return "\\n" if c == "\n" else c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}"
+    if c == "\n":
+        return "\\n"
+    return c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}"
 
 
 def _text(value: Any) -> str:

@@ -195,9 +195,11 @@ def append_line(path: Path, line: str) -> None:
         line: text without a line break.
     """
     with open(path, "ab+") as file:
-        if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
-            file.seek(0)
-            file.truncate(file.read().rfind(b"\n") + 1)
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.seek(0)
+                file.truncate(file.read().rfind(b"\n") + 1)
         file.write(reading.to_valid_utf8(line).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
@@ -426,11 +428,12 @@ def _list_data_sets(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset
         StoreError: sizes that cannot be, or arrays above 64 GiB together.
     """
     data_sets: list[tuple[str, h5py.Dataset]] = []
-    file.visititems(
-        lambda name, item: (
-            data_sets.append((name, item)) if isinstance(item, h5py.Dataset) else None
-        )
-    )
+
+    def add(name: str, item: h5py.HLObject) -> None:
+        if isinstance(item, h5py.Dataset):
+            data_sets.append((name, item))
+
+    file.visititems(add)
     claimed = 0
     for name, item in data_sets:
         check_claim(path, item, name)
@@ -496,7 +499,7 @@ def _write(
     after each array.
 
     Args:
-        through: file that stores write errors.
+        checked_file: stores write errors.
         kind: of the artefact.
         version: of the kind.
         attributes: of the header.

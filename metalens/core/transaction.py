@@ -620,10 +620,9 @@ def unlisted_files(folder: Path) -> set[str]:
     """
     present = set(iterate_files(folder))
     for parent in (folder, *(path.parent for path in folder.rglob(NAME))):
-        manifest, relative = read_manifest(parent), parent.relative_to(folder)
-        present -= (
-            {(relative / name).as_posix() for name in (*manifest["files"], NAME)}
-            if manifest
-            else set()
-        )
+        manifest = read_manifest(parent)
+        relative = parent.relative_to(folder)
+        if manifest:
+            names = (*manifest["files"], NAME)
+            present -= {(relative / name).as_posix() for name in names}
     return present

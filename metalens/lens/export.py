@@ -174,8 +174,10 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
         )
     has_pillar = np.isfinite(phase)
     rows, columns = np.nonzero(has_pillar)
-    pillar_points = [(rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
-            (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2]  # fmt: skip
+    pillar_points = [
+        (rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
+        (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2,
+    ]
     interior = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
     is_interior = map_coordinates(interior, pillar_points, order=1) > 1 - 1e-9
     interpolated = map_coordinates(
@@ -264,10 +266,8 @@ def unwrap_phase(lens: Lens) -> Array:
     left = np.unwrap(phase[first:last, column::-1], axis=1)[:, ::-1]
     rows = np.concatenate([left[:, :-1], right], axis=1)
     unwrapped = np.full(phase.shape, np.nan)
-    unwrapped[first:last] = (
-        rows
-        + (np.unwrap(phase[first:last, column]) - phase[first:last, column])[:, None]
-    )
+    middle_phase = phase[first:last, column]
+    unwrapped[first:last] = rows + (np.unwrap(middle_phase) - middle_phase)[:, None]
     jump = max(
         float(np.nanmax(np.abs(np.diff(unwrapped, axis=axis)), initial=0))
         for axis in (0, 1)

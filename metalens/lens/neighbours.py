@@ -67,8 +67,8 @@ class NeighbourRows:
         least squares.
 
         Axes: along the lattice and its diagonal, field along the slope and across, a
-            and b. The factor is that of the power-normalised amplitude. Without
-            diagonal rows, those along the lattice are used for both.
+        and b. The factor is that of the power-normalised amplitude. Without diagonal
+        rows, those along the lattice are used for both.
         """
         cosine = np.sqrt(np.maximum(1 - (self.sine / self.cover) ** 2, 1e-9))
         amplitude = self.factor * np.stack([cosine**-0.5, cosine**0.5])
@@ -179,8 +179,8 @@ class NeighbourRows:
         """Variants of the rows that span their uncertainty.
 
         They are: the coarser truncation; without the row whose removal changes the mean
-            most at these sines; and the change reduced by a fifth, for zones that
-            shorten towards the rim.
+        most at these sines; and the change reduced by a fifth, for zones that shorten
+        towards the rim.
 
         Args:
             sine: (m,) by which zones turn light.

@@ -222,9 +222,9 @@ def interpolate_table(
     """t at all pairs of places by rational interpolation, and its error estimate.
 
     The value is the mean of two orders: along x then y, and along y then x. The
-        estimate is the largest change between the orders, or against an interpolation
-        with a quarter of the nodes left out. It is spread over half a node spacing, and
-        0.05 ``tolerance`` is added.
+    estimate is the largest change between the orders, or against an interpolation with
+    a quarter of the nodes left out. It is spread over half a node spacing, and 0.05
+    ``tolerance`` is added.
 
     Args:
         nodes: (m,) and (n,) rising sizes along x and y, um.
@@ -242,16 +242,13 @@ def interpolate_table(
     sparser = _interpolate_in_turn(
         x[rows], y[columns], values[np.ix_(rows, columns)], at_x, at_y, tolerance
     )
-    difference = np.maximum(
-        difference, np.abs(sparser - (x_then_y + y_then_x) / 2).max(axis=-1)
-    )
+    mean = (x_then_y + y_then_x) / 2
+    difference = np.maximum(difference, np.abs(sparser - mean).max(axis=-1))
     half_gaps = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
     difference = maximum_filter(
         difference, size=[2 * count + 1 for count in half_gaps], mode="nearest"
     )
-    return InterpolatedTable(
-        (x_then_y + y_then_x) / 2, np.asarray(difference + 0.05 * tolerance)
-    )
+    return InterpolatedTable(mean, np.asarray(difference + 0.05 * tolerance))
 
 
 def _sparser_nodes(count: int) -> Array:
@@ -283,16 +280,15 @@ def _interpolate_in_turn(
         at_y: (q,) places.
         tolerance: of t.
     """
+    residual = FIT_SHARE * tolerance
     fits = [
-        rational.fit_rational_aaa(x, values[:, k], tolerance=FIT_SHARE * tolerance)(
-            at_x
-        )
+        rational.fit_rational_aaa(x, values[:, k], tolerance=residual)(at_x)
         for k in range(len(y))
     ]
     columns = np.stack(fits, axis=1)
     return np.stack(
         [
-            rational.fit_rational_aaa(y, line, tolerance=FIT_SHARE * tolerance)(at_y)
+            rational.fit_rational_aaa(y, line, tolerance=residual)(at_y)
             for line in columns
         ]
     )
@@ -369,11 +365,9 @@ class _Nodes:
     def _of(self, pair: tuple[float, float]) -> SolvedPillar:
         """Pillar of a solved pair; exchanging its sizes exchanges x and y of t."""
         pillar = self._known[self._first(pair)]
-        return (
-            pillar
-            if self._first(pair) == pair
-            else SolvedPillar(pillar.t[::-1, ::-1], pillar.error)
-        )
+        if self._first(pair) == pair:
+            return pillar
+        return SolvedPillar(pillar.t[::-1, ::-1], pillar.error)
 
     def grid(
         self, x: Array, y: Array, console: Console, label: str
@@ -419,7 +413,10 @@ def sweep_two_sizes(
     journal = SweepJournal(checkpoint, cell, settings)
     places = size_entries(settings)
     reach = _choose_truncation(cell, settings)
-    t, error, held, solves = [], [], [], 0
+    t = []
+    error = []
+    held = []
+    solves = 0
     for index, wavelength in enumerate(settings.wavelengths_um):
         nodes = _Nodes(cell, settings, wavelength, reach, journal)
         x, y = _choose_lines(nodes, settings, console)
@@ -437,16 +434,15 @@ def sweep_two_sizes(
         error.append(bar)
         held.append(np.insert(held_pairs, 0, index, axis=1))
         solves += nodes.solves
-    axes_um = np.array(settings.wavelengths_um), *places
     provenance = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
-    all_held = np.concatenate(held)
     library = AxesLibrary(
         cell,
         settings,
-        *axes_um,
+        np.array(settings.wavelengths_um),
+        *places,
         np.array(t),
         np.array(error),
-        all_held,
+        np.concatenate(held),
         solves,
         reach,
         provenance,
@@ -515,9 +511,8 @@ def _choose_lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array,
         # a few pairs in a hundred may lie near resonances
         if share_above <= 0.03 or len(x) >= MOST:
             return x, y
-        capped = np.minimum(
-            doubt, 10 * sweep.bar
-        )  # so that one resonance does not take all lines
+        # capped, so that one resonance does not take all lines
+        capped = np.minimum(doubt, 10 * sweep.bar)
         profiles = [capped.mean(axis=1), capped.mean(axis=0)]
         if nodes.swaps:
             profiles = [profiles[0] + profiles[1]] * 2
@@ -529,7 +524,7 @@ def _add_lines(lines: Array, sizes: Array, profile: Array) -> Array:
 
     Args:
         lines: (m,) nodes, um.
-        look: (p,) sizes, um.
+        sizes: (p,) um.
         profile: (p,) doubt at these sizes.
     """
     for _ in range(2):

@@ -77,10 +77,9 @@ class ResponseCurve:
 
         The estimate adds the largest disagreement with a rival fit, the residual of the
         fit, a tenth of the tolerance, and the solver's error. The last is mostly a
-        small shift of
-        the diameter: it is carried from the neighbouring nodes in proportion to the
-            slope of t. The estimate is capped at 1 + max(1, |t|), as a pillar is
-            passive. At a node it is the solver's own.
+        small shift of the diameter: it is carried from the neighbouring nodes in
+        proportion to the slope of t. The estimate is capped at 1 + max(1, |t|), as a
+        pillar is passive. At a node it is the solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -95,9 +94,8 @@ class ResponseCurve:
         node_error = self.nodes.error[order]
         shift = node_error / self._steepness(x)
         value = self.best(d)
-        error = self._doubt(d) + np.maximum(
-            shift[right - 1], shift[right]
-        ) * self._steepness(d)
+        larger_shift = np.maximum(shift[right - 1], shift[right])
+        error = self._doubt(d) + larger_shift * self._steepness(d)
         for side in (right - 1, right):
             at_node = x[side] == d
             value[at_node] = self.nodes.response[order[side[at_node]]]
@@ -221,11 +219,11 @@ def sample_adaptively(
         place, doubt = _most_doubtful(
             fit, [simpler, *earlier_fits[-2:]], np.array(x), cheaper
         )
-        resolved = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(
-            simpler.support
-        )
-        agreed = resolved and doubt < tolerance / 2
-        place = _widest_gap(x, cheaper) if agreed and predicted == 0 else place
+        meets_data = simpler.residual <= FIT_SHARE * tolerance
+        has_spare_pole = len(fit.support) > len(simpler.support)
+        agreed = meets_data and has_spare_pole and doubt < tolerance / 2
+        if agreed and predicted == 0:
+            place = _widest_gap(x, cheaper)
         response = solve(place)
         error = np.abs(fit(np.array([place]))[0] - (response.t, response.r)).max()
         x.append(place)
@@ -329,11 +327,9 @@ def _widest_gap(x: list[float], cheaper: Array) -> float:
     middle = (ordered[widest] + ordered[widest + 1]) / 2
     quarter = (ordered[widest + 1] - ordered[widest]) / 4
     distance = np.abs(cheaper - middle)
-    return float(
-        cheaper[np.argmin(distance)]
-        if distance.min(initial=np.inf) < quarter
-        else middle
-    )
+    if distance.min(initial=np.inf) < quarter:
+        return float(cheaper[np.argmin(distance)])
+    return float(middle)
 
 
 def _responses(responses: list[Response]) -> Array:

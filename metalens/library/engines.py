@@ -115,17 +115,15 @@ def solvers_at_common_discretization(
             for light in lights
         ]
     by_light = [
-        [
-            functools.cache(level)
-            for level in (
-                _modal_levels(cell, light, tolerance)
-                if engine == "modal"
-                else _rcwa_levels(cell, light, span_um[1], tolerance)
-            )
-        ]
+        _modal_levels(cell, light, tolerance)
+        if engine == "modal"
+        else _rcwa_levels(cell, light, span_um[1], tolerance)
         for light in lights
     ]
-    levels = list(zip(*by_light, strict=True))
+    levels = [
+        [functools.cache(solver) for solver in level]
+        for level in zip(*by_light, strict=True)
+    ]
     probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
     allowed_misses = 1 if engine == "modal" else 0
     for index, level in enumerate(levels[:-1]):
@@ -212,14 +210,10 @@ def _rcwa_levels(
     if not cell.round:
         from metalens.rcwa import most_harmonics
 
-        largest_truncation = most_harmonics(
+        most = most_harmonics(
             cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
         )
-        truncations = (
-            (*range(6, largest_truncation - 1, 2), largest_truncation)
-            if largest_truncation > 6
-            else (largest_truncation - 1, largest_truncation)
-        )
+        truncations = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
     settings = {"tolerance": tolerance}
     return [
         functools.partial(

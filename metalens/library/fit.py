@@ -416,18 +416,18 @@ def _choose_coefficients(
         # so many coefficients may take |T| below 0: then the last result stands
         with contextlib.suppress(DomainError):
             longer_domain, longer_proxy = _longest_domain(branch, limits, more)
-            if _cost(longer_proxy, limits) <= 1 and len(
-                longer_domain.diameter_um
-            ) > len(domain.diameter_um):
+            is_longer = len(longer_domain.diameter_um) > len(domain.diameter_um)
+            if _cost(longer_proxy, limits) <= 1 and is_longer:
                 domain, proxy, terms = longer_domain, longer_proxy, more
-    for fewer in range(terms - 1, 1, -1) if _cost(proxy, limits) > 1 else ():
+    if _cost(proxy, limits) <= 1:
+        return domain, proxy, terms
+    for fewer in range(terms - 1, 1, -1):
         candidate = _best_power(domain, limits, fewer)
         if candidate is not None and _cost(candidate, limits) < _cost(proxy, limits):
             proxy, terms = candidate, fewer
-    shortened = (
-        _cut_last_diameters(domain, limits, terms) if _cost(proxy, limits) > 1 else None
-    )
-    return shortened or (domain, proxy, terms)
+    if _cost(proxy, limits) <= 1:
+        return domain, proxy, terms
+    return _cut_last_diameters(domain, limits, terms) or (domain, proxy, terms)
 
 
 def _cut_last_diameters(
@@ -566,9 +566,8 @@ def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
     level = _minimax(axes, data.level, terms)
-    upper_bound = polynomial.certified_bounds(
-        level, points=64 if level.size > terms else 512
-    )[1]
+    points = 64 if level.size > terms else 512
+    _, upper_bound = polynomial.certified_bounds(level, points=points)
     if upper_bound > 1 - HEADROOM:
         level = level * ((1 - HEADROOM) / upper_bound)
     errors = [
@@ -662,9 +661,8 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
     for _ in range(rounds):
         root = np.sqrt(weight)[..., None]
         q, r = np.linalg.qr(basis * root)
-        coefficients = np.linalg.solve(
-            r, np.swapaxes(q, -1, -2) @ (values[..., None] * root)
-        )[..., 0]
+        projected = np.swapaxes(q, -1, -2) @ (values[..., None] * root)
+        coefficients = np.linalg.solve(r, projected)[..., 0]
         deviation = np.abs(np.einsum("nk,...k->...n", basis, coefficients) - values)
         largest = deviation.max(axis=-1)
         better = largest < least_deviation
@@ -699,10 +697,9 @@ def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
     t = library.cross_polarized
     d = library.diameter_um
     middle = int(np.searchsorted(d, library.best_converting_um))
-    least_conversion = 0.85 * np.abs(t[:, middle]).min()
-    good = (np.abs(t).min(axis=0) >= least_conversion) & ~_near_narrow_resonances(
-        library, limits.least_half_width_um
-    )
+    conversion = np.abs(t[:, middle]).min()
+    good = np.abs(t).min(axis=0) >= 0.85 * conversion
+    good &= ~_near_narrow_resonances(library, limits.least_half_width_um)
     if limits.within_um is not None:
         good &= (d >= limits.within_um[0]) & (d <= limits.within_um[1])
     runs = (run for run in find_runs(good) if run.start <= middle < run.stop)
@@ -710,12 +707,11 @@ def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
     if run.stop - run.start < LEAST_ENTRIES:
         raise DomainError(
             f"fewer than {LEAST_ENTRIES} sizes around {d[middle]:.4g} um, where most light is converted "
-            f"({np.abs(t[:, middle]).min() ** 2:.0%}), are free of resonances: sweep with more samples, or another cell"
+            f"({conversion**2:.0%}), are free of resonances: sweep with more samples, or another cell"
         )
     phase = np.unwrap(np.angle(t[:, run]), axis=-1)
-    phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[
-        :, None
-    ]
+    at_best = phase[:, middle - run.start]
+    phase += (np.unwrap(at_best) - at_best)[:, None]  # along the wavelengths
     branch = MonotonicBranch(
         phase[None],
         np.abs(t[:, run])[None],
@@ -728,7 +724,7 @@ def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
     inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
     notes = (
-        f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",
+        f"converted light: at {d[middle]:.4f} um {conversion**2:.3f} of it changes hand",
     )
     return ProxyFit(
         proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, limits), math.nan

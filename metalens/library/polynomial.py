@@ -152,7 +152,7 @@ def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
     """:func:`_term` as a torch function that saves only its input for derivatives.
 
     Terms are closed under differentiation: with a = dx/d(D^m) and m = power, d/dD [D^k
-        q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
+    q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
     """
     import torch
 

@@ -77,13 +77,14 @@ class _SweepRun:
         entries that are still above it are solved one by one.
         """
         sweep = self.sweep
-        nodes = pick_nodes(sweep.wavelengths_um), pick_nodes(sweep.angles_deg)
+        wavelengths = pick_nodes(sweep.wavelengths_um)
+        angles = pick_nodes(sweep.angles_deg)
         self.solve(
             [
                 self.wave(wavelength, angle, polarization)
-                for angle in nodes[1]
+                for angle in angles
                 for polarization in sweep.polarizations
-                for wavelength in nodes[0]
+                for wavelength in wavelengths
             ],
             "curves",
         )
@@ -119,7 +120,7 @@ class _SweepRun:
         """Plane wave of an entry, with s and p written as x and y at normal incidence.
 
         The plane of incidence is along x: s is y, and p is x. Cells that respond
-            equally to both use x for s as well.
+        equally to both use x for s as well.
         """
         if not angle_deg and polarization in ("s", "p"):
             along_y = polarization == "s" and not self.cell.alike
@@ -301,7 +302,7 @@ def _interpolate_family(
     Args:
         rows: by plane wave; extended.
         family: {position: plane wave} along wavelength or sin² of the angle.
-        sharp: (k, 2) narrow resonances of each curve: diameter and half-width, um.
+        resonances: (k, 2) narrow ones of each curve: diameter and half-width, um.
         diameters: (n,) um.
     """
     solved = {x: wave for x, wave in family.items() if wave in rows}
@@ -339,16 +340,9 @@ def _crossed_by_resonances(first: Array, second: Array, diameters: Array) -> Arr
     for poles, others in ((first, second), (second, first)):
         for centre, width in poles:
             distance = np.abs(others[:, 0] - centre)
-            end = (
-                float(others[np.argmin(distance), 0])
-                if distance.size and distance.min() < reach_um
-                else None
-            )
-            low, high = (
-                (centre - reach_um, centre + reach_um)
-                if end is None
-                else sorted((centre, end))
-            )
+            low, high = centre - reach_um, centre + reach_um
+            if distance.size and distance.min() < reach_um:
+                low, high = sorted((centre, float(others[np.argmin(distance), 0])))
             mask |= (diameters >= low - 4 * width) & (diameters <= high + 4 * width)
     return mask
 
@@ -357,11 +351,11 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     """(3, diameter) row at ``x`` by the polynomial through all nodes: t, r, error
     estimate.
 
-    The error is extrapolated from leave-out tests. ``one`` is the change by leaving out
-    one node, ``two`` that by leaving out a second. The polynomial through all nodes is
-    taken to gain over ``one`` as ``one`` gains over ``two``: error = 3 one min(1, one /
-    two), plus the nodes' errors times |weight|. Changes are the largest of nine
-    neighbouring diameters, as one alone may vanish by chance.
+    The error of t is extrapolated from leave-out tests. The first change c1 is that of
+    t by leaving out one node, the second c2 by leaving out another one as well. Each
+    node is taken to reduce the error by c1 / c2: error = 3 c1 min(1, c1 / c2), plus the
+    nodes' errors times |weight|. Changes are the largest of nine neighbouring
+    diameters, as one alone may vanish by chance.
 
     Args:
         nodes: (m,) positions.
@@ -370,19 +364,24 @@ def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
     """
     weights = lagrange_weights(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
-    one = np.zeros(table.shape[2])
-    two = np.zeros(table.shape[2])
+    first_change = np.zeros(table.shape[2])
+    second_change = np.zeros(table.shape[2])
     for k in range(len(nodes)):
-        keep = np.arange(len(nodes)) != k
-        without = np.tensordot(lagrange_weights(nodes[keep], x), table[keep, 0], 1)
-        one = np.maximum(one, np.abs(without - row[0]))
+        all_but_k = np.arange(len(nodes)) != k
+        reduced = np.tensordot(
+            lagrange_weights(nodes[all_but_k], x), table[all_but_k, 0], 1
+        )
+        first_change = np.maximum(first_change, np.abs(reduced - row[0]))
         for j in range(k):
-            fewer = keep & (np.arange(len(nodes)) != j)
-            lower = np.tensordot(lagrange_weights(nodes[fewer], x), table[fewer, 0], 1)
-            two = np.maximum(two, np.abs(lower - without))
-    one, two = (maximum_filter1d(change, 9) for change in (one, two))
-    gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
-    row[2] = 3 * gain * one + np.abs(weights) @ table[:, 2].real
+            all_but_jk = all_but_k & (np.arange(len(nodes)) != j)
+            twice_reduced = np.tensordot(
+                lagrange_weights(nodes[all_but_jk], x), table[all_but_jk, 0], 1
+            )
+            second_change = np.maximum(second_change, np.abs(twice_reduced - reduced))
+    first_change = maximum_filter1d(first_change, 9)
+    second_change = maximum_filter1d(second_change, 9)
+    gain = np.minimum(1.0, first_change / np.maximum(second_change, 1e-300))
+    row[2] = 3 * gain * first_change + np.abs(weights) @ table[:, 2].real
     return row
 
 
