@@ -426,6 +426,12 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
 
     A table takes the record of its ``kind``, or the record that knows most of its keys.
     Any other value takes the first type that fits.
+
+    Args:
+        value: from the table.
+        options: types of the union.
+        where: file or place that errors name.
+        key: its full name in errors.
     """
     kinds = _kinds(options)
     if kinds and isinstance(value, dict):

@@ -41,9 +41,9 @@ _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where an artefact comes from.
+    """Origin of an artefact.
 
-    config: the settings that made it, as TOML text.
+    config: its settings, as TOML text.
     inputs: {file name: SHA-256} of every file read.
     seed: of the random generator, -1 where none was used.
     versions: {package: version}.
@@ -59,8 +59,12 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StoredArtefact:
-    """The content of an artefact file: ``arrays`` by name (``group/name``),
-    ``attributes`` of the header.
+    """Content of an artefact file.
+
+    kind, version: from its header.
+    arrays: by name (``group/name``).
+    attributes: of the header.
+    provenance: of the artefact.
     """
 
     kind: str

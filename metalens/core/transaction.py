@@ -42,10 +42,10 @@ _MARKS = (
 class OutputDraft:
     """A claimed output.
 
-    path: where to write it; companions of a file go into the same folder under their own
-    names.
-    target: where all appears at the end; where a link leads. resumed: whether ``path``
-    holds work of an earlier run.
+    path: where to write it; companions of a file go into the same folder under their
+        own names.
+    target: its final path; where a link leads.
+    resumed: whether ``path`` holds work of an earlier run.
     """
 
     path: Path
@@ -57,10 +57,10 @@ class OutputDraft:
 class ClaimTerms:
     """What a claim allows.
 
-    force: whether what exists may be replaced, if it is ours. inputs: files and folders
-    that are read.
-    room: bytes that the output needs. parents: whether missing folders above it are
-    made.
+    force: whether an existing output may be replaced, if it is ours.
+    inputs: files and folders that are read.
+    room: bytes that the output needs.
+    parents: whether missing folders above it are created.
     """
 
     force: bool = False

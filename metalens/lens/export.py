@@ -39,7 +39,7 @@ def check_export_format(path: str | Path) -> None:
 
 
 def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
-    """Write a lens in the format that the name's ending says.
+    """Write a lens in the format of the name's ending.
 
     ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission,
     pitch_um, wavelength_um; where pillars are turned angle_rad; where they have two
@@ -47,10 +47,12 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
 
     Args:
-        path: target; its ending says the format.
+        path: target; its ending selects the format.
+        lens: the lens.
+        samples: points of a grid phase along a side.
 
     Returns:
-        largest difference in phase (rad) between the pillars and what a program
+        Largest difference in phase (rad) between the pillars and what a program
             interpolates; 0 for the arrays.
 
     Raises:
@@ -109,11 +111,11 @@ def lens_arrays(lens: Lens) -> dict[str, Array]:
 class GridPhase:
     """Phase on a square grid, +y down as everywhere here.
 
-    phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be
+    phase_rad: (n, n), extended a few points beyond the lens, so that its rim can be
         interpolated; nan further out.
-    step_um: of the points. error_rad: largest difference between the pillars and the
-        cubic interpolation of the points, a few points inside the rim, where a program
-        has all it needs.
+    step_um: spacing of the points.
+    error_rad: largest difference between the pillars and the cubic interpolation of the
+        points, taken a few points inside the rim.
     """
 
     phase_rad: Array
@@ -121,12 +123,12 @@ class GridPhase:
     error_rad: float
 
     def text(self) -> str:
-        """The file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy
-        nodata`` a point, largest y first.
+        """Text of the file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy
+        dxy nodata`` per point, largest y first.
 
         Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the
-            program then takes differences. The blanks that end the first line say whose
-            file it is.
+            program then takes differences. The blanks at the end of the first line mark
+            it as our file.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
         lines = [f"{n} {n} {step} {step} 0 0 0\t \t"]

@@ -21,14 +21,15 @@ _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 class NeighbourRows:
     """Supercell responses of rows of non-identical pillars of a lens.
 
-    sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
-        diagonal of the lattice.
-    factor: (2, n) complex tangential amplitude where the light should go, over that of
-        pillars one by one; of light whose field lies along the row, and across it.
-        coarse: (2, n) the same at a coarser truncation.
-    scatter: (n,) share of the transmitted power that goes elsewhere, beyond what
-        pillars one by one would send there.
-    wavelength_um: of the rows. cover: index of the medium behind the pillars.
+    sine: (n,) by which a row turns light.
+    diagonal: (n,) whether it runs along the diagonal of the lattice.
+    factor: (2, n) complex tangential amplitude in the intended direction, over that of
+        the locally periodic model; for fields along the row, and across it.
+    coarse: (2, n) the same at a coarser truncation.
+    scatter: (n,) share of the transmitted power in other directions, beyond that of the
+        locally periodic model.
+    wavelength_um: of the rows.
+    cover: index of the medium behind the pillars.
 
     Raises:
         LensError: arrays that do not belong together, no row along the lattice, a sine
@@ -44,6 +45,7 @@ class NeighbourRows:
     cover: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
         n = len(self.sine)
         shapes = {name: np.shape(getattr(self, name)) for name in _ARRAYS}
         if shapes != {

@@ -80,6 +80,7 @@ class DiameterMap:
     pillars: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
+        """Check the map in blocks of rows, and count its pillars."""
         d = self.diameter_um
         if d.ndim != 2:
             raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
@@ -211,12 +212,13 @@ class TwoSizeTable:
     """Transmission of pillars over the size along x and that along y, for light
     polarised along x and along y.
 
-    wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2)
-        power-normalised amplitudes that keep the polarisation, exp(-iwt).
-    focus_y_um: (sensor, source) distance of the light polarised along y; that of the
-        lens is of light along x.
-    entry_error: root mean square of the error bars of the pillars that stand in the
-        lens, relative to |t|; nan where it is not known (older files).
+    wavelength_um: (w,) vacuum wavelengths.
+    x_um, y_um: (m,) and (n,) evenly spaced sizes.
+    t: (w, m, n, 2) power-normalised amplitudes that keep the polarisation, exp(-iwt).
+    focus_y_um: (sensor, source) distances for light polarised along y; those of the
+        lens are for light along x.
+    entry_error: root mean square of the error bars of the pillars in the lens, relative
+        to |t|; nan where it is not known (older files).
     """
 
     wavelength_um: Array
@@ -227,6 +229,7 @@ class TwoSizeTable:
     entry_error: float = math.nan
 
     def __post_init__(self) -> None:
+        """Refuse values that do not fit the axes or are not finite."""
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um), 2)
         if self.t.shape != shape or min(shape) < 1 or not np.isfinite(self.t).all():
             raise LensError(
@@ -307,23 +310,24 @@ class Lens:
     """A designed (or as-built) metalens.
 
     diameters: of every pillar.
-    cell: the pillar cell that the proxy was made for.
+    cell: the pillar cell that the proxy describes.
     proxy: diameter and wavelength to phase and transmission (paper Eq. 2).
     wavelength_um: of the design.
     sensor_distance_um: lens to sensor, in the cover medium.
     source_distance_um: object distance of best focus (inf for a collimated beam).
     profile: name of the design (hyperbolic, double-helix, cubic, fisher, map,
         as-built).
-    provenance: config and inputs that made it.
+    provenance: config and inputs of the design.
     layers: films in front and behind; their cover is that of the cell.
-    hand: circular light that the lens is made for: "right" (field x + iy, the phase
-        grows by twice the turn of a pillar) or "left"; the proxy is then that of the
-        light that leaves with the other hand. Empty: any light.
-    pairs: table of pillars of two sizes in place of the proxy; None where they have
-        one. light: polarisation, "x" or "y", that phase, transmission and distances are
-        for where they have two (:meth:`seen`).
-    neighbours: rows of its own non-identical pillars (:func:`metalens.design.neighbours`),
-        whose factor PSFs and images then hold; None where none was solved.
+    hand: incident circular light of the design: "right" (field x + iy, the phase grows
+        by twice the turn of a pillar) or "left". The proxy then describes the light
+        that leaves with the other hand. Empty: any light.
+    pairs: table of pillars of two sizes in place of the proxy; None for one size.
+    light: polarisation, "x" or "y", of phase, transmission and distances where pillars
+        have two sizes (:meth:`seen`).
+    neighbours: solved rows of its own non-identical pillars
+        (:func:`metalens.design.neighbours`), whose factor PSFs and images then include;
+        None where none was solved.
 
     Raises:
         LensError: layers with another cover than the cell's; turned pillars without a
@@ -346,6 +350,7 @@ class Lens:
     neighbours: NeighbourRows | None = None
 
     def __post_init__(self) -> None:
+        """Check the parts against each other, and set the cover of the layers."""
         if (self.pairs is None) != (self.diameters.length_um is None) or (
             self.pairs is None and self.light != "x"
         ):

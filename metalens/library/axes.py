@@ -37,21 +37,20 @@ class AxesLibrary:
     normal incidence.
 
     Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the
-    pillar's foot to that of its top, as :class:`metalens.cell.response.Response` has
-    it. The sizes are those before the turn of the shape.
+    pillar's foot to that of its top, as in :class:`metalens.cell.response.Response`.
+    The sizes are those before the turn of the shape.
 
     cell, sweep: what was computed.
-    wavelength_um: (w,). x_um: (m,), y_um: (n,) sizes, evenly spaced with one step.
-    t: (w, m, n, 2, 2) Jones matrices; last axis: polarisation that comes (x, y), the
-    one before: that leaves.
+    wavelength_um: (w,) vacuum wavelengths.
+    x_um, y_um: (m,) and (n,) sizes, evenly spaced with one step.
+    t: (w, m, n, 2, 2) Jones matrices; the last axis is the incident polarisation (x,
+        y), the one before it the outgoing one.
     t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not
-    below the true error: solver and
-        interpolation.
+        below the true error: solver and interpolation.
     held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the
-    wavelength, x, y, largest
-        |interpolated - solved| on one truncation, error bar of the entry.
-    solves: behind the entries. harmonics: orders of the truncation, the same for all
-    entries.
+        wavelength, x, y, largest |interpolated - solved| on one truncation, error bar.
+    solves: number of exact solves behind the entries.
+    harmonics: orders of the truncation, the same for all entries.
     """
 
     cell: Cell
@@ -67,6 +66,7 @@ class AxesLibrary:
     provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, and values that are not finite."""
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um))
         if self.t.shape != (*shape, 2, 2) or self.t_error.shape != shape:
             raise DomainError(
@@ -328,8 +328,12 @@ class _Nodes:
     def solve(
         self, pairs: list[tuple[float, float]], console: Console, label: str
     ) -> list[SolvedPillar]:
-        """Jones matrix and error bar of every pair (x, y) of sizes in um; new pairs are
-        solved in parallel.
+        """Jones matrix and error bar of every pair; new pairs are solved in parallel.
+
+        Args:
+            pairs: (x, y) sizes, um.
+            console: where progress is shown.
+            label: names the pairs in the progress.
         """
         new_pairs = list(
             dict.fromkeys(

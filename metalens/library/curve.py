@@ -25,11 +25,13 @@ FINEST_UM = 2e-5
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SolvedNodes:
-    """Exact solves of one curve, in the order they were made.
+    """Exact solves of one curve, in the order in which they were computed.
 
-    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver.
-    converged: whether the last nodes were predicted within the tolerance; reason: why
-        the search stopped.
+    diameter_um: (n,) of the pillars.
+    response: (n, 2) complex t and r.
+    error: (n,) error estimate of the solver.
+    converged: whether the last nodes were predicted within the tolerance.
+    reason: why the search stopped.
     """
 
     diameter_um: Array

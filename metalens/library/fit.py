@@ -74,7 +74,12 @@ class ProxyTolerances:
 
 @dataclass(frozen=True, slots=True)
 class FitTrial:
-    """One line of the table of error against coefficients."""
+    """Errors of a proxy with a given number of coefficients, for the table of a fit.
+
+    coefficients: of phase and |T| together.
+    power: the polynomials run in diameter^power.
+    phase_error_rad, transmission_error: largest deviation from the entries.
+    """
 
     coefficients: int
     power: int
@@ -84,17 +89,17 @@ class FitTrial:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProxyFit:
-    """A proxy and why it is as it is.
+    """A proxy with the limits of its domain and its errors.
 
-    notes: where its domain was cut, and why. table: error against the number of
-        coefficients on that domain.
-    turns: covered by the domain, the least over wavelengths and angles.
-    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their
-        mean.
-    shortfall: by how much the proxy misses the tolerances that were wanted, for a
-        person; empty where it meets them.
-    smooth_turns: covered by the diameters without resonance, as far as the proxy or
-        not.
+    proxy: the polynomials.
+    notes: where the domain was cut, and the reasons.
+    table: error against the number of coefficients on that domain.
+    turns: phase range of the domain, the least over wavelengths and angles.
+    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy describes
+        their mean.
+    shortfall: message on tolerances that the proxy misses; empty where it meets them.
+    smooth_turns: phase range of all diameters without resonance, also outside the
+        domain.
     """
 
     proxy: Proxy
@@ -113,9 +118,9 @@ class MonotonicBranch:
     phase: (angle, wavelength, diameter) rad, unwrapped along every axis.
     level: |t|, as phase.
     diameter_um, wavelength_um, angle_rad: the axes.
-    notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
-        their mean.
-    gaps_um: (least, largest) diameters inside the stretch around narrow resonances,
+    notes: what bounds the diameters.
+    polarization_spread: largest |t_s - t_p| / 2; phase and level are of their mean.
+    gaps_um: (least, largest) diameters around narrow resonances inside the branch,
         which no pillar of a lens should have.
     """
 

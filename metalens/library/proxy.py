@@ -72,6 +72,7 @@ class Proxy:
     gaps_um: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse an empty domain, and |T| outside [0, 1] by its certified bounds."""
         low, high = self.domain_um
         if not 0 <= low < high < math.inf:
             raise DomainError(

@@ -62,6 +62,7 @@ class Sweep:
     lengths_um: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        """Refuse settings out of range."""
         for name, values in (
             ("wavelengths_um", self.wavelengths_um),
             ("angles_deg", self.angles_deg),
@@ -207,6 +208,7 @@ class PillarLibrary:
     turned: GeometricPhase | None = None
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, and values that are not finite."""
         shape = (
             len(self.polarization),
             len(self.angle_rad),

@@ -68,6 +68,7 @@ class CellStudy:
     cell: Cell | None = None
 
     def __post_init__(self) -> None:
+        """Refuse settings that contradict each other or leave no printable pillar."""
         if self.cell is not None and self.pillar != PLAIN:
             raise ConfigError(
                 "pillar and cell are both given: a cell has its own material; give pillar inside cell"
@@ -103,16 +104,16 @@ class CellStudy:
 
 @dataclass(frozen=True, slots=True)
 class CellVerdict:
-    """One cell at one wavelength.
+    """Result of one cell at one wavelength, on its longest smooth run of diameters.
 
-    turns: of phase that the longest smooth stretch covers; from_um, to_um: its
-        diameters.
-    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in
-        phase.
+    turns: of phase that the run covers.
+    from_um, to_um: its diameters.
+    least_transmission: smallest |t| on it.
+    mean_power: mean |t|² over it, weighted evenly in phase.
     ends: what bounds it above.
     max_angle_deg: of incidence in air up to which no diffraction order propagates, in
         substrate or cover.
-    error: largest error estimate of t on the stretch.
+    error: largest error estimate of t on it.
     pillar: name of the material, or n + ik.
     """
 
