@@ -136,8 +136,8 @@ def merge_tables(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def dumps(record: Any) -> str:
-    """TOML text of a config record; ``loads`` gives the same record back. Fields that
-    are None are left out.
+    """TOML text of a config record, from which ``loads`` restores it; fields that are
+    None are omitted.
     """
     lines: list[str] = []
     _dump(record, "", lines)
@@ -559,7 +559,7 @@ def _dump(record: Any, prefix: str, lines: list[str]) -> None:
 
 
 def _escaped(c: str) -> str:
-    """A character inside a TOML string."""
+    """A character as written inside a TOML string."""
     if c in '\\"':
         return "\\" + c
     if c == "\n":

@@ -32,7 +32,7 @@ _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return (
         len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")

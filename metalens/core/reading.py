@@ -9,7 +9,8 @@ _WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def decode_text(content: bytes) -> str:
-    """Text of UTF-8, or of UTF-16 with its byte-order mark (as spreadsheets save it).
+    """Text decoded from UTF-8, or from UTF-16 with a byte-order mark (as spreadsheets
+    save it).
 
     Args:
         content: bytes of the file.

@@ -42,7 +42,13 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of text or numbers under a head, as :func:`in_figures` shows them."""
+    """Rows of text or numbers under a head.
+
+    head: titles of the columns.
+    rows: values, written by :func:`in_figures`.
+    caption: text above the table; empty for none.
+    digits: significant digits of numbers.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[Any]]
@@ -384,7 +390,7 @@ class Console:
     json: bool = False
 
     def say(self, text: str) -> None:
-        """One line for a person."""
+        """Print one line, unless quiet or with --json."""
         if not (self.quiet or self.json):
             flush_output(text + "\n")
 
@@ -412,7 +418,7 @@ class Console:
         return self.judged(dict(values), "\n".join(lines), failures)
 
     def result(self, values: dict[str, Any], text: str) -> None:
-        """The outcome: ``values`` with --json, else ``text``."""
+        """Print the outcome: ``values`` as JSON with --json, else ``text``."""
         if self.json:
             flush_output(json.dumps(values, indent=1, default=float) + "\n")
         else:

@@ -88,7 +88,7 @@ def sha256(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes.
 
     Args:
-        path: file to read or write.
+        path: of the file.
     """
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -162,7 +162,7 @@ def hold_lock(target: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file, or the names in a folder, to the disk."""
+    """Flush a file, or the directory entries of a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -171,19 +171,20 @@ def sync_file(path: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) whole or not at all.
+    """Write a text file (UTF-8), whole or not at all.
 
     Args:
-        path: file to read or write.
+        path: of the file.
+        text: its content.
     """
     write_bytes(path, reading.to_valid_utf8(text).encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all.
+    """Write a file, whole or not at all.
 
     Args:
-        path: file to read or write.
+        path: of the file.
         content: bytes of the file.
     """
     with replace_atomically(path) as scratch, open(scratch, "wb") as file:
@@ -566,6 +567,7 @@ def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
 
 
 def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
+    """Write the group ``provenance``: config, seed, inputs and versions."""
     group = file.create_group("provenance")
     _write_attribute(group, "config", provenance.config)
     _write_attribute(group, "seed", provenance.seed)
@@ -607,7 +609,7 @@ def save_record(path: str | Path, kind: str, record: Any) -> None:
 
 
 def load_record(path: str | Path, kind: str, record_type: type[Record]) -> Record:
-    """Read what :func:`save_record` wrote, as a ``record_type``.
+    """Read a ``record_type`` that :func:`save_record` wrote.
 
     Args:
         path: of the file.
@@ -729,7 +731,7 @@ def _holds_arrays(kind: Any) -> bool:
 
 
 def _without_none(hint: Any) -> Any:
-    """The type of ``X`` or ``X | None``."""
+    """The type X of ``X`` or ``X | None``."""
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint
     return next(kind for kind in typing.get_args(hint) if kind is not type(None))
@@ -741,7 +743,7 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _to_tuple(value: Any) -> Any:
-    """Nested lists as tuples, bytes as text."""
+    """Nested lists as nested tuples, and bytes as text."""
     if isinstance(value, list):
         return tuple(_to_tuple(item) for item in value)
     return value.decode() if isinstance(value, bytes) else value

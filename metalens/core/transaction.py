@@ -537,7 +537,7 @@ def check_manifest(folder: Path) -> None:
 
 
 def sync_files(folder: Path) -> None:
-    """Flush a folder and all that is in it."""
+    """Flush a folder and all files below it to the disk."""
     for place, _, names in os.walk(folder):
         for path in (*(Path(place, name) for name in names), Path(place)):
             store.sync_file(path)

@@ -57,7 +57,8 @@ def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
 
 
 def diffraction_um(lens: Lens | ApertureSummary) -> float:
-    """Wavelength over the paraxial numerical aperture of the image side, um.
+    """Diffraction length wavelength / NA, with the paraxial numerical aperture of the
+    image side, um.
 
     Args:
         lens: the lens.
@@ -81,8 +82,8 @@ def window_um(
 
 
 def disc_um(lens: Lens | ApertureSummary) -> float:
-    """Radius of a defocused spot at which its depth can be resolved: 5.3 wavelength /
-    NA, 2 digits.
+    """Radius of a defocused spot whose depth can just be resolved: 5.3 wavelength / NA,
+    um; 2 digits.
 
     Args:
         lens: the lens.
@@ -92,7 +93,7 @@ def disc_um(lens: Lens | ApertureSummary) -> float:
 
 def pixel_um(lens: Lens | ApertureSummary) -> float:
     """Pixel pitch that samples most of the information of a spot: 0.88 wavelength / NA,
-    2 digits.
+    um; 2 digits.
 
     Args:
         lens: the lens.
@@ -120,8 +121,8 @@ def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 
 
 def sample_um(lens: Lens | ApertureSummary, pixel_um: float) -> float:
-    """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a
-    pixel; 2 digits.
+    """Sampling pitch of intensities: 0.86 wavelength / (4 sin(rim angle)), at most a
+    quarter of a pixel, um; 2 digits.
 
     Args:
         lens: the lens.

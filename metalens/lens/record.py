@@ -149,8 +149,8 @@ class DiameterMap:
 
     @property
     def grid(self) -> "SiteSpacing":
-        """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on
-        a square lattice.
+        """Spacing of the sites for :func:`metalens.propagate.make_case`; zeros on a
+        square lattice.
         """
         square = self.lattice.kind == "square" and not self.row_um
         column, row = self.steps_um
@@ -457,7 +457,12 @@ class Lens:
     def transmission(
         self, wavelength_um: float | None = None, angle_rad: float = 0.0
     ) -> Array:
-        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none."""
+        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none.
+
+        Args:
+            wavelength_um: of the design where it is left out.
+            angle_rad: of incidence in air.
+        """
         if self.pairs is not None:
             return np.minimum(
                 np.abs(self._amplitude(slice(None), self.pairs, wavelength_um)), 1.0

@@ -104,7 +104,11 @@ class AxesLibrary:
 
 
 def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
-    """The cell whose pillar of size ``x_um`` is ``y_um`` long along its other axis."""
+    """The cell with a pillar of ``x_um`` by ``y_um``: the ratio of its shape is y / x.
+
+    Raises:
+        CellError: a shape that has one size.
+    """
     shape = cell.shape
     if not isinstance(shape, Rectangle | Ellipse):
         raise CellError(
@@ -116,16 +120,16 @@ def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
 
 
 def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
-    """Refuse a sweep over two sizes that cannot be computed, before anything is
-    computed.
+    """Refuse a sweep over two sizes that cannot be computed.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
 
     Raises:
-        ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
-            with a ratio of its own, pillars that touch; and as
-            :func:`metalens.library.check_sweep`.
+        ConfigError: no ranges.
+        CellError: another shape than rectangle or ellipse, one with a ratio of its own,
+            pillars that touch; and as :func:`metalens.library.check_sweep`.
     """
     spans = size_ranges(sweep)
     if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
@@ -295,7 +299,7 @@ def _interpolate_in_turn(
 
 
 class SolvedPillar(NamedTuple):
-    """One pillar: (2, 2) Jones matrix and its error bar."""
+    """(2, 2) Jones matrix of one pillar, and its error bar."""
 
     t: Array
     error: float
@@ -376,7 +380,14 @@ class _Nodes:
     def grid(
         self, x: Array, y: Array, console: Console, label: str
     ) -> tuple[Array, Array]:
-        """(m, n, 4) Jones matrices and (m, n) error bars on all pairs of nodes."""
+        """(m, n, 4) Jones matrices and (m, n) error bars of all pairs of nodes.
+
+        Args:
+            x: (m,) sizes, um.
+            y: (n,) sizes, um.
+            console: where progress is shown.
+            label: names the pairs in the progress.
+        """
         pillars = self.solve(
             [(float(a), float(b)) for a in x for b in y], console, label
         )

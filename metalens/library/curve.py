@@ -144,11 +144,11 @@ class ResponseCurve:
         return np.asarray(rise + 2 / (high - low))
 
     def resonances(self, half_width_um: float = 0.02) -> Array:
-        """(k, 2) diameter and half-width of the poles nearer to the real axis than
-        ``half_width_um``, um.
+        """(k, 2) diameter and half-width of the poles of t(D) with |imaginary part|
+        below ``half_width_um``, um.
 
-        Poles that a rival fit does not share (within a fifth of their width) carry no
-        meaning and are left out.
+        Poles that a rival fit does not share (within a fifth of their width) are noise
+        and are left out.
         """
         low = self.nodes.diameter_um.min()
         high = self.nodes.diameter_um.max()
@@ -244,7 +244,8 @@ def sample_adaptively(
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:
-    """The rational curve through exact solves, and the rivals that judge it.
+    """Rational curve through exact solves, and three rival fits for its error estimate:
+    one of least degree, two without the last nodes.
 
     Args:
         nodes: the exact solves.

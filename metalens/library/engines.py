@@ -23,14 +23,15 @@ Engine = Literal["auto", "rcwa", "modal"]
 
 
 def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
-    """``modal`` for round pillars on a square lattice (more precise, and faster where
-    upright), ``rcwa`` for others.
-
-    Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
+    """Solver of a cell: ``modal`` for round pillars on a square lattice (more precise,
+    and faster where upright), ``rcwa`` for others.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
         engine: what is asked for: auto, rcwa or modal.
+
+    Raises:
+        CellError: the modal engine for another cell.
     """
     if engine == "modal" and not cell.round:
         raise CellError(
@@ -230,7 +231,15 @@ def _solve(
     settings: dict[str, Any],
     diameter_um: float,
 ) -> Response:
-    """One meta-atom by ``modal`` or ``rcwa``, imported where it is used."""
+    """Response of one pillar by ``modal`` or ``rcwa``, imported on use.
+
+    Args:
+        engine: modal or rcwa.
+        cell: unit cell.
+        light: plane wave that comes.
+        settings: keywords of the solver.
+        diameter_um: of the pillar.
+    """
     solver = importlib.import_module(f"metalens.{engine}")
     response: Response = solver.solve(
         cell,

@@ -51,7 +51,7 @@ class ProxyTolerances:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of phase (rad) and |T|."""
+        """Tolerances of phase (rad) and |T|; 1e-3 where none is set."""
         return (
             self.phase_tolerance_rad or FOLLOWED,
             self.transmission_tolerance or FOLLOWED,
@@ -393,10 +393,11 @@ def _fit_branch(
 
 
 def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
-    """Root mean square of the error bars of t, relative to |t|, of the entries at some
-    of a library's diameters.
+    """Root-mean-square error bar of t, relative to |t|, over the entries at some
+    diameters of a library.
 
     Args:
+        library: the swept cell.
         diameter_um: of the entries, um.
     """
     selected = np.isin(library.diameter_um, diameter_um)
@@ -465,7 +466,7 @@ def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> 
 
 
 def proxy_of(library: PillarLibrary) -> Proxy:
-    """The proxy that a library holds, fitted now where it holds none.
+    """The stored proxy of a library, or a newly fitted one where none is stored.
 
     Raises:
         DomainError: no proxy fits.
@@ -507,10 +508,10 @@ def _longest_domain(
 
 
 def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
-    """By how much a proxy misses its tolerances, for a person; empty where it meets
-    them.
+    """Message on how far a proxy misses its tolerances; empty where it meets them.
 
     Args:
+        proxy: phase and |T| over the diameter.
         wanted: tolerances and limits of the fit.
     """
     if tolerance_ratio(proxy, wanted) <= 1:
@@ -679,7 +680,9 @@ def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
 
 
 def _trial(data: MonotonicBranch, power: int, coefficients: int) -> FitTrial | None:
-    """One line of the table; None where |T| falls below 0 between the entries."""
+    """Errors of a proxy with this many coefficients in total; None where |T| falls
+    below 0 between the entries.
+    """
     try:
         proxy = fit_terms(data, power, coefficients // 2)
     except DomainError:

@@ -113,8 +113,8 @@ def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
 
 
 def mirror_jones(t: Array) -> Array:
-    """Jones matrices of the mirror image (y to -y): those of the pillar turned the
-    other way.
+    """Jones matrices of the mirror image (y to -y), which is the pillar turned the
+    other way: the cross terms change sign.
 
     Args:
         t: (..., 2, 2) Jones matrices in x and y.

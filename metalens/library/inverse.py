@@ -162,7 +162,13 @@ def _newton(
 
 
 def _tabulate_inverse(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
-    """(TABLE,) diameters at even steps of the phase, from the end of least phase."""
+    """(TABLE,) diameters at even steps of the phase, from the end of least phase, um;
+    by linear interpolation of a dense sampling.
+
+    Args:
+        p: monotone phase over the diameter.
+        within: (least, largest) diameter, um.
+    """
     d = np.linspace(*within, DENSE * TABLE)
     phase = polynomial.evaluate_curve(p, d)
     if phase[-1] < phase[0]:

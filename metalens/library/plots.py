@@ -29,9 +29,11 @@ DEG, NM = 180 / np.pi, 1e3
 def write_study(
     folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
 ) -> None:
-    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist.
+    """Write cell_study.json, README.md and cell_study.png to ``folder``, which must
+    exist.
 
     Args:
+        folder: that is written to.
         study: what is compared.
         verdicts: of all its cells.
         command: that wrote the page, shown in it.
@@ -170,6 +172,7 @@ def _residuals(panel: Any, library: "PillarLibrary", fit: "ProxyFit") -> None:
 
 
 def _write(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
     with replace_atomically(path) as part:
         figure.savefig(part, format="png", metadata={"Software": "metalens"})
 

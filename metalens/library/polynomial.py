@@ -58,8 +58,13 @@ def chebyshev_curve(
     power: int,
     ceiling: float = math.inf,
 ) -> ChebyshevCurve:
-    """The curve of 1-D Chebyshev ``coefficients`` on ``domain``, see
-    :class:`ChebyshevCurve` for ``power`` and ``ceiling``.
+    """Curve of a 1-D Chebyshev sum on a domain.
+
+    Args:
+        coefficients: (degree + 1,) of the sum.
+        domain: (least, largest) diameter, um.
+        power: of the diameter, see :class:`ChebyshevCurve`.
+        ceiling: upper limit of the values.
     """
     monomials = _to_monomials(tuple(coefficients.tolist()))
     return ChebyshevCurve(monomials, *domain, power, ceiling)
@@ -112,7 +117,7 @@ def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
 
 
 def to_unit_interval(p: ChebyshevCurve, diameter: Any) -> Any:
-    """x of ``diameter`` (um) on the curve ``p``."""
+    """x of ``diameter`` (um) on the curve ``p``: scale diameter^power + shift."""
     x = diameter * p.scale
     for _ in range(p.power - 1):
         x *= diameter
@@ -130,7 +135,14 @@ def evaluate_horner(monomials: Monomials, x: Any) -> Any:
 
 
 def _term(p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any) -> Any:
-    """D^exponent q(x(D)) with q of these monomials, NumPy or torch."""
+    """D^exponent q(x(D)), NumPy or torch.
+
+    Args:
+        p: curve that maps D to x.
+        monomials: of q.
+        exponent: of D.
+        diameter: D, um.
+    """
     total = evaluate_horner(monomials, to_unit_interval(p, diameter))
     for _ in range(exponent):
         total *= diameter
@@ -194,8 +206,12 @@ def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
 
 
 def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
-    """``work`` elementwise over the array ``values`` in cache-sized chunks, on all
-    cores that the process may use.
+    """Elementwise ``work`` on an array, in cache-sized chunks on all cores that the
+    process may use.
+
+    Args:
+        work: function of a 1-D array that keeps its shape and dtype.
+        values: array of any shape.
     """
     flat = np.ascontiguousarray(values).ravel()
     if flat.size <= CHUNK:
@@ -233,8 +249,8 @@ def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
 
 
 def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
-    """Whether ``p`` rises or falls throughout ``within`` (um): no root of its slope
-    lies inside (certified, not sampled).
+    """Whether ``p`` rises or falls throughout ``within`` (um): its slope has no root
+    inside, by the roots of the polynomial, not by sampling.
     """
     low, high = to_unit_interval(p, np.array(within, float))
     slope = _derivative(p, p.monomials)

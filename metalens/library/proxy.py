@@ -133,19 +133,21 @@ class Proxy:
         within_um: tuple[float, float] | None = None,
         gap: Literal["refuse", "nearest"] = "refuse",
     ) -> Values:
-        """Diameter of the pillar with a phase, any phase taken modulo 2 pi into the
-        domain.
+        """Diameter of the pillar with a given phase modulo 2 pi, um; shape, dtype and
+        device of ``phase_rad``.
 
         Args:
+            phase_rad: (*shape) rad, array, tensor or number.
+            wavelength_um: within the proxy's range.
+            angle_rad: of incidence in air.
             within_um: (least, largest) diameter to use; the whole domain without it.
                 Where it covers more than a turn the end with the lesser phase is used:
                 move ``within_um`` to choose the branch.
             gap: what to do with a phase that no pillar has (less than a turn covered).
 
-        Accuracy:
-            phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
-                gradients are exact. A diameter in one of ``gaps_um`` moves to its
-                nearer end.
+        Accuracy: phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32.
+            Torch gradients are exact. A diameter in one of ``gaps_um`` moves to its
+            closer end.
 
         Raises:
             DomainError: the phase is not monotone within ``within_um``, or no pillar
@@ -207,8 +209,8 @@ class Proxy:
         angle_rad: float = 0.0,
         within_um: tuple[float, float] | None = None,
     ) -> bool:
-        """Whether the phase rises or falls throughout: no root of its slope lies inside
-        (certified, not sampled).
+        """Whether the phase rises or falls throughout the diameters: its slope has no
+        root inside, by the roots of the polynomial, not by sampling.
         """
         return polynomial.is_monotonic(
             self.at(wavelength_um, angle_rad), within_um or self.domain_um

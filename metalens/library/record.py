@@ -124,8 +124,8 @@ class Sweep:
 
     @property
     def polarizations(self) -> tuple[Polarization, ...]:
-        """x at normal incidence alone (a square lattice responds equally to x and y), else s
-        and p; x and y for circular.
+        """Polarisations that are solved: x at normal incidence (a square lattice
+        responds equally to x and y), else s and p; x and y for circular light.
         """
         if self.light == "circular":
             return ("x", "y")
@@ -133,7 +133,7 @@ class Sweep:
 
     @property
     def bar(self) -> float:
-        """The tolerance, that of round pillars where none is stated."""
+        """The tolerance of t, or that of round pillars where none is stated."""
         return USUAL["modal"] if self.tolerance is None else self.tolerance
 
     def with_tolerance(self, cell: Cell) -> "Sweep":
@@ -230,15 +230,15 @@ class PillarLibrary:
 
     @property
     def lost(self) -> Array:
-        """As t: share of the power that is absorbed or leaves in orders other than zero
-        (of a shape without a mirror along x or y, or in the other polarisation).
+        """Share of the power outside the zero order of the incident polarisation, as t:
+        it is absorbed, or in other orders or the other polarisation.
         """
         return np.asarray(np.maximum(1 - self.energy, 0.0))
 
     @property
     def cross_polarized(self) -> Array:
-        """(wavelength, size) amplitude (t_x - t_y)/2 that leaves with the other hand,
-        of circular light on pillars that are not turned.
+        """(wavelength, size) amplitude (t_x - t_y)/2 that circular light sends to the
+        other hand, for pillars that are not turned.
         """
         return np.asarray(self.t[0, 0] - self.t[1, 0]) / 2
 
@@ -267,10 +267,11 @@ class PillarLibrary:
 
 
 def check_sweep(cell: Cell, sweep: Sweep) -> None:
-    """Refuse a sweep that cannot be computed, before anything is computed.
+    """Refuse a sweep that cannot be computed.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
 
     Raises:
         CellError: pillars touch, or diffraction orders propagate in the cover (named).

@@ -226,7 +226,7 @@ def _judge_cells(
 
 
 def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
-    """(least, largest) printable size.
+    """(least, largest) printable size of a cell, um.
 
     Raises:
         CellError: there is none.
@@ -377,7 +377,7 @@ def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
 
 
 def _subject(study: CellStudy) -> str:
-    """What the pillars are, in words."""
+    """The pillars of the study with their materials, in words."""
     if study.cell is None:
         return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
     substrate = material_name(study.cell.substrate)
@@ -386,7 +386,7 @@ def _subject(study: CellStudy) -> str:
 
 
 def _limits(study: CellStudy) -> str:
-    """What is printed, in words."""
+    """The printable sizes, in words."""
     least = f"{1e3 * study.min_diameter_um:.4g} nm"
     gap = f"{1e3 * study.min_gap_um:.4g} nm"
     if study.made(study.pitches_um[0], study.heights_um[0]).round:

@@ -407,7 +407,13 @@ def _with_rising_phase(t: Array) -> tuple[Array, bool]:
 
 
 def _left_out_errors(sizes: Array, t: Array) -> Array:
-    """Distance of each entry from a cubic spline through the entries of other parity."""
+    """Error bars from interpolation: distance of each entry from a cubic spline through
+    the entries of the other parity of place.
+
+    Args:
+        sizes: (n,) um.
+        t: (angle, wavelength, n) complex amplitudes.
+    """
     error = np.empty(t.shape)
     index = np.arange(len(sizes))
     for parity in (0, 1):

@@ -92,7 +92,7 @@ def run_task(task: Task) -> list[SolvedNodes]:
 
 
 def fit_curves(solved: list[SolvedNodes], *, tolerance: float) -> list[ResponseCurve]:
-    """The curves t(D) through the solves of a task of curves.
+    """Rational curves t(D) through the solves of a task of curves, one per light.
 
     Args:
         solved: of the task.
@@ -105,8 +105,11 @@ def fit_curves(solved: list[SolvedNodes], *, tolerance: float) -> list[ResponseC
 
 
 def material_files(of: object) -> Iterator[Path]:
-    """Files that the materials anywhere in a record (a cell, a film, a tuple of names)
-    are read from.
+    """Files that the materials in a record are read from, nested records and tuples
+    included.
+
+    Args:
+        of: a cell, film, material name, or tuple of them.
     """
     if isinstance(of, str):
         if of not in materials.NAMES and Path(of).is_file():
@@ -144,7 +147,7 @@ class SweepJournal:
                 self._know(line)
 
     def _know(self, line: str) -> None:
-        """The solves of a line; a damaged one is dropped: its task is done again."""
+        """Store the solves of a journal line; a damaged line is ignored."""
         try:
             task, rows = json.loads(line)
             self._known[str(task)] = [SolvedNodes.from_json(row) for row in rows]
