@@ -124,7 +124,7 @@ def mirror_jones(t: Array) -> Array:
 
 def period_rad(cell: Cell) -> float:
     """Turn of the pillar in its lattice after which the Jones matrix repeats, in the
-    pillar's axes: 90 deg (square), 60 deg (hexagonal) or 180 deg.
+    pillar's axes, rad: pi/2 (square), pi/3 (hexagonal), else pi.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
