@@ -13,10 +13,10 @@ Bools = NDArray[np.bool_]
 
 
 def to_tensor(values: Any) -> Any:
-    """A torch tensor of a map: tensors as they are, arrays of any strides.
+    """Values as a torch tensor; tensors are returned unchanged.
 
     Args:
-        values: (…, y, x) tensor or array.
+        values: (…, y, x) tensor, or NumPy array of any strides.
     """
     import torch
 

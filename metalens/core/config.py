@@ -20,37 +20,34 @@ from metalens.core import reading
 from metalens.core.errors import ConfigError, nearest_name_hint
 
 Record = TypeVar("Record")
-_LARGEST = 1 << 24  # bytes of a config
-_WORDS = re.compile(
-    r"[^\x00-\x08\x0b-\x1f\x7f]*"
-)  # text: blanks and line ends, no other control characters
+_LARGEST = 1 << 24  # bytes of a config file
+# text: tabs and line ends, but no other control characters
+_PRINTABLE = re.compile(r"[^\x00-\x08\x0b-\x1f\x7f]*")
 _BACKSLASH = (
     "a backslash in double quotes begins an escape: write a path of Windows in single "
     "quotes ('C:\\maps\\a.npy') or with /"
 )
-_KEY = re.compile(r"(?<!\S)((?:\w+,\s+)*\w+):\s")  # in the docstring of a record
-_EITHER_SIGN = ("_rad", "_deg", "_offset")
-_MOST, _LARGE = (
-    (1 << 63) - 1,
-    1e9,
-)  # of a seed; of any other number, in the unit of its key
+# ``name:`` or ``name, other:`` in the docstring of a record
+_KEY = re.compile(r"(?<!\S)((?:\w+,\s+)*\w+):\s")
+_EITHER_SIGN = ("_rad", "_deg", "_offset")  # endings of keys that may be negative
+# largest seed; largest magnitude of any other number, in the unit of its key
+_MOST, _LARGE = (1 << 63) - 1, 1e9
 
 
 def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Record:
     """Read a TOML file into ``record``, a frozen dataclass (nested dataclasses are
     tables).
 
-    Args:
-        path: file to read or write.
-        empty: whether a file without a word stands for the defaults; long work refuses
-            it.
-
     A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its
-    field says more: ``signed`` (or
-    not), ``above`` (more than that), ``most``, ``may_be_inf``; a list or name has
-    entries unless its default is empty
-    or ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses
-    comes with file and key.
+    field says otherwise: ``signed`` (or not), ``above`` (more than that), ``most``,
+    ``may_be_inf``. A list or name has entries unless its default is empty or
+    ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses is
+    reported with file and key.
+
+    Args:
+        path: of the file.
+        record: dataclass that is filled.
+        empty: whether an empty file stands for the defaults; long work refuses it.
 
     Raises:
         ConfigError: missing file, TOML syntax, unknown or missing key, wrong type, a
@@ -63,10 +60,12 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
     """The tables of a TOML file that is to become ``record``.
 
     Args:
-        path: file to read or write.
+        path: of the file.
+        record: dataclass that errors name.
+        empty: whether an empty file is accepted.
 
     Raises:
-        ConfigError: missing file, not text, or not TOML; empty where that is no answer.
+        ConfigError: missing file, not text, or not TOML; empty where that is refused.
     """
     path = Path(path)
     try:
@@ -101,10 +100,12 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
 
 
 def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
-    """As :func:`load`, from TOML text; ``where`` names it in errors.
+    """Record from TOML text; otherwise as :func:`load`.
 
     Args:
+        text: TOML.
         record: dataclass that is filled.
+        where: names the text in errors.
     """
     return from_table(_parsed(text, where), record, where=where)
 
@@ -112,9 +113,11 @@ def loads(text: str, record: type[Record], *, where: str = "config") -> Record:
 def from_table(
     table: dict[str, Any], record: type[Record], *, where: str = "config"
 ) -> Record:
-    """As :func:`load`, from a table that is already parsed (or merged from several).
+    """Record from a table that is already parsed (or merged from several); otherwise as
+    :func:`load`.
 
     Args:
+        table: values by key.
         record: dataclass that is filled.
         where: file or place that errors name.
     """
@@ -122,19 +125,19 @@ def from_table(
 
 
 def merge_tables(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """``base`` with the entries of ``over`` in their place, table by table."""
-    both = {
-        k: merge_tables(base[k], v)
-        if isinstance(v, dict) and isinstance(base.get(k), dict)
-        else v
-        for k, v in over.items()
+    """``base`` updated with the entries of ``over``, table by table."""
+    merged = {
+        key: merge_tables(base[key], value)
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+        else value
+        for key, value in over.items()
     }
-    return base | both
+    return base | merged
 
 
 def dumps(record: Any) -> str:
-    """TOML text of a config record; ``loads`` gives the same record back. Fields that
-    are None are left out.
+    """TOML text of a config record, from which ``loads`` restores it; fields that are
+    None are omitted.
     """
     lines: list[str] = []
     _dump(record, "", lines)
@@ -142,27 +145,45 @@ def dumps(record: Any) -> str:
 
 
 def _parsed(text: str, where: str) -> dict[str, Any]:
+    """Tables of TOML text; a syntax error becomes a ConfigError that names ``where``."""
     try:
         return tomllib.loads(text)
     except ValueError as error:  # of TOML, or an integer of thousands of digits
-        words = str(error).partition("; use sys")[0]
+        message = str(error).partition("; use sys")[0]
         raise ConfigError(
-            f"{where}: not valid TOML: {words}{_path_hint(text, words)}"
+            f"{where}: not valid TOML: {message}{_path_hint(text, message)}"
         ) from None
     except RecursionError:
         raise ConfigError(f"{where}: not valid TOML: nested too deep") from None
 
 
-def _path_hint(text: str, words: str) -> str:
-    """The cure where the line of an error holds a backslash in double quotes."""
-    place = re.search(r"line (\d+)", words)
+def _path_hint(text: str, message: str) -> str:
+    """Advice on Windows paths, where the line that a TOML error names has a backslash
+    in double quotes; else empty.
+
+    Args:
+        text: TOML.
+        message: of the error.
+    """
+    match = re.search(r"line (\d+)", message)
     lines = text.split("\n")
-    line = lines[int(place.group(1)) - 1] if place else ""
+    line = lines[int(match.group(1)) - 1] if match else ""
     return f"; {_BACKSLASH}" if re.search(r'"[^"]*\\', line) else ""
 
 
 def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
-    fields = {f.name: f for f in dataclasses.fields(record) if f.init}
+    """A record from a table, nested tables included.
+
+    Args:
+        table: values by key.
+        record: dataclass that is filled.
+        where: file or place that errors name.
+        prefix: of the keys in errors, as ``cell.shape.``.
+
+    Raises:
+        ConfigError: an unknown or missing key, or a value out of range.
+    """
+    fields = {entry.name: entry for entry in dataclasses.fields(record) if entry.init}
     hints = typing.get_type_hints(record)
     for key in table:
         if key not in fields:
@@ -175,63 +196,68 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
         with _meaning(record, key):
             values[key] = _convert(value, hints[key], where, prefix + key)
             _check_range(fields[key], values[key], where, prefix + key)
-    for name, f in fields.items():
-        if _required(f) and name not in values:
+    for name, entry in fields.items():
+        if _required(entry) and name not in values:
             with _meaning(record, name):
                 raise ConfigError(
                     f"{where}: missing key {prefix + name!r} in {record.__name__}"
                 )
     try:
-        made = record(**values)
+        built = record(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"{where}: {_culprit(record, values, prefix, str(error))}"
         ) from error
-    for key, value in values.items():  # what the record lets pass
+    for key, value in values.items():  # signs that the record itself accepts
         with _meaning(record, key):
             _check_sign(fields[key], value, where, prefix + key)
-    return made
+    return built
 
 
-class _Meant(ConfigError):
-    """A refusal that says what its key means."""
+class _ExplainedError(ConfigError):
+    """A refusal that already explains its key."""
 
 
 @contextmanager
 def _meaning(record: type[Any], key: str) -> Iterator[None]:
-    """Lets a refusal of a key end in what the key means."""
+    """Context that appends the meaning of a key to a refusal of it."""
     try:
         yield
-    except _Meant:
+    except _ExplainedError:
         raise
     except ConfigError as error:
         text = textwrap.shorten(
             describe_fields(record).get(key, ""), 160, placeholder=" ..."
         )
-        raise _Meant(f"{error} ({key}: {text})" if text else str(error)) from None
+        raise _ExplainedError(
+            f"{error} ({key}: {text})" if text else str(error)
+        ) from None
 
 
 def describe_fields(record: type[Any]) -> dict[str, str]:
-    """{field: what the docstring of a record says of it}: ``name: text`` or ``name,
-    other: text``, to an empty line.
+    """{field: its description in the docstring of a record}.
+
+    A description is ``name: text`` or ``name, other: text``, up to an empty line.
     """
-    names = {f.name for f in dataclasses.fields(record)}
+    names = {entry.name for entry in dataclasses.fields(record)}
     doc = inspect.getdoc(record) or ""
     if doc.startswith(
         f"{record.__name__}("
     ):  # the signature that stands for a docstring
         return {}
-    places = [
-        m for m in _KEY.finditer(doc) if set(re.split(r",\s+", m.group(1))) <= names
+    matches = [
+        candidate
+        for candidate in _KEY.finditer(doc)
+        if set(re.split(r",\s+", candidate.group(1))) <= names
     ]
-    found: dict[str, str] = {}
-    for place, following in zip(places, [*places, None][1:], strict=True):
-        text = doc[place.end() : following.start() if following else len(doc)].split(
+    descriptions: dict[str, str] = {}
+    for match, following in zip(matches, [*matches, None][1:], strict=True):
+        text = doc[match.end() : following.start() if following else len(doc)].split(
             "\n\n"
         )[0]
-        for name in re.split(r",\s+", place.group(1)):
-            found.setdefault(name, " ".join(text.split()).rstrip(" ;."))
-    return found
+        for name in re.split(r",\s+", match.group(1)):
+            descriptions.setdefault(name, " ".join(text.split()).rstrip(" ;."))
+    return descriptions
 
 
 def _required(field: dataclasses.Field[Any]) -> bool:
@@ -241,25 +267,34 @@ def _required(field: dataclasses.Field[Any]) -> bool:
     )
 
 
-def _culprit(record: Any, values: dict[str, Any], prefix: str, said: str) -> str:
-    """What a record says of its values, after the key without which it would be
-    content, unless it names the key.
+def _culprit(record: Any, values: dict[str, Any], prefix: str, message: str) -> str:
+    """Message of a record's refusal, led by the keys without which the record would be
+    accepted, unless it names them.
+
+    Args:
+        record: dataclass that refuses the values.
+        values: by key.
+        prefix: of the keys in errors.
+        message: text of the refusal.
     """
-    required = {f.name for f in dataclasses.fields(record) if _required(f)}
-    said = said if len(said) <= 500 else said[:500] + " ..."
-    fitting = [
+    required = {entry.name for entry in dataclasses.fields(record) if _required(entry)}
+    message = message if len(message) <= 500 else message[:500] + " ..."
+    culprits = [
         k
         for k in values
         if k not in required
-        and _content(record, {n: v for n, v in values.items() if n != k})
+        and _is_accepted(
+            record, {name: value for name, value in values.items() if name != k}
+        )
     ]
-    if any(key in said for key in fitting):
-        return f"[{prefix[:-1]}] {said}" if prefix else said
-    named = [f"{prefix}{key} is {_shown(values[key])}" for key in fitting[:3]]
-    return f"{' or '.join(named) or prefix[:-1] or 'top level'}: {said}"
+    if any(key in message for key in culprits):
+        return f"[{prefix[:-1]}] {message}" if prefix else message
+    named = [f"{prefix}{key} is {_shown(values[key])}" for key in culprits[:3]]
+    return f"{' or '.join(named) or prefix[:-1] or 'top level'}: {message}"
 
 
-def _content(record: Any, values: dict[str, Any]) -> bool:
+def _is_accepted(record: Any, values: dict[str, Any]) -> bool:
+    """Whether a record accepts the values."""
     try:
         record(**values)
     except (ValueError, TypeError, ArithmeticError):
@@ -270,16 +305,22 @@ def _content(record: Any, values: dict[str, Any]) -> bool:
 def _check_range(
     field: dataclasses.Field[Any], value: Any, where: str, key: str
 ) -> None:
-    """Numbers finite, at most 1e9 in size; no empty list or name, but where these say
-    something; see :func:`load`.
+    """Refuse an empty list or name, and a number that is not finite or too large;
+    limits as for :func:`load`.
+
+    Args:
+        field: of the record.
+        value: number, text, path or tuple.
+        where: file or place that errors name.
+        key: its full name in errors.
     """
     limits = field.metadata
-    empty = (
+    may_be_empty = (
         field.metadata.get("may_be_empty")
         or field.default in ("", ())
-        or _made(field) == ()
+        or _factory_default(field) == ()
     )
-    if (value in ((), "") and not empty) or (
+    if (value in ((), "") and not may_be_empty) or (
         isinstance(value, Path) and not value.name
     ):
         raise ConfigError(
@@ -302,7 +343,9 @@ def _check_range(
 def _check_sign(
     field: dataclasses.Field[Any], value: Any, where: str, key: str
 ) -> None:
-    """A number on the side of 0 that its field says."""
+    """Refuse a negative number, unless its field is signed, and one not above the
+    field's lower limit.
+    """
     if isinstance(value, int | float) and not isinstance(value, bool):
         limits = field.metadata
         if value < 0 and not limits.get("signed", field.name.endswith(_EITHER_SIGN)):
@@ -313,7 +356,8 @@ def _check_sign(
             )
 
 
-def _made(field: dataclasses.Field[Any]) -> Any:
+def _factory_default(field: dataclasses.Field[Any]) -> Any:
+    """The value of a field's default factory; None without one."""
     return (
         None
         if field.default_factory is dataclasses.MISSING
@@ -322,7 +366,7 @@ def _made(field: dataclasses.Field[Any]) -> Any:
 
 
 def _numbers(value: Any) -> Iterator[int | float]:
-    """Numbers in a value or in the lists of a value."""
+    """Numbers in a value or in its nested tuples."""
     if isinstance(value, tuple):
         for part in value:
             yield from _numbers(part)
@@ -331,6 +375,17 @@ def _numbers(value: Any) -> Iterator[int | float]:
 
 
 def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
+    """A TOML value as the type of its field.
+
+    Args:
+        value: from the table.
+        hint: type of the field.
+        where: file or place that errors name.
+        key: its full name in errors.
+
+    Raises:
+        ConfigError: the value does not fit the type.
+    """
     if typing.get_origin(hint) is typing.Annotated:
         hint = typing.get_args(hint)[0]
     origin, options = typing.get_origin(hint), typing.get_args(hint)
@@ -352,19 +407,32 @@ def _convert(value: Any, hint: Any, where: str, key: str) -> Any:
 
 
 def _kinds(options: tuple[Any, ...]) -> dict[str, Any]:
-    """Records by their ``kind``, where all of the options tell it."""
-    found: dict[str, Any] = {}
+    """{kind: record} of a union of records that each have a literal ``kind``; empty for
+    any other union.
+    """
+    records: dict[str, Any] = {}
     for option in options:
         kind = dataclasses.is_dataclass(option) and typing.get_type_hints(option).get(
             "kind"
         )
         if not kind or typing.get_origin(kind) is not typing.Literal:
             return {}
-        found |= dict.fromkeys(typing.get_args(kind), option)
-    return found
+        records |= dict.fromkeys(typing.get_args(kind), option)
+    return records
 
 
 def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -> Any:
+    """A value as one of several types.
+
+    A table takes the record of its ``kind``, or the record that knows most of its keys.
+    Any other value takes the first type that fits.
+
+    Args:
+        value: from the table.
+        options: types of the union.
+        where: file or place that errors name.
+        key: its full name in errors.
+    """
     kinds = _kinds(options)
     if kinds and isinstance(value, dict):
         kind = value.get("kind")
@@ -375,14 +443,14 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
         return _convert(value, kinds[kind], where, key)
     errors = []
     records = [option for option in options if dataclasses.is_dataclass(option)]
-    if (
-        isinstance(value, dict) and len(records) > 1
-    ):  # the record that knows most of the keys
-        known = [
+    if isinstance(value, dict) and len(records) > 1:
+        matching_keys = [
             len(value.keys() & {f.name for f in dataclasses.fields(option)})
             for option in records
         ]
-        return _convert(value, records[known.index(max(known))], where, key)
+        return _convert(
+            value, records[matching_keys.index(max(matching_keys))], where, key
+        )
     for option in options:
         if option is type(None):
             continue
@@ -394,6 +462,7 @@ def _convert_union(value: Any, options: tuple[Any, ...], where: str, key: str) -
 
 
 def _convert_tuple(value: Any, options: tuple[Any, ...], where: str, key: str) -> Any:
+    """A TOML list as a tuple, of fixed or any length, each entry converted."""
     if not isinstance(value, list):
         raise _wrong(value, "a list", where, key)
     if len(options) == 2 and options[1] is ...:
@@ -409,7 +478,14 @@ def _convert_tuple(value: Any, options: tuple[Any, ...], where: str, key: str) -
 
 
 def _convert_scalar(value: Any, hint: Any, where: str, key: str) -> Any:
-    if isinstance(value, str) and hint in (str, Path) and not _WORDS.fullmatch(value):
+    """Text, path, whole number, number or boolean as the type of its field; whole
+    numbers fit where a float is needed.
+    """
+    if (
+        isinstance(value, str)
+        and hint in (str, Path)
+        and not _PRINTABLE.fullmatch(value)
+    ):
         raise ConfigError(
             f"{where}: {key} is {_shown(value)}, need text without control characters"
         )
@@ -431,13 +507,14 @@ def _convert_scalar(value: Any, hint: Any, where: str, key: str) -> Any:
 
 
 def _wrong(value: Any, need: str, where: str, key: str) -> ConfigError:
+    """Refusal of a value of the wrong type."""
     return ConfigError(
         f"{where}: {key} is {_shown(value)} ({type(value).__name__}), need {need}"
     )
 
 
 def _shown(value: Any) -> str:
-    """A value as it may stand in a message: not long, not deep."""
+    """A value as text for a message, shortened in length and depth."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 100
     short.maxlevel = 3
@@ -452,6 +529,14 @@ def _shown(value: Any) -> str:
 
 
 def _dump(record: Any, prefix: str, lines: list[str]) -> None:
+    """Append the TOML lines of a record: plain values, then tables, then lists of
+    tables.
+
+    Args:
+        record: dataclass.
+        prefix: of the names of its tables.
+        lines: that are extended.
+    """
     values = {
         f.name: getattr(record, f.name) for f in dataclasses.fields(record) if f.init
     }
@@ -474,13 +559,16 @@ def _dump(record: Any, prefix: str, lines: list[str]) -> None:
 
 
 def _escaped(c: str) -> str:
-    """A character inside a TOML string."""
+    """A character as written inside a TOML string."""
     if c in '\\"':
         return "\\" + c
-    return "\\n" if c == "\n" else c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}"
+    if c == "\n":
+        return "\\n"
+    return c if c >= " " and c != "\x7f" else f"\\u{ord(c):04x}"
 
 
 def _text(value: Any) -> str:
+    """A plain value in TOML."""
     if hasattr(value, "item"):  # a scalar of NumPy
         value = value.item()
     if isinstance(value, bool):

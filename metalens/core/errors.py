@@ -95,11 +95,14 @@ class TrainingError(MetalensError):
 def nearest_name_hint(
     name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None
 ) -> str:
-    """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known
+    """Hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known
     names.
 
-    elsewhere: what is said of names that belong to another place (of a record of
-    settings its ``ELSEWHERE``).
+    Args:
+        name: that is unknown.
+        known: names that are allowed.
+        elsewhere: {name: hint} of names that belong to another place (the ``ELSEWHERE``
+            of a record of settings).
     """
     if elsewhere and name in elsewhere:
         return f"; {elsewhere[name]}"
@@ -123,8 +126,7 @@ EXTRAS = {
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str | None:
-    """What to install for a library that an extra brings; None where it is none of
-    ours.
+    """What to install for a missing optional library; None for any other.
 
     >>> missing_extra(ModuleNotFoundError("No module named 'torch'", name="torch"))
     "this needs torch, which is not installed: pip install 'metalens-toolchain[optics]'"

@@ -16,9 +16,8 @@ Common = TypeVar("Common")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Done = Iterator[tuple[int, Any]]
-Place = Callable[
-    [Callable[[Any, Any], Any], Any, Sequence[Any]], Done
-]  # (work, common, tasks): (index, result)
+# runs (work, common, tasks), and yields (index, result)
+Place = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Done]
 _PLACE: ContextVar[Place | None] = ContextVar("_PLACE", default=None)
 _VARIABLES = (
     "OMP_NUM_THREADS",
@@ -26,15 +25,14 @@ _VARIABLES = (
     "MKL_NUM_THREADS",
     "NUMBA_NUM_THREADS",
 )
-# safe path: what lies in the current folder is never imported, whatever its name
+# safe path: files in the current folder are never imported
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
-_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = (
-    "1e15"  # what a large lens takes is no leak to end a worker for
-)
+# a worker whose memory grows with a large lens is not restarted
+_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return (
         len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
@@ -44,11 +42,10 @@ def usable_cores() -> int:
 
 @contextlib.contextmanager
 def run_on(processes: int | None = None) -> Iterator[None]:
-    """Do the tasks of the block in so many processes of this machine.
+    """Context whose tasks run in a given number of processes of this machine.
 
     Args:
-        processes: None: each verb has its own way, :func:`run_parallel` a process a
-            core,
+        processes: number of processes. None: :func:`run_parallel` takes one per core,
             :func:`gather_parallel` threads of this process.
 
     Raises:
@@ -60,7 +57,7 @@ def run_on(processes: int | None = None) -> Iterator[None]:
     if not 1 <= processes <= 1024:
         raise ConfigError(f"{processes} workers: need 1 to 1024")
     with _pool(processes) as pool:
-        token = _PLACE.set(functools.partial(_here, pool))
+        token = _PLACE.set(functools.partial(_run_in_pool, pool))
         try:
             yield
         finally:
@@ -73,12 +70,12 @@ def run_parallel(
     *,
     processes: int | None = None,
 ) -> Iterator[tuple[int, Result]]:
-    """(index, result) of every task as it is done.
+    """(index, result) of every task, in the order in which they finish.
 
     Args:
-        tasks: what is computed in parallel.
         work: a function of a module (workers import it by name).
-        processes: where :func:`run_on` says nothing; by default one a core.
+        tasks: its arguments.
+        processes: where :func:`run_on` does not set it; by default one per core.
 
     Raises:
         WorkerError: a worker process died, with its cause. Whatever ``work`` raises.
@@ -90,7 +87,7 @@ def run_parallel(
         yield from place(_plain, work, tasks)
         return
     with _pool(min(processes or usable_cores(), len(tasks))) as pool:
-        yield from _here(pool, _plain, work, tasks)
+        yield from _run_in_pool(pool, _plain, work, tasks)
 
 
 def gather_parallel(
@@ -103,35 +100,37 @@ def gather_parallel(
     """``work(common, task)`` of every task, in their order, each with one BLAS thread.
 
     Args:
-        work: a function of a module. common: what all tasks need.
-        beside: where :func:`run_on` names no workers, side by side in threads of this
-            process, for work that mostly
-            consists of calls which release the interpreter lock; else one after the
-            other, each with all threads.
+        work: a function of a module.
+        common: what all tasks need.
+        tasks: the second arguments.
+        beside: without workers of :func:`run_on`, run the tasks in parallel threads of
+            this process. That is for work that mostly releases the interpreter lock;
+            else they run in turn, each with all threads.
 
     Raises:
         WorkerError: as :func:`run_parallel`. Whatever ``work`` raises.
     """
     place = _PLACE.get()
     if place is not None and tasks:
-        found: dict[int, Result] = dict(place(work, common, tasks))
-        return [found[i] for i in range(len(tasks))]
-    alone = functools.partial(work, common)
+        results: dict[int, Result] = dict(place(work, common, tasks))
+        return [results[i] for i in range(len(tasks))]
+    with_common = functools.partial(work, common)
     with threads.one_blas_thread():
         return (
-            threads.run_each(alone, tasks)
+            threads.run_each(with_common, tasks)
             if beside
-            else [alone(task) for task in tasks]
+            else [with_common(task) for task in tasks]
         )
 
 
 def _plain(work: Callable[[Task], Result], task: Task) -> Result:
+    """``work`` of a task without a common argument, in the signature with one."""
     return work(task)
 
 
 @contextlib.contextmanager
 def _pool(count: int) -> Iterator[Any]:
-    """Processes that start with the first task and end with the block."""
+    """Context of worker processes, which start with the first task."""
     from loky import ProcessPoolExecutor
 
     with _environment():  # of loky's own helper too, which is started like a worker
@@ -146,6 +145,7 @@ def _pool(count: int) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _environment() -> Iterator[None]:
+    """Context with the workers' environment variables, restored at the end."""
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)
     try:
@@ -155,19 +155,30 @@ def _environment() -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _here(
+def _run_in_pool(
     pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]
 ) -> Done:
+    """(index, result) of every task as a pool of processes finishes it.
+
+    Args:
+        pool: of processes.
+        work: called with (common, task).
+        common: first argument.
+        tasks: second arguments.
+
+    Raises:
+        WorkerError: a worker process died.
+    """
     from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
     try:
         with _environment():
-            waiting = {
+            indices = {
                 pool.submit(work, common, task): i for i, task in enumerate(tasks)
             }
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
+        for future in as_completed(indices):
+            yield indices[future], future.result()
     except BrokenProcessPool as error:
         cause = " ".join(str(error).split())
         raise WorkerError(
@@ -176,14 +187,18 @@ def _here(
 
 
 def _settle(parent: int) -> None:
-    """Begin a worker: what it prints is a message, not a result; it ends with whoever
-    started it.
+    """Initialise a worker: its standard output goes to standard error, and it ends when
+    its parent does.
+
+    Args:
+        parent: process number.
     """
     os.dup2(2, 1)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
 
 def _watch(parent: int) -> None:
+    """End this process when its parent is another one than ``parent``."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

@@ -19,8 +19,12 @@ def gauss_legendre_nodes(count: int) -> tuple[Array, Array]:
 
 
 def legendre_values(count: int, t: Array) -> Array:
-    """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by
-    the stable recurrence.
+    """(*t, count) orthonormal Legendre polynomials P̂_0 … P̂_{count-1} at t, with ∫P̂²
+    = 1 on [-1, 1].
+
+    Args:
+        count: number of polynomials.
+        t: places in [-1, 1], an array of any shape.
     """
     scale = np.sqrt(np.arange(count) + 0.5)
     t = np.asarray(t, float)  # legvander takes a number for an array of one
@@ -30,19 +34,22 @@ def legendre_values(count: int, t: Array) -> Array:
 
 def interpolation_matrix(count: int, t: Array) -> Array:
     """(*t, count) values at ``t`` of the Lagrange polynomials on
-    :func:`gauss_legendre_nodes`: L_a =
-    w_a Σ_m P̂_m(t_a) P̂_m(t).
+    :func:`gauss_legendre_nodes`: L_a(t) = w_a Σ_m P̂_m(t_a) P̂_m(t).
+
+    Args:
+        count: number of nodes.
+        t: places in [-1, 1].
     """
     return np.asarray(legendre_values(count, t) @ to_nodes(count))
 
 
 @functools.lru_cache(maxsize=64)
 def to_nodes(count: int) -> Array:
-    """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in
-    the modes.
+    """(mode, node) matrix w_a P̂_m(t_a): maps values at the nodes to Legendre
+    coefficients.
 
     Args:
-        count: how many.
+        count: number of nodes and of modes.
     """
     t, w = gauss_legendre_nodes(count)
     return legendre_values(count, t).T * w
@@ -54,21 +61,24 @@ def mapped_nodes(count: int, low: float, high: float) -> Array:
 
 
 def needed_node_count(samples: Array, tolerance: float) -> int:
-    """Number of nodes that represent all lines to ``tolerance``.
+    """Number of Gauss-Legendre nodes that represent all lines to ``tolerance``.
 
     Args:
         samples: (line, count) complex values on :func:`gauss_legendre_nodes` (count),
-            count well above
-            what is needed.
+            with count well above the result.
         tolerance: of the root mean square over lines and position, relative to that of
             the samples.
 
     Returns:
         The least n with a tail of modes n, n+1, … below tolerance; ``count`` + 1 where
-        the samples are too few to tell.
+            the samples are too few to tell.
     """
     count = samples.shape[-1]
     power = (np.abs(samples.reshape(-1, count) @ to_nodes(count).T) ** 2).sum(0)
     tail = np.sqrt(np.cumsum(power[::-1])[::-1] / power.sum())
-    small = np.nonzero(tail <= tolerance)[0]
-    return int(small[0]) if small.size and small[0] <= 0.85 * count else count + 1
+    sufficient = np.nonzero(tail <= tolerance)[0]
+    return (
+        int(sufficient[0])
+        if sufficient.size and sufficient[0] <= 0.85 * count
+        else count + 1
+    )

@@ -9,7 +9,8 @@ _WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def decode_text(content: bytes) -> str:
-    """Text of UTF-8, or of UTF-16 with its byte-order mark (as spreadsheets save it).
+    """Text decoded from UTF-8, or from UTF-16 with a byte-order mark (as spreadsheets
+    save it).
 
     Args:
         content: bytes of the file.
@@ -29,16 +30,19 @@ def read_text(path: str | Path) -> str:
     """Text of a file, by :func:`decode_text`.
 
     Args:
-        path: file to read or write.
+        path: of the file.
     """
     return decode_text(Path(path).read_bytes())
 
 
 def column_separator(line: str) -> tuple[str | None, bool]:
-    """What parts the columns of a line of a table (None for blanks and tabs), and
+    """Separator of the columns of a table's line (None for blanks and tabs), and
     whether its commas are decimal.
 
-    They are where something else parts the columns: "840,5;0,3", "840,5 0,3".
+    They are where something else separates the columns: "840,5;0,3", "840,5 0,3".
+
+    Args:
+        line: of the table.
     """
     if ";" in line:
         return ";", True
@@ -52,18 +56,20 @@ def column_separator(line: str) -> tuple[str | None, bool]:
 
 
 def split_columns(line: str) -> list[str]:
-    """The words of such a line, decimals with points."""
-    mark, decimal = column_separator(line)
+    """Fields of a table's line as text, with decimal points."""
+    separator, decimal = column_separator(line)
     line = line.replace(",", ".") if decimal else line
-    return (line if mark is None else line.replace(mark, " ")).split()
+    return (line if separator is None else line.replace(separator, " ")).split()
 
 
 def to_valid_utf8(text: str) -> str:
-    """A text whose every character is one of UTF-8, of one that may hold names of files in bytes of no known locale.
+    """Text that UTF-8 can encode, from text that may hold file names of an unknown
+    encoding.
 
-    Python keeps such bytes as lone surrogates. Where they are UTF-8 they become what they stand for; others, codes.
+    Python keeps their bytes as lone surrogates. Valid UTF-8 among them becomes its
+    characters; other bytes become escapes.
 
-    >>> shown("gr\\udcc3\\udcb6sse \\udcff")
+    >>> to_valid_utf8("gr\\udcc3\\udcb6sse \\udcff")
     'grösse \\\\xff'
     """
     try:
@@ -83,7 +89,7 @@ def missing_reason(path: Path) -> str:
     return "no such file"
 
 
-_FOREIGN = {  # first bytes of what is often given in place of an artefact, in words
+_FOREIGN = {  # first bytes of files that are often mistaken for an artefact
     b"\x93NUMPY": "an array of NumPy",
     b"PK\x03\x04": "an archive (.npz or .zip)",
     b"II*\0": "a TIFF picture",
@@ -95,10 +101,11 @@ _FOREIGN = {  # first bytes of what is often given in place of an artefact, in w
 
 
 def foreign_format(path: str | Path) -> str:
-    """What a file is that begins as another program's, in words; empty for any other.
+    """Format of a file with the first bytes of another program, in words; empty for any
+    other.
 
     Args:
-        path: file to read or write.
+        path: of the file.
     """
     start = b""
     with contextlib.suppress(OSError), open(path, "rb") as file:

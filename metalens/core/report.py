@@ -42,7 +42,13 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of text or numbers under a head, as :func:`in_figures` shows them."""
+    """Rows of text or numbers under a head.
+
+    head: titles of the columns.
+    rows: values, written by :func:`in_figures`.
+    caption: text above the table; empty for none.
+    digits: significant digits of numbers.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[Any]]
@@ -51,7 +57,7 @@ class Table:
 
     @property
     def cells(self) -> list[list[str]]:
-        """Rows as text."""
+        """Rows as text, numbers with ``digits`` significant digits."""
         return [[self._text(value) for value in row] for row in self.rows]
 
     @property
@@ -69,7 +75,7 @@ class Table:
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = [
             "  ".join(
-                cell.ljust(w) for cell, w in zip(row, widths, strict=True)
+                cell.ljust(width) for cell, width in zip(row, widths, strict=True)
             ).rstrip()
             for row in lines
         ]
@@ -97,7 +103,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class KeyFigure:
-    """A number that stands at the top of the page; ``good`` colours it (None: neutral)."""
+    """A number at the top of the page; ``good`` colours it (None: neutral)."""
 
     label: str
     value: str
@@ -150,7 +156,7 @@ WORDS |= {
 
 
 def in_words(key: str) -> str:
-    """A key of a result as a reader says it, with its unit behind a stroke.
+    """A key of a result in words, with its unit after a slash.
 
     >>> in_words("max_phase_error_rad")
     'largest phase error / rad'
@@ -160,19 +166,17 @@ def in_words(key: str) -> str:
     *parts, last = key.split("_")
     unit = UNITS.get(last, "") if parts else ""
     if unit and parts[-1] == "per":
-        over = UNITS.get(parts[-2], "") if len(parts) > 2 else ""
-        unit, parts = (
-            (f"({over}/{unit})", parts[:-2]) if over else (f"(1/{unit})", parts[:-1])
-        )
-    said = " ".join(
+        numerator = UNITS.get(parts[-2], "") if len(parts) > 2 else ""
+        unit = f"({numerator or 1}/{unit})"
+        parts = parts[: -2 if numerator else -1]
+    words = " ".join(
         WORDS.get(part, part) for part in (parts if unit else [*parts, last])
     )
-    return f"{said} / {unit}" if unit else said
+    return f"{words} / {unit}" if unit else words
 
 
 def in_figures(value: Any, digits: int = 4) -> str:
-    """A value as a reader wants it: ``digits`` significant digits, yes and no, 0 for
-    what rounding has left.
+    """A value as text: ``digits`` significant digits, yes and no, 0 for rounding errors.
 
     >>> [in_figures(v) for v in (0.123456, 19553.2, 7.2e-15, True, None, "air", float("nan"))]
     ['0.1235', '19550', '0', 'yes', '–', 'air', 'nan']
@@ -182,22 +186,21 @@ def in_figures(value: Any, digits: int = 4) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        shown = f"{value:.{digits}g}"
+        rounded = f"{value:.{digits}g}"
         if 10**digits <= abs(value) < 1e7:
-            return f"{float(shown):.0f}"
+            return f"{float(rounded):.0f}"
         # what is smaller in um, rad, shares or electrons is rounding
-        return "0" if abs(value) < 1e-12 else shown
+        return "0" if abs(value) < 1e-12 else rounded
     return str(value)
 
 
 def figure_png(figure: "Canvas", *, dpi: int = 220) -> bytes:
-    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the
-    figure is closed.
+    """PNG bytes of a matplotlib figure, equal for equal drawings; the figure is closed.
 
-    Two pixels of the file stand for one of the page: sharp on dense screens and on
-    paper.
+    Two pixels of the file stand for one of the page, for dense screens and print.
 
     Args:
+        figure: that is drawn.
         dpi: dots per inch.
     """
     from matplotlib import pyplot
@@ -221,12 +224,14 @@ def make_figure(
     size: tuple[float, float] = (8.0, 3.4),
     **options: Any,
 ) -> Any:
-    """(figure, axes) of matplotlib in the look of the reports, drawn without a display.
+    """(figure, axes) of matplotlib in the style of the reports, drawn without a
+    display.
 
     Args:
         rows: panels along a column.
-        columns: panels or characters along a row.
+        columns: panels along a row.
         size: width and height, inches.
+        options: of ``pyplot.subplots``.
     """
     import matplotlib
 
@@ -262,11 +267,15 @@ def write_report(
     lead: str = "",
     key_figures: Sequence[KeyFigure] = (),
 ) -> None:
-    """Write the page: title, one lead paragraph, key figures, then the sections with a
-    contents list.
+    """Write an HTML page: title, one lead paragraph, key figures, then the sections
+    with a contents list.
 
     Args:
-        path: file to read or write.
+        path: of the page.
+        title: of the page.
+        sections: in their order.
+        lead: first paragraph.
+        key_figures: numbers at the top.
 
     Raises:
         OSError: the target cannot be written.
@@ -330,21 +339,20 @@ def _is_nested(value: Any) -> bool:
 
 
 def _list_text(value: Any) -> str:
-    """One line for a value; of a long list of numbers, how many and their range."""
+    """One line for a value; a long list of numbers gives its length and range."""
     if not isinstance(value, list | tuple):
         return in_figures(value).replace("\n", " ")
     numbers = [v for v in value if isinstance(v, int | float) and math.isfinite(v)]
     if len(value) > 6 and len(numbers) == len(value):
-        ends = in_figures(min(numbers)), in_figures(max(numbers))
-        return f"{len(value)} values, {ends[0]} to {ends[1]}"
+        limits = in_figures(min(numbers)), in_figures(max(numbers))
+        return f"{len(value)} values, {limits[0]} to {limits[1]}"
     return ", ".join(_list_text(entry) for entry in value[:6]) + (
         ", ..." if len(value) > 6 else ""
     )
 
 
 def flush_output(text: str = "") -> None:
-    """Write to standard output and flush it; a reader that went away (``| head``) is no
-    failure of the work.
+    """Write to standard output and flush it; a closed pipe (``| head``) is no error.
 
     Args:
         text: what is printed.
@@ -363,11 +371,11 @@ def flush_output(text: str = "") -> None:
 
 
 def silence_output() -> None:
-    """Standard output leads nowhere from here on, what it still holds included."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    with contextlib.suppress(OSError, ValueError):  # one that is no file
-        os.dup2(nowhere, sys.stdout.fileno())
-    os.close(nowhere)
+    """Discard all further standard output, buffered text included."""
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    with contextlib.suppress(OSError, ValueError):  # standard output without a file
+        os.dup2(null_device, sys.stdout.fileno())
+    os.close(null_device)
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,7 +390,7 @@ class Console:
     json: bool = False
 
     def say(self, text: str) -> None:
-        """One line for a person."""
+        """Print one line, unless quiet or with --json."""
         if not (self.quiet or self.json):
             flush_output(text + "\n")
 
@@ -410,26 +418,36 @@ class Console:
         return self.judged(dict(values), "\n".join(lines), failures)
 
     def result(self, values: dict[str, Any], text: str) -> None:
-        """The outcome: ``values`` with --json, else ``text``."""
+        """Print the outcome: ``values`` as JSON with --json, else ``text``."""
         if self.json:
             flush_output(json.dumps(values, indent=1, default=float) + "\n")
         else:
             self.say(text)
 
     def judged(self, values: dict[str, Any], text: str, failures: Iterable[str]) -> int:
-        """The outcome with the checks that it failed, in words (``failures`` of the
-        values, a line each of the text);
-        the status that the command ends with: 1 with any failure, else 0. Empty words
-        are no failure."""
-        found = [failure for failure in failures if failure]
+        """Print the outcome with the checks that it failed, and return the exit status:
+        1 with any failure, else 0.
+
+        Args:
+            values: the result; ``failures`` is added to them.
+            text: the result for a person; a line per failure is added.
+            failures: sentences; empty ones are none.
+        """
+        failed = [failure for failure in failures if failure]
         self.result(
-            values | {"failures": found},
-            "\n".join([text, *(f"  FAILED: {failure}" for failure in found)]),
+            values | {"failures": failed},
+            "\n".join([text, *(f"  FAILED: {failure}" for failure in failed)]),
         )
-        return 1 if found else 0
+        return 1 if failed else 0
 
     def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
-        """Pass ``items`` through, showing how far it is, the rate and the time left."""
+        """Yield ``items`` while showing progress, rate and remaining time.
+
+        Args:
+            items: that are passed through.
+            total: how many there are.
+            label: of the progress.
+        """
         if self.quiet or self.json:
             yield from items
         elif sys.stdout.isatty():
@@ -438,18 +456,24 @@ class Console:
             yield from self._lines(items, total, label)
 
     def _lines(self, items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-        start = shown = time.monotonic()
+        """Yield ``items``, with a line of progress every 10 s and at the end of long
+        work.
+        """
+        start = last_shown = time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            if now - shown > 10 or (done == total and now - start > 2):
+            if now - last_shown > 10 or (done == total and now - start > 2):
                 rate = done / (now - start)
-                left = (total - done) / rate
-                self.say(f"{label}: {done}/{total}, {rate:.3g}/s, {left:.0f} s left")
-                shown = now
+                remaining = (total - done) / rate
+                self.say(
+                    f"{label}: {done}/{total}, {rate:.3g}/s, {remaining:.0f} s left"
+                )
+                last_shown = now
 
 
 def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+    """Yield ``items`` under a progress bar with rate and remaining time."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

@@ -28,22 +28,22 @@ from metalens.core.errors import MetalensError, OutputError, StoreError
 
 Attribute = str | int | float | bool
 Record = TypeVar("Record")
-# words of the command line, for locks and manifests
+# text of the command line, for locks and manifests
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
-# of HDF5: every block of metadata carries a checksum, files can still be edited
+# HDF5 versions (least, most): every block of metadata carries a checksum
 _FORMAT = ("v110", "v110")
 _UNITS = "um, rad"
-_MOST_BYTES = 1 << 36  # of all arrays of a file
-# bytes of an array that is kept in its header, under the checksum of the header
+_MOST_BYTES = 1 << 36  # of all arrays of a file together
+# largest array in bytes that is stored in its header, under the header's checksum
 _SMALL = 4096
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where an artefact comes from.
+    """Origin of an artefact.
 
-    config: the settings that made it, as TOML text.
+    config: its settings, as TOML text.
     inputs: {file name: SHA-256} of every file read.
     seed: of the random generator, -1 where none was used.
     versions: {package: version}.
@@ -59,8 +59,12 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StoredArtefact:
-    """The content of an artefact file: ``arrays`` by name (``group/name``),
-    ``attributes`` of the header.
+    """Content of an artefact file.
+
+    kind, version: from its header.
+    arrays: by name (``group/name``).
+    attributes: of the header.
+    provenance: of the artefact.
     """
 
     kind: str
@@ -71,7 +75,9 @@ class StoredArtefact:
 
 
 def package_versions() -> Iterator[tuple[str, str]]:
-    """(name, version) of the packages whose numbers enter an artefact."""
+    """(name, version) of Python, this package and the libraries that affect its
+    numbers.
+    """
     yield "python", ".".join(map(str, sys.version_info[:3]))
     for name in ("metalens-toolchain", *_RECORDED):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -82,7 +88,7 @@ def sha256(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes.
 
     Args:
-        path: file to read or write.
+        path: of the file.
     """
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -90,36 +96,36 @@ def sha256(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def replace_atomically(path: str | Path) -> Iterator[Path]:
-    """Give a scratch path in the folder of ``path``; sync it and rename it over
-    ``path`` only if the block succeeds.
+    """Context of a scratch path in the folder of ``path``; it is synced and renamed
+    over ``path`` only if the block succeeds.
 
     Whatever ends the block early (error, Ctrl-C, full disk, kill), the old file stays.
-    Writers of one file wait for each other; the next one overwrites a scratch file that
-    a killed process left.
+    Writers of one file wait for each other. A scratch file that a killed process left
+    is overwritten by the next writer.
 
     Args:
         path: file to write.
     """
     path = Path(path)
-    part = path.with_name(f".{path.name}.part")
+    scratch = path.with_name(f".{path.name}.part")
     with hold_lock(path, wait=True):
         try:
-            yield part
-            sync_file(part)
-            part.replace(path)
+            yield scratch
+            sync_file(scratch)
+            scratch.replace(path)
             sync_file(path.parent)
         finally:
-            part.unlink(missing_ok=True)
+            scratch.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def hold_lock(target: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold ``.NAME.lock`` in the folder of an output; the kernel frees it when its
-    owner dies.
+    """Context that holds the lock file ``.NAME.lock`` in the folder of an output; the
+    kernel frees it when its owner dies.
 
     Args:
         target: the output; its folder exists.
-        wait: for another owner, in place of a refusal.
+        wait: wait for another owner instead of raising.
 
     Raises:
         OutputError: another process writes this output; the message names it.
@@ -156,7 +162,7 @@ def hold_lock(target: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def sync_file(path: Path) -> None:
-    """Flush a file, or the names in a folder, to the disk."""
+    """Flush a file, or the directory entries of a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -165,44 +171,47 @@ def sync_file(path: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) whole or not at all.
+    """Write a text file (UTF-8), whole or not at all.
 
     Args:
-        path: file to read or write.
+        path: of the file.
+        text: its content.
     """
     write_bytes(path, reading.to_valid_utf8(text).encode())
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all.
+    """Write a file, whole or not at all.
 
     Args:
-        path: file to read or write.
+        path: of the file.
         content: bytes of the file.
     """
-    with replace_atomically(path) as part, open(part, "wb") as file:
+    with replace_atomically(path) as scratch, open(scratch, "wb") as file:
         file.write(content)
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a journal, on the disk when this returns; a line that was cut short
-    goes first.
+    """Append a line to a journal, synced to the disk on return; a truncated last line
+    is removed first.
 
     Args:
         path: of the journal.
         line: text without a line break.
     """
     with open(path, "ab+") as file:
-        if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
-            file.seek(0)
-            file.truncate(file.read().rfind(b"\n") + 1)
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.seek(0)
+                file.truncate(file.read().rfind(b"\n") + 1)
         file.write(reading.to_valid_utf8(line).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
 
 def whole_lines(path: Path) -> list[str]:
-    """Lines of a journal but one that was cut short; none without a file.
+    """Lines of a journal without a truncated last one; empty where there is no file.
 
     Args:
         path: of the journal.
@@ -213,8 +222,8 @@ def whole_lines(path: Path) -> list[str]:
 
 
 def open_journal(path: Path, title: str) -> list[str]:
-    """Whole lines of a journal after its title, its first line; the journal of other
-    work is begun afresh.
+    """Whole lines of a journal after its title, which is its first line; the journal of
+    other work is replaced by an empty one.
 
     Args:
         path: of the journal.
@@ -226,8 +235,8 @@ def open_journal(path: Path, title: str) -> list[str]:
     lines = whole_lines(path)
     if lines and lines[0] == title:
         return lines[1:]
-    begun = path.read_bytes()[:2] if path.is_file() else b""
-    if path.is_dir() or begun not in (b"", b'["'):
+    start = path.read_bytes()[:2] if path.is_file() else b""
+    if path.is_dir() or start not in (b"", b'["'):
         raise StoreError(
             f"{path} is in the way of what is kept for an interruption, and no journal of metalens; move it"
         )
@@ -237,19 +246,20 @@ def open_journal(path: Path, title: str) -> list[str]:
 
 class CheckedFile(io.FileIO):
     """A file for the HDF5 library, which may crash the process where a write fails, as
-    on a full disk: the first refusal is kept for :meth:`check`, nothing is written
-    from then on.
+    on a full disk.
+
+    The first write error is stored for :meth:`check`; nothing is written after it.
     """
 
     refused: BaseException | None = None
 
     def check(self) -> None:
-        """Raise what a write was refused with."""
+        """Raise the stored write error, if there is one."""
         if self.refused is not None:
             raise self.refused
 
     def write(self, content: Any) -> int:
-        """All of ``content``."""
+        """Write all of ``content``, or nothing after an error; its length is returned."""
         view = memoryview(content)
         try:
             while view and self.refused is None:
@@ -259,7 +269,7 @@ class CheckedFile(io.FileIO):
         return len(content)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the size of what is still written."""
+        """Set the size of the file, unless a write failed."""
         return 0 if self.refused is not None else super().truncate(size)
 
 
@@ -273,19 +283,22 @@ def save(
     provenance: Provenance | None = None,
     compress: bool = True,
 ) -> None:
-    """Write an artefact: header (kind, version, units), arrays, provenance. Same input
-    gives the same bytes.
+    """Write an artefact: header (kind, version, units), arrays and provenance. Equal
+    input gives equal bytes.
 
     Args:
-        attributes: of the file.
         path: target, replaced atomically.
+        kind: of the artefact, checked when it is read.
         arrays: by name; ``a/b`` makes group ``a``.
+        version: of the kind.
+        attributes: of the file.
+        provenance: of the artefact.
         compress: gzip level 1 with byte shuffle for arrays above 64 KiB.
 
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
-    with replace_atomically(path) as part, CheckedFile(part, "wb+") as file:
+    with replace_atomically(path) as scratch, CheckedFile(scratch, "wb+") as file:
         _write(
             file,
             kind,
@@ -307,19 +320,18 @@ def load(
 ) -> StoredArtefact:
     """Read an artefact and check its header.
 
-    Args:
-        path: file to read or write.
-        kind: the kind that is needed; None takes any (``metalens info``).
-        without: arrays that are left in the file.
+    Arrays and header are under checksums of HDF5: a truncated or damaged file is
+    refused. A file that was edited with an HDF5 library is read as it now stands.
 
-    Arrays and header are under checksums of HDF5: a file that was cut or damaged is
-    refused, not read wrongly, and one
-    that was edited with an HDF5 library is read as it now stands.
+    Args:
+        path: of the file.
+        kind: the kind that is needed; None takes any (``metalens info``).
+        version: of the kind that is needed.
+        without: names of arrays that are not read.
 
     Raises:
         StoreError: no such file, not HDF5, truncated, damaged, or of another kind or
-            version; also where an entry
-            that is asked for later is not in the file.
+            version; also where a missing entry is asked for later.
     """
     path = Path(path)
     if not path.is_file():
@@ -332,16 +344,16 @@ def load(
     except StoreError:
         raise
     except DAMAGE as error:
-        found = reading.foreign_format(path)
+        other_format = reading.foreign_format(path)
         raise StoreError(
-            f"{path}: {found}, need an HDF5 file of this toolchain"
-            if found
+            f"{path}: {other_format}, need an HDF5 file of this toolchain"
+            if other_format
             else f"{path}: truncated or not an HDF5 file of this toolchain ({error})"
         ) from error
 
 
 def kind_of(path: str | Path) -> str:
-    """The kind that an artefact file says it is; '' for any other file.
+    """Kind that an artefact file states in its header; '' for any other file.
 
     Args:
         path: of the file.
@@ -350,10 +362,10 @@ def kind_of(path: str | Path) -> str:
         return ""
     try:
         with h5py.File(path, "r") as file:
-            found, units = (_plain(file.attrs.get(k)) for k in ("kind", "units"))
+            kind, units = (_plain(file.attrs.get(name)) for name in ("kind", "units"))
     except DAMAGE:
         return ""
-    return found if isinstance(found, str) and units == _UNITS else ""
+    return kind if isinstance(kind, str) and units == _UNITS else ""
 
 
 def _read(
@@ -363,8 +375,20 @@ def _read(
     version: int,
     without: Collection[str],
 ) -> StoredArtefact:
-    found = _plain(file.attrs.get("kind"))
-    if found is None:
+    """Artefact of an open file, after its kind and version are checked.
+
+    Args:
+        path: names the file in errors.
+        file: that is read.
+        kind: that is needed; None takes any.
+        version: that is needed with ``kind``.
+        without: names of arrays that are not read.
+
+    Raises:
+        StoreError: no header, another kind or version, or sizes that cannot be.
+    """
+    stored_kind = _plain(file.attrs.get("kind"))
+    if stored_kind is None:
         raise StoreError(
             f"{path}: an HDF5 file without 'kind', not made by this toolchain"
         )
@@ -373,58 +397,70 @@ def _read(
         raise StoreError(
             f"{path}: version is {number!r}, need a whole number; damaged: make it again"
         )
-    if kind is not None and (found != kind or number != version):
+    if kind is not None and (stored_kind != kind or number != version):
         raise StoreError(
-            f"{path} holds {found!r} version {number}, need {kind!r} version {version}; "
+            f"{path} holds {stored_kind!r} version {number}, need {kind!r} version {version}; "
             "make it again with this release or give another file"
         )
-    arrays: dict[str, Array] = _Held(path)
-    wanted = ((name, item) for name, item in _listed(path, file) if name not in without)
+    arrays: dict[str, Array] = _Entries(path)
+    data_sets = (
+        (name, item)
+        for name, item in _list_data_sets(path, file)
+        if name not in without
+    )
     arrays |= {
-        name: item[...] for name, item in wanted if not name.startswith("provenance/")
+        name: item[...]
+        for name, item in data_sets
+        if not name.startswith("provenance/")
     }
-    attributes: dict[str, Any] = _Held(path)
+    attributes: dict[str, Any] = _Entries(path)
     attributes |= {
-        k: _plain(v)
-        for k, v in file.attrs.items()
-        if k not in ("kind", "version", "units")
+        key: _plain(value)
+        for key, value in file.attrs.items()
+        if key not in ("kind", "version", "units")
     }
     return StoredArtefact(
-        str(found), number, arrays, attributes, _read_provenance(file)
+        str(stored_kind), number, arrays, attributes, _read_provenance(file)
     )
 
 
-def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
-    """Data sets of a file, refused together before any is read where they claim more
-    than the file can hold.
+def _list_data_sets(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
+    """(name, data set) of all data sets of a file.
+
+    All are checked before any is read: none may claim more than the file can hold.
+
+    Raises:
+        StoreError: sizes that cannot be, or arrays above 64 GiB together.
     """
-    found: list[tuple[str, h5py.Dataset]] = []
-    file.visititems(
-        lambda name, item: (
-            found.append((name, item)) if isinstance(item, h5py.Dataset) else None
-        )
-    )
+    data_sets: list[tuple[str, h5py.Dataset]] = []
+
+    def add(name: str, item: h5py.HLObject) -> None:
+        if isinstance(item, h5py.Dataset):
+            data_sets.append((name, item))
+
+    file.visititems(add)
     claimed = 0
-    for name, item in found:
+    for name, item in data_sets:
         check_claim(path, item, name)
         claimed += item.nbytes
     if claimed > _MOST_BYTES:
         raise StoreError(
             f"{path}: its arrays take {claimed / 1e9:.3g} GB, more than {_MOST_BYTES / 1e9:.3g} GB"
         )
-    return found
+    return data_sets
 
 
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
-    """Refuse a data set of no values, of more than its bytes in the file can hold, or
-    that lies in other files.
+    """Refuse a data set without a shape, larger than its stored bytes can expand to, or
+    with values in other files.
 
     Args:
-        path: file to read or write.
-        name: of the item.
+        path: names the file in errors.
+        item: the data set.
+        name: of the data set.
 
     Raises:
-        StoreError: naming what it claims and what is there.
+        StoreError: naming what it claims and what the file holds.
     """
     if item.shape is None:
         raise StoreError(
@@ -442,8 +478,8 @@ def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
         )
 
 
-class _Held(dict[str, Any]):
-    """Entries of a file; one that is not there is a refusal that names the file."""
+class _Entries(dict[str, Any]):
+    """Entries of a file by name; a missing one raises a StoreError that names both."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -456,7 +492,7 @@ class _Held(dict[str, Any]):
 
 
 def _write(
-    through: CheckedFile,
+    checked_file: CheckedFile,
     kind: str,
     version: int,
     attributes: Mapping[str, Attribute],
@@ -464,7 +500,19 @@ def _write(
     provenance: Provenance,
     compress: bool,
 ) -> None:
-    with h5py.File(through, "w", track_order=False, libver=_FORMAT) as file:
+    """Write header, arrays in order of name, and provenance; a write error is raised
+    after each array.
+
+    Args:
+        checked_file: stores write errors.
+        kind: of the artefact.
+        version: of the kind.
+        attributes: of the header.
+        arrays: by name.
+        provenance: of the artefact.
+        compress: whether arrays above 64 KiB are compressed.
+    """
+    with h5py.File(checked_file, "w", track_order=False, libver=_FORMAT) as file:
         header: dict[str, Attribute] = {
             "kind": kind,
             "version": version,
@@ -474,11 +522,14 @@ def _write(
             _write_attribute(file, name, value)
         for name in sorted(arrays):
             _write_array(file, name, np.asarray(arrays[name]), compress)
-            through.check()
+            checked_file.check()
         _write_provenance(file, provenance)
 
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
+    """Write one array with a checksum: up to 4096 bytes inside its header, larger ones
+    in chunks. Text is stored as UTF-8 of fixed length.
+    """
     if array.dtype.kind == "U":
         encoded = np.array(
             [reading.to_valid_utf8(text).encode() for text in array.flat], "S"
@@ -487,23 +538,23 @@ def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> No
             h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1))
         )
     if array.nbytes <= _SMALL:
-        inside = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        inside.set_layout(h5py.h5d.COMPACT)
-        file.create_dataset(name, data=array, track_times=False, dcpl=inside)
+        compact = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        compact.set_layout(h5py.h5d.COMPACT)
+        file.create_dataset(name, data=array, track_times=False, dcpl=compact)
         return
-    packing = (
+    compression = (
         {"compression": "gzip", "compression_opts": 1, "shuffle": True}
         if compress and array.nbytes > 65536
         else {}
     )
     file.create_dataset(
-        name, data=array, track_times=False, chunks=True, fletcher32=True, **packing
+        name, data=array, track_times=False, chunks=True, fletcher32=True, **compression
     )
 
 
 def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
-    """Text goes in at its own length, inside the header; text of any length would lie
-    elsewhere, without a checksum.
+    """Write one attribute inside the header. Text has its exact length: HDF5 stores
+    text of variable length elsewhere, without a checksum.
     """
     if isinstance(value, str):
         encoded = reading.to_valid_utf8(value).encode()
@@ -516,6 +567,7 @@ def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
 
 
 def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
+    """Write the group ``provenance``: config, seed, inputs and versions."""
     group = file.create_group("provenance")
     _write_attribute(group, "config", provenance.config)
     _write_attribute(group, "seed", provenance.seed)
@@ -526,10 +578,11 @@ def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
 
 
 def _read_provenance(file: h5py.File) -> Provenance:
+    """Provenance stored in a file."""
     group = file["provenance"]
     inputs, versions = (
-        {k: str(_plain(v)) for k, v in group[p].attrs.items()}
-        for p in ("inputs", "versions")
+        {name: str(_plain(value)) for name, value in group[part].attrs.items()}
+        for part in ("inputs", "versions")
     )
     return Provenance(
         str(_plain(group.attrs["config"])), inputs, int(group.attrs["seed"]), versions
@@ -537,7 +590,7 @@ def _read_provenance(file: h5py.File) -> Provenance:
 
 
 def _plain(value: Any) -> Any:
-    """A number or text of Python."""
+    """A stored scalar as a Python number, or as text where it is bytes."""
     if isinstance(value, bytes):
         return value.decode()
     return value.item() if isinstance(value, np.generic) else value
@@ -556,7 +609,7 @@ def save_record(path: str | Path, kind: str, record: Any) -> None:
 
 
 def load_record(path: str | Path, kind: str, record_type: type[Record]) -> Record:
-    """Read what :func:`save_record` wrote, as a ``record_type``.
+    """Read a ``record_type`` that :func:`save_record` wrote.
 
     Args:
         path: of the file.
@@ -579,17 +632,18 @@ def load_record(path: str | Path, kind: str, record_type: type[Record]) -> Recor
 def flatten_record(
     record: Any, group: str = ""
 ) -> tuple[dict[str, Array], dict[str, Attribute]]:
-    """(arrays, attributes) of a record; fields that are None are left out.
+    """(arrays, attributes) of a record by name; fields that are None are left out.
 
     Args:
         record: a dataclass of arrays, numbers, text, tuples, dictionaries of arrays or
             numbers, and other records.
-        group: stands before every name.
+        group: prefix of every name.
     """
     arrays: dict[str, Array] = {}
     attributes: dict[str, Attribute] = {}
     for entry in dataclasses.fields(record):
-        value, name = getattr(record, entry.name), group + entry.name
+        name = group + entry.name
+        value = getattr(record, entry.name)
         value = value.item() if isinstance(value, np.generic) else value
         if not entry.init or isinstance(value, Provenance):
             continue
@@ -598,11 +652,11 @@ def flatten_record(
         elif isinstance(value, tuple):
             arrays[name] = np.array(value)
         elif isinstance(value, Mapping):
-            arrays |= {f"{name}/{key}": np.array(one) for key, one in value.items()}
+            arrays |= {f"{name}/{key}": np.array(item) for key, item in value.items()}
         elif _holds_arrays(type(value)):
-            inner = flatten_record(value, _group(entry, group))
-            arrays |= inner[0]
-            attributes |= inner[1]
+            nested = flatten_record(value, _group(entry, group))
+            arrays |= nested[0]
+            attributes |= nested[1]
         elif dataclasses.is_dataclass(value):
             attributes[name] = config.dumps(value)
         elif value is not None:
@@ -619,14 +673,14 @@ def build_record(
     group: str = "",
     **given: Any,
 ) -> Record:
-    """Inverse of :func:`flatten_record`.
+    """Record from its arrays and attributes; the inverse of :func:`flatten_record`.
 
     Args:
         record_type: the dataclass; a field without an entry takes its default.
         arrays: by name.
         attributes: by name.
         where: names the file in errors.
-        group: stands before every name.
+        group: prefix of every name.
         given: fields that do not come from the entries.
 
     Raises:
@@ -639,24 +693,24 @@ def build_record(
         if entry.name in given or not entry.init:
             continue
         if _holds_arrays(kind):
-            inner = _group(entry, group)
-            if any(n.startswith(inner) for n in (*arrays, *attributes)):
+            nested_group = _group(entry, group)
+            if any(key.startswith(nested_group) for key in (*arrays, *attributes)):
                 given[entry.name] = build_record(
-                    kind, arrays, attributes, where=where, group=inner
+                    kind, arrays, attributes, where=where, group=nested_group
                 )
         elif typing.get_origin(kind) is dict:
-            of_arrays = typing.get_args(kind)[1] is Array
+            holds_arrays = typing.get_args(kind)[1] is Array
             given[entry.name] = {
-                n.removeprefix(f"{name}/"): array if of_arrays else array.item()
-                for n, array in arrays.items()
-                if n.startswith(f"{name}/")
+                key.removeprefix(f"{name}/"): array if holds_arrays else array.item()
+                for key, array in arrays.items()
+                if key.startswith(f"{name}/")
             }
         elif name in attributes:
             value = attributes[name]
-            settings = dataclasses.is_dataclass(kind)
+            is_settings = dataclasses.is_dataclass(kind)
             given[entry.name] = (
                 config.loads(value, kind, where=f"{where}: {name}")
-                if settings
+                if is_settings
                 else value
             )
         elif name in arrays or _is_required(entry):
@@ -667,16 +721,17 @@ def build_record(
 
 
 def _group(field: dataclasses.Field[Any], group: str) -> str:
-    """What stands before the names of a record's entries."""
+    """Prefix of the names of a nested record's entries."""
     return group if field.metadata.get("flat") else f"{group}{field.name}/"
 
 
 def _holds_arrays(kind: Any) -> bool:
+    """Whether a type is a record compared by identity, as those with arrays are."""
     return dataclasses.is_dataclass(kind) and kind.__eq__ is object.__eq__
 
 
 def _without_none(hint: Any) -> Any:
-    """The type of ``X`` or ``X | None``."""
+    """The type X of ``X`` or ``X | None``."""
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint
     return next(kind for kind in typing.get_args(hint) if kind is not type(None))
@@ -688,26 +743,29 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _to_tuple(value: Any) -> Any:
-    """Nested lists as tuples, bytes as text."""
+    """Nested lists as nested tuples, and bytes as text."""
     if isinstance(value, list):
-        return tuple(_to_tuple(one) for one in value)
+        return tuple(_to_tuple(item) for item in value)
     return value.decode() if isinstance(value, bytes) else value
 
 
 def typed_reader(load: Callable[..., Record]) -> Callable[..., Record]:
-    """A ``load(path, ...)`` whose every failure on a damaged or edited file is a
-    StoreError that names the file.
+    """Decorator of ``load(path, ...)``: every failure on a damaged or edited file
+    becomes a StoreError that names the file.
+
+    Args:
+        load: function whose first argument is the path.
     """
 
     @functools.wraps(load)
-    def checked(path: str | Path, *more: Any, **about: Any) -> Record:
+    def checked(path: str | Path, *args: Any, **options: Any) -> Record:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter(
                     "error", np.exceptions.ComplexWarning
                 )  # complex numbers where real ones belong
-                made = load(path, *more, **about)
-            _check_types(made)
+                record = load(path, *args, **options)
+            _check_types(record)
         except MetalensError:
             raise
         except (
@@ -719,13 +777,14 @@ def typed_reader(load: Callable[..., Record]) -> Callable[..., Record]:
             raise StoreError(
                 f"{path}: entries of the wrong kind ({error}); edited or damaged: make it again"
             ) from None
-        return made
+        return record
 
     return checked
 
 
 def _check_types(record: Any) -> None:
-    """Numbers, words and arrays where the fields of a record say so.
+    """Refuse a record whose numbers, text and arrays do not have the types of its
+    fields; nested records too.
 
     Raises:
         TypeError: naming the field.
@@ -740,7 +799,8 @@ def _check_types(record: Any) -> None:
         bool: bool | np.bool_,
     }
     for entry in dataclasses.fields(record):
-        value, hint = getattr(record, entry.name), hints[entry.name]
+        value = getattr(record, entry.name)
+        hint = hints[entry.name]
         if hint in needed and (
             not isinstance(value, needed[hint])
             or (isinstance(value, bool) and hint is not bool)

@@ -20,25 +20,24 @@ from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_CONCURRENT = threading.local()  # stop: set for a thread that works with others
+_CONCURRENT = threading.local()  # stop: event of a thread of run_each
 
 
-class WorkStopped(Exception):  # no error: nobody waits for what is stopped any more
-    """Raised within an item of :func:`run_each` that is no longer wanted."""
+class WorkStopped(Exception):  # no error: the result of the item is not used
+    """Raised within an item of :func:`run_each` that is cancelled."""
 
 
 def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """``work`` of every item, in their order: side by side, one thread each,
-    :func:`run_split` within them included.
+    """``work`` of every item, in their order, one thread per item; :func:`run_split`
+    within an item stays in its thread.
 
-    For work that consists of calls which release the interpreter lock, and that shares
-    nothing it changes. An
-    interrupt or the first failure stops the others at their next :func:`run_split`, and
-    is
-    raised when they have ended.
+    For work of calls that release the interpreter lock, and that changes nothing
+    shared. An interrupt or the first failure stops the other items at their next
+    :func:`run_split`. It is raised when they have ended.
 
     Args:
-        items: what is computed one by one.
+        work: called with each item.
+        items: what is computed in parallel.
     """
     items = list(items)
     count = min(thread_count(), len(items), 16)  # each has memory of its own
@@ -46,7 +45,7 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
         return [work(item) for item in items]
     stop = threading.Event()
 
-    def alone(item: Item) -> Result:
+    def run_item(item: Item) -> Result:
         _CONCURRENT.stop = stop
         return work(item)
 
@@ -55,7 +54,7 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
         one_blas_thread(),
     ):
         try:
-            jobs = [pool.submit(alone, item) for item in items]
+            jobs = [pool.submit(run_item, item) for item in items]
             return [job.result() for job in jobs]
         except BaseException:
             stop.set()
@@ -66,6 +65,9 @@ def run_each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Resu
 def run_split(count: int, work: Callable[[int, int], object]) -> None:
     """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads
     (see :func:`thread_count`).
+
+    Raises:
+        WorkStopped: the item of :func:`run_each` that calls this was cancelled.
     """
     stop = getattr(_CONCURRENT, "stop", None)
     if stop is not None and stop.is_set():
@@ -74,53 +76,54 @@ def run_split(count: int, work: Callable[[int, int], object]) -> None:
 
 
 def run_concurrently(*works: Callable[[], Any]) -> list[Any]:
-    """Results of several calls, side by side where there are threads; see
+    """Results of several calls in parallel threads, in the order of ``works``; see
     :func:`run_split`.
     """
-    out = dict[int, Any]()
+    results = dict[int, Any]()
 
-    def some(start: int, stop: int) -> None:
+    def run_range(start: int, stop: int) -> None:
         for i in range(start, stop):
-            out[i] = works[i]()
+            results[i] = works[i]()
 
-    run_split(len(works), some)
-    return [out[i] for i in range(len(works))]
+    run_split(len(works), run_range)
+    return [results[i] for i in range(len(works))]
 
 
 def run_split_torch(count: int, work: Callable[[int, int], object]) -> None:
-    """As :func:`run_split`, for work of many small calls of torch: each part has one of
-    its
-    threads to itself.
+    """As :func:`run_split`, for many small calls of torch: each part runs with one
+    torch thread.
 
-    Together they would wait for each other at every call. ``work`` may carry no
-    derivatives: what torch knows of them
-    is of the calling thread.
+    With more they would wait for each other at every call. ``work`` may carry no
+    derivatives: torch records them in the calling thread only.
 
     Args:
-        count: how many.
+        count: length of the range that is split.
+        work: called with (start, stop).
     """
     torch = sys.modules["torch"]
-    own = int(torch.get_num_threads())
+    torch_threads = int(torch.get_num_threads())
 
-    def alone(start: int, stop: int) -> None:
+    def work_single_threaded(start: int, stop: int) -> None:
         torch.set_num_threads(1)
         work(start, stop)
 
     try:
-        _shared(count, min(own, count), alone)
+        _shared(count, min(torch_threads, count), work_single_threaded)
     finally:
-        torch.set_num_threads(own)
+        torch.set_num_threads(torch_threads)
 
 
 def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
-    """``work`` in so many parts, the first in this thread."""
+    """Call ``work(start, stop)`` over [0, count) in ``parts``, the first in this
+    thread.
+    """
     if parts <= 1:
         work(0, count)
         return
     edges = [count * i // parts for i in range(parts + 1)]
     jobs = [
-        _pool(os.getpid(), parts).submit(work, a, b)
-        for a, b in itertools.pairwise(edges[1:])
+        _pool(os.getpid(), parts).submit(work, start, stop)
+        for start, stop in itertools.pairwise(edges[1:])
     ]
     work(edges[0], edges[1])
     for job in jobs:
@@ -128,8 +131,8 @@ def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
 
 
 def thread_count() -> int:
-    """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this
-    process; one within `each`.
+    """Threads for parallel loops: torch's where it is loaded, else OMP_NUM_THREADS,
+    else the cores of this process; one within :func:`run_each`.
     """
     if getattr(_CONCURRENT, "stop", None) is not None:
         return 1
@@ -142,12 +145,13 @@ def thread_count() -> int:
 
 @functools.lru_cache(maxsize=2)
 def _pool(process: int, parts: int) -> ThreadPoolExecutor:
+    """Pool of threads, a new one after a fork: ``process`` is the process number."""
     return ThreadPoolExecutor(parts, thread_name_prefix=f"metalens-{process}")
 
 
 def one_blas_thread() -> contextlib.AbstractContextManager[object]:
-    """Run numpy's and scipy's BLAS on one thread: its idle threads spin for a while and
-    take torch's cores.
+    """Context in which the BLAS of numpy and scipy runs on one thread; idle BLAS
+    threads would spin on cores that torch uses.
     """
     limit: contextlib.AbstractContextManager[object] = _blas().limit(limits=1)
     return limit
@@ -155,29 +159,27 @@ def one_blas_thread() -> contextlib.AbstractContextManager[object]:
 
 @functools.lru_cache(maxsize=1)
 def keep_memory() -> bool:
-    """From here on what is freed stays with the process, for arrays to come; False
-    where the C library is not glibc.
+    """Let the process keep freed memory for later arrays; False where the C library is
+    not glibc.
 
-    For runs whose steps all make arrays of the same sizes. Left to itself glibc gives
-    blocks of over 32 MB, and the end
-    of its heap, back to the system after every step, and gets them as new pages, which
-    the system clears one by one.
+    For runs whose steps all allocate arrays of the same sizes. By default glibc returns
+    blocks of over 32 MB, and the end of its heap, to the system after every step. It
+    then gets them as new pages, which the system clears one by one.
     """
-    tune = (
+    mallopt = (
         getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     )
-    own_pages, trimmed = (
-        -3,
-        -1,
-    )  # M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h; either one alone makes it worse
-    return tune is not None and bool(
-        tune(own_pages, 1 << 30) and tune(trimmed, (1 << 31) - 1)
+    # options of malloc.h; to set only one of them is slower than none
+    mmap_threshold = -3
+    trim_threshold = -1
+    return mallopt is not None and bool(
+        mallopt(mmap_threshold, 1 << 30) and mallopt(trim_threshold, (1 << 31) - 1)
     )
 
 
 @functools.lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
-    importlib.import_module(
-        "scipy.linalg"
-    )  # its BLAS is another one than numpy's, and must be there to be found
+    """Controller of the BLAS libraries of numpy and scipy."""
+    # scipy has a BLAS of its own, which the controller finds only when it is loaded
+    importlib.import_module("scipy.linalg")
     return ThreadpoolController().select(user_api="blas")

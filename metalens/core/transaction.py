@@ -15,11 +15,11 @@ from metalens.core import store
 from metalens.core.errors import OutputError, StoreError
 
 ROOM = 1 << 22  # bytes that every output may need
-# endings of what an interruption leaves for the next run
+# endings of the names that an interruption leaves for the next run
 UNFINISHED, JOURNAL = ".unfinished", ".resume"
 NAME, KIND, VERSION = "manifest.json", "metalens folder", 1
-_ENDS = 1 << 16  # bytes at either end of a file in which its mark is looked for
-# first bytes of a file, and what ours has in it
+_ENDS = 1 << 16  # bytes at either end of a file that are searched for its signature
+# signatures of our files: first bytes, and bytes further on
 _MARKS = (
     (b"\x89PNG", b"Software\0metalens"),
     (b"<!doctype html>", b'name="generator" content="metalens'),
@@ -42,10 +42,10 @@ _MARKS = (
 class OutputDraft:
     """A claimed output.
 
-    path: where to write it; companions of a file go into the same folder under their own
-    names.
-    target: where all appears at the end; where a link leads. resumed: whether ``path``
-    holds work of an earlier run.
+    path: where to write it; companions of a file go into the same folder under their
+        own names.
+    target: its final path; where a link leads.
+    resumed: whether ``path`` holds work of an earlier run.
     """
 
     path: Path
@@ -57,10 +57,10 @@ class OutputDraft:
 class ClaimTerms:
     """What a claim allows.
 
-    force: whether what exists may be replaced, if it is ours. inputs: files and folders
-    that are read.
-    room: bytes that the output needs. parents: whether missing folders above it are
-    made.
+    force: whether an existing output may be replaced, if it is ours.
+    inputs: files and folders that are read.
+    room: bytes that the output needs.
+    parents: whether missing folders above it are created.
     """
 
     force: bool = False
@@ -73,8 +73,8 @@ class ClaimTerms:
 def claim_file(
     target: Path, *, companions: Sequence[str] = (), terms: ClaimTerms = ClaimTerms()
 ) -> Iterator[OutputDraft]:
-    """Claim a file and its companions, give a scratch path, and put all in place if the
-    block succeeds.
+    """Context of a scratch path for a file; it and its companions are put in place if
+    the block succeeds.
 
     Args:
         target: the file.
@@ -84,7 +84,7 @@ def claim_file(
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
-    target = _followed(target)
+    target = _resolve_link(target)
     names = [target.stem + end for end in companions]
     if target.name.lower() in (name.lower() for name in names):
         raise OutputError(
@@ -92,18 +92,18 @@ def claim_file(
         )
     with _claim(target, terms, is_folder=False) as scratch:
         _refuse(target, names, terms, is_folder=False)
-        new = scratch / "new"
-        new.mkdir()
-        yield OutputDraft(new / target.name, target)
-        written = {path.name for path in new.iterdir()} - {target.name}
-        sync_files(new)
+        folder = scratch / "new"
+        folder.mkdir()
+        yield OutputDraft(folder / target.name, target)
+        written = {path.name for path in folder.iterdir()} - {target.name}
+        sync_files(folder)
         _refuse(target, {*names} | written, terms, is_folder=False)
         # a picture is missing after a kill, never another's
         for name in {*names} | written:
             target.with_name(name).unlink(missing_ok=True)
-        (new / target.name).replace(target)
+        (folder / target.name).replace(target)
         for name in written:
-            (new / name).replace(target.with_name(name))
+            (folder / name).replace(target.with_name(name))
         store.sync_file(target.parent)
 
 
@@ -111,8 +111,8 @@ def claim_file(
 def claim_folder(
     target: Path, *, terms: ClaimTerms = ClaimTerms()
 ) -> Iterator[OutputDraft]:
-    """Claim a folder, give a scratch folder to fill, and put it in place with a
-    manifest if the block succeeds.
+    """Context of a scratch folder to fill; it is put in place with a manifest if the
+    block succeeds.
 
     Args:
         target: the folder.
@@ -121,15 +121,15 @@ def claim_folder(
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
-    target = _followed(target)
+    target = _resolve_link(target)
     with _claim(target, terms, is_folder=True) as scratch:
         _refuse(target, (), terms, is_folder=True)
-        new = scratch / "new"
-        new.mkdir()
-        yield OutputDraft(new, target)
-        _finish(new)
+        folder = scratch / "new"
+        folder.mkdir()
+        yield OutputDraft(folder, target)
+        _finish(folder)
         _refuse(target, (), terms, is_folder=True)
-        _put(scratch, new, target)
+        _put(scratch, folder, target)
 
 
 @contextlib.contextmanager
@@ -141,28 +141,27 @@ def claim_long_work(
     grow: bool = False,
     terms: ClaimTerms = ClaimTerms(),
 ) -> Iterator[OutputDraft]:
-    """As :func:`claim_folder` for work of minutes to days: it is done in
-    ``NAME.unfinished``
-    in the folder of the target.
+    """As :func:`claim_folder`, for work of minutes to days that is done in
+    ``NAME.unfinished`` next to the target.
 
     That folder survives an interruption if it holds a file that matches a pattern of
-    ``keep``; with ``resume`` the next run goes on in it, or in a copy of the finished
-    folder. What stands at ``target`` stays until the end. What others put into a folder
-    of ours goes with it, and does not become ours.
+    ``keep``. With ``resume`` the next run continues in it, or in a copy of the finished
+    folder. The content of ``target`` stays until the end. Files that others put into a
+    folder of ours are carried over, and are not listed as ours.
 
     Args:
         target: the folder.
         keep: patterns of files that are worth keeping.
-        resume: go on with unfinished work.
-        grow: always go on, from a copy of what stands at ``target``, and put the whole
-            back; it must have a manifest, or hold nothing but folders that have one.
+        resume: continue unfinished work.
+        grow: always continue, from a copy of ``target``, and replace the whole; it must
+            have a manifest, or hold nothing but folders that have one.
         terms: what the claim allows.
 
     Raises:
         OutputError: nothing to resume, or unfinished work that would be lost; see
             :func:`_refuse`.
     """
-    target = _followed(target)
+    target = _resolve_link(target)
     with _claim(target, terms, is_folder=True) as scratch:
         work = unfinished_path(target)
         if not (resume or grow):
@@ -177,20 +176,21 @@ def claim_long_work(
             _put(scratch, work, target)
         except BaseException as error:
             if any(True for pattern in keep for _ in work.glob(pattern)):
-                how = "the same command" if grow else "--resume"
-                error.add_note(f"{work} holds what is done so far; {how} goes on")
+                command = "the same command" if grow else "--resume"
+                error.add_note(f"{work} holds what is done so far; {command} goes on")
             else:
                 shutil.rmtree(work, ignore_errors=True)
             raise
 
 
 def unfinished_path(target: Path) -> Path:
-    """Where the work on a folder is done until it is finished.
+    """Folder ``NAME.unfinished``, where the work on a folder is done until it is
+    finished.
 
     Args:
-        target: output file.
+        target: the finished folder.
     """
-    target = _followed(target)
+    target = _resolve_link(target)
     return target.with_name(target.name + UNFINISHED)
 
 
@@ -202,17 +202,21 @@ def check_room(target: Path, room: int) -> None:
         room: bytes that it needs.
 
     Raises:
-        OutputError: naming what is free and what is needed.
+        OutputError: naming the free and the needed bytes.
     """
-    spare = shutil.disk_usage(target.parent).free
-    if spare < room:
+    free = shutil.disk_usage(target.parent).free
+    if free < room:
         raise OutputError(
-            f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
+            f"{target}: {free / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
         )
 
 
-def _followed(target: Path) -> Path:
-    """What a link leads to, also where that does not stand yet."""
+def _resolve_link(target: Path) -> Path:
+    """Target of a symbolic link, which need not exist; any other path unchanged.
+
+    Raises:
+        OutputError: a link that cannot be resolved.
+    """
     try:
         return target.resolve() if os.path.islink(target) else target
     except (OSError, RuntimeError) as error:
@@ -223,8 +227,19 @@ def _followed(target: Path) -> Path:
 
 @contextlib.contextmanager
 def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path]:
-    """Lock an output and give an empty scratch folder in its folder, which goes in the
-    end; that of a killed owner goes first.
+    """Context that locks an output and gives an empty scratch folder next to it,
+    removed at the end.
+
+    Folders above the output that were created here are removed again on failure, where
+    they are empty.
+
+    Args:
+        target: the output.
+        terms: what the claim allows.
+        is_folder: whether the output is a folder.
+
+    Raises:
+        OutputError: a name that cannot be written, or no folder to write it in.
     """
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(
@@ -234,23 +249,25 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
         raise OutputError(
             f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work"
         )
-    missing = [one for one in target.parents if not one.exists()] * terms.parents
+    new_parents = [
+        folder for folder in target.parents if not folder.exists()
+    ] * terms.parents
     if terms.parents:
         target.parent.mkdir(parents=True, exist_ok=True)
     if not target.parent.is_dir():
-        how = (
+        problem = (
             "is a file: give"
             if target.parent.exists()
             else "does not exist; make it or give"
         )
-        raise OutputError(f"{target}: folder {target.parent} {how} another name")
+        raise OutputError(f"{target}: folder {target.parent} {problem} another name")
     try:
         with _scratch(target) as scratch:
             yield scratch
     except BaseException as error:
-        for one in missing:  # those that were made here and hold nothing
+        for folder in new_parents:  # only empty ones can be removed
             with contextlib.suppress(OSError):
-                one.rmdir()
+                folder.rmdir()
         if isinstance(error, OSError) and error.filename is None:  # a full disk
             error.add_note(f"{target} could not be made")
         raise
@@ -258,6 +275,12 @@ def _claim(target: Path, terms: ClaimTerms, *, is_folder: bool) -> Iterator[Path
 
 @contextlib.contextmanager
 def _scratch(target: Path) -> Iterator[Path]:
+    """Context of the locked output's scratch folder ``.NAME.new``, emptied at the start
+    and removed at the end.
+
+    Raises:
+        OutputError: the folder of the output cannot be written.
+    """
     scratch = target.with_name(f".{target.name}.new")
     with contextlib.ExitStack() as stack:
         try:
@@ -276,8 +299,14 @@ def _scratch(target: Path) -> Iterator[Path]:
 def _refuse(
     target: Path, companions: Iterable[str], terms: ClaimTerms, *, is_folder: bool
 ) -> None:
-    """Refuse an output that is an input, exists without --force, is none of ours, or
-    finds no room.
+    """Refuse an output that is an input, exists without --force, is not ours, or finds
+    no room.
+
+    Args:
+        target: the output.
+        companions: names of files that are written with it.
+        terms: what the claim allows.
+        is_folder: whether the output is a folder.
 
     Raises:
         OutputError: naming what stands there and what to do.
@@ -301,79 +330,99 @@ def _refuse(
             f"{target} is a mount point, which cannot be replaced whole; give another name"
         )
     if target.exists() and target.is_dir() != is_folder:
-        found, needed = ("folder", "file") if target.is_dir() else ("file", "folder")
-        raise OutputError(f"{target} is a {found}; need the name of a {needed}")
+        present, needed = ("folder", "file") if target.is_dir() else ("file", "folder")
+        raise OutputError(f"{target} is a {present}; need the name of a {needed}")
     for path in (target, *(target.with_name(name) for name in companions)):
         if not _is_taken(path):
             continue
         if not terms.force:
             raise OutputError(f"{path} exists; give --force to overwrite it")
-        why = foreign_reason(path)
-        if why:
+        reason = foreign_reason(path)
+        if reason:
             raise OutputError(
-                f"{path} {why}: not overwritten, not even with --force; move it or give another name"
+                f"{path} {reason}: not overwritten, not even with --force; move it or give another name"
             )
     check_room(target, terms.room)
 
 
 def _is_taken(path: Path) -> bool:
-    """Whether a path is taken by more than an empty folder."""
+    """Whether a path is anything but free or an empty folder."""
     if path.is_dir():
         return any(path.iterdir())
     return path.exists() or path.is_symlink()
 
 
 def _finish(folder: Path) -> None:
-    """Give a folder its manifest, and sync all that is in it."""
-    begun = read_manifest(folder)
-    others = begun["others"] if begun else ()
+    """Write the manifest of a finished folder, and sync all of its files."""
+    manifest = read_manifest(folder)
+    others = manifest["others"] if manifest else ()
     write_manifest(folder, store.COMMAND.get(), others=others)
     sync_files(folder)
 
 
-def _put(scratch: Path, new: Path, target: Path) -> None:
-    """Exchange a finished folder with what stands."""
+def _put(scratch: Path, finished: Path, target: Path) -> None:
+    """Put a finished folder in place of the target, in one step where the system can;
+    the old folder goes to the scratch folder.
+    """
     if not target.exists():
-        new.rename(target)
-    elif _exchange_names(new, target):
-        new.rename(scratch / "old")
+        finished.rename(target)
+    elif _exchange_names(finished, target):
+        finished.rename(scratch / "old")
     else:
         target.rename(scratch / "old")
-        new.rename(target)
+        finished.rename(target)
     store.sync_file(target.parent)
 
 
 def _exchange_names(one: Path, other: Path) -> bool:
-    """Swap two names in one step; False where the system cannot."""
+    """Exchange two names in one step (Linux renameat2); False where that fails."""
     if not sys.platform.startswith("linux"):
         return False
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    current_folder, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
     first = os.fsencode(one.absolute())
     second = os.fsencode(other.absolute())
-    return call is not None and not call(here, first, here, second, exchange)
+    return renameat2 is not None and not renameat2(
+        current_folder, first, current_folder, second, exchange
+    )
 
 
 def _open_work(
     scratch: Path, target: Path, terms: ClaimTerms, *, resume: bool, grow: bool
 ) -> bool:
-    """Make or find the folder of unfinished work; whether it holds some already."""
+    """Create or reopen the folder of unfinished work; returns whether it holds earlier
+    work.
+
+    A copy of the finished target counts as earlier work.
+
+    Args:
+        scratch: folder for files on their way in or out.
+        target: the output folder.
+        terms: what the claim allows.
+        resume: continue unfinished work, or a copy of the target.
+        grow: the target need not match its manifest.
+
+    Raises:
+        OutputError: a folder that is not ours, or unfinished work without resume or
+            force.
+    """
     work = unfinished_path(target)
-    found = read_manifest(work) if work.is_dir() else None
-    if work.exists() and found is None:
+    manifest = read_manifest(work) if work.is_dir() else None
+    if work.exists() and manifest is None:
         raise OutputError(
             f"{work} is in the way and was not made by metalens; move it or give another name"
         )
-    if found is not None and resume:
+    if manifest is not None and resume:
         return True
-    if found is not None and not terms.force:
+    if manifest is not None and not terms.force:
         raise OutputError(
             f"{work} holds an unfinished run; give --resume to go on, or --force to start over"
         )
-    if found is not None:
+    if manifest is not None:
         work.rename(scratch / "given_up")
     fresh = scratch / "work"
-    copied, others = resume and _is_taken(target), set[str]()
+    copied = resume and _is_taken(target)
+    others = set[str]()
     if copied:
         others = unlisted_files(target)
         if others and read_manifest(target) is None:
@@ -393,14 +442,17 @@ def _open_work(
 def write_manifest(
     folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()
 ) -> None:
-    """Write the manifest of everything in a folder but ``others``, which are not ours
-    and are named as such.
+    """Write the manifest of all files in a folder: SHA-256 and size of each.
 
-    Unfinished: of a folder that is still being made.
+    Args:
+        folder: that is listed.
+        command: that made it.
+        finished: False while the folder is being filled; no files are listed then.
+        others: files that are not ours, listed by name alone.
     """
     listed = {name: {"sha256": store.sha256(folder / name), "bytes": (folder / name).stat().st_size}
               for name in (sorted({*iterate_files(folder)} - {*others}) if finished else ())}  # fmt: skip
-    about = {
+    manifest = {
         "kind": KIND,
         "version": VERSION,
         "finished": finished,
@@ -409,14 +461,14 @@ def write_manifest(
         "files": listed,
         "others": sorted(others),
     }
-    store.write_text(folder / NAME, json.dumps(about, indent=1) + "\n")
+    store.write_text(folder / NAME, json.dumps(manifest, indent=1) + "\n")
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder; None where it has none.
+    """Manifest of a folder with its entries' types checked; None where it has none.
 
     Raises:
-        StoreError: it is damaged or none of ours.
+        StoreError: it is damaged or not ours.
     """
     path = folder / NAME
     if not path.is_file():
@@ -424,18 +476,21 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     try:
         if path.stat().st_size > 1 << 26:
             raise ValueError("too large")
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        if (found["kind"], found["version"]) != (KIND, VERSION):
+        manifest: dict[str, Any] = json.loads(path.read_bytes())
+        if (manifest["kind"], manifest["version"]) != (KIND, VERSION):
             raise ValueError(
-                f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}"
+                f"kind {manifest['kind']!r} version {manifest['version']!r}, need {KIND!r} version {VERSION}"
             )
         entries = {
             str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])}
-            for n, e in found["files"].items()
+            for n, e in manifest["files"].items()
         }
-        others = [str(name) for name in found.get("others", ())]
-        plain = {"finished": bool(found["finished"]), "command": str(found["command"])}
-        return found | plain | {"files": entries, "others": others}
+        others = [str(name) for name in manifest.get("others", ())]
+        plain = {
+            "finished": bool(manifest["finished"]),
+            "command": str(manifest["command"]),
+        }
+        return manifest | plain | {"files": entries, "others": others}
     except (
         OSError,
         ValueError,
@@ -450,22 +505,22 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def check_manifest(folder: Path) -> None:
-    """Refuse a folder of ours that is unfinished or no longer what was written; one
-    without a manifest passes.
+    """Refuse a folder of ours that is unfinished or no longer as written; one without a
+    manifest passes.
 
-    Files that were added since are left alone.
+    Files that were added since are ignored.
 
     Raises:
         StoreError: what is missing or differs, and what to do.
     """
-    found = read_manifest(folder)
-    if found is None:
+    manifest = read_manifest(folder)
+    if manifest is None:
         return
-    if not found["finished"]:
+    if not manifest["finished"]:
         raise StoreError(
             f"{folder} is unfinished: go on with --resume, or make it again"
         )
-    for name, entry in found["files"].items():
+    for name, entry in manifest["files"].items():
         path = folder / name
         if not path.is_file():
             raise StoreError(
@@ -482,30 +537,32 @@ def check_manifest(folder: Path) -> None:
 
 
 def sync_files(folder: Path) -> None:
-    """Flush a folder and all that is in it."""
+    """Flush a folder and all files below it to the disk."""
     for place, _, names in os.walk(folder):
         for path in (*(Path(place, name) for name in names), Path(place)):
             store.sync_file(path)
 
 
 def iterate_files(folder: Path) -> Iterator[str]:
-    """Names of all files below a folder, without the manifest; folders that hold nothing
-    end in a slash.
+    """Names of all files below a folder, relative to it, without its manifest; links to
+    folders are named too.
     """
     for place, folders, names in os.walk(folder):
-        here = Path(place).relative_to(folder)
+        parent = Path(place).relative_to(folder)
         yield from (
-            (here / n).as_posix() for n in names if (here / n).as_posix() != NAME
+            (parent / name).as_posix()
+            for name in names
+            if (parent / name).as_posix() != NAME
         )
         yield from (
-            (here / n).as_posix()
-            for n in folders
-            if os.path.islink(os.path.join(place, n))
+            (parent / name).as_posix()
+            for name in folders
+            if os.path.islink(os.path.join(place, name))
         )
 
 
 def empty_folder(folder: Path) -> None:
-    """Remove all that is in a folder but its manifest."""
+    """Remove everything in a folder but its manifest."""
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -517,7 +574,7 @@ def foreign_reason(path: Path) -> str:
     """Why a file or folder may not be replaced as one of ours; '' where it may.
 
     A folder is ours with a manifest and no file beyond those that it lists; a file by
-    its kind or mark.
+    its kind or signature.
 
     Args:
         path: of what stands there.
@@ -526,43 +583,46 @@ def foreign_reason(path: Path) -> str:
         return _foreign_folder(path)
     try:
         with open(path, "rb") as file:
-            known = file.read(_ENDS)
+            ends = file.read(_ENDS)
             file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
-            known += file.read()
+            ends += file.read()
     except OSError as error:
         return f"cannot be read ({error.strerror})"
-    marked = any(known.startswith(first) and mark in known for first, mark in _MARKS)
+    marked = any(ends.startswith(first) and mark in ends for first, mark in _MARKS)
     return "" if marked or store.kind_of(path) else "was not made by metalens"
 
 
 def _foreign_folder(path: Path) -> str:
+    """Why a folder may not be replaced: files without a manifest, a damaged manifest,
+    or files beyond those listed. '' where it may.
+    """
     present = set(iterate_files(path))
     if not present and not (path / NAME).exists():
         return ""
     try:
-        found = read_manifest(path)
+        manifest = read_manifest(path)
     except StoreError as error:
         return str(error)
-    if found is None:
+    if manifest is None:
         return f"holds {min(present)} and no {NAME}: not made by metalens"
-    others = present - found["files"].keys()
-    if found["finished"] and others:
+    others = present - manifest["files"].keys()
+    if manifest["finished"] and others:
         return f"holds {min(others)}, which metalens did not make"
     return ""
 
 
 def unlisted_files(folder: Path) -> set[str]:
-    """Files that neither the manifest of a folder lists nor that of a folder inside it.
+    """Names of files that no manifest lists, neither that of a folder nor that of one
+    inside it.
 
     Raises:
         StoreError: a manifest is damaged.
     """
     present = set(iterate_files(folder))
-    for place in (folder, *(path.parent for path in folder.rglob(NAME))):
-        found, inside = read_manifest(place), place.relative_to(folder)
-        present -= (
-            {(inside / name).as_posix() for name in (*found["files"], NAME)}
-            if found
-            else set()
-        )
+    for parent in (folder, *(path.parent for path in folder.rglob(NAME))):
+        manifest = read_manifest(parent)
+        relative = parent.relative_to(folder)
+        if manifest:
+            names = (*manifest["files"], NAME)
+            present -= {(relative / name).as_posix() for name in names}
     return present

@@ -17,21 +17,20 @@ from metalens.lens.record import Lens
 
 ARRAYS, GRID = (".npz", ".mat"), ".dat"
 SUFFIXES = (*ARRAYS, GRID)
-_MM, _NO_DATA = (
-    1e-3,
-    1,
-)  # of a grid-phase file: lengths in mm (unit flag 0), flag of a point without data
-_RIM = 4  # points: a cubic spline forgets an edge as 0.27^points
+# grid-phase file: mm per um (unit flag 0), and the flag of a point without data
+_MM, _NO_DATA = 1e-3, 1
+# points from the rim: the effect of an edge on a cubic spline decays as 0.27^points
+_RIM = 4
 
 
 def check_export_format(path: str | Path) -> None:
-    """Refuse a file name that says no known format.
+    """Refuse a file name whose ending is no known format.
 
     Args:
-        path: whose ending says the format.
+        path: whose ending selects the format.
 
     Raises:
-        LensError: naming the formats there are.
+        LensError: naming the known formats.
     """
     if Path(path).suffix.lower() not in SUFFIXES:
         raise LensError(
@@ -40,7 +39,7 @@ def check_export_format(path: str | Path) -> None:
 
 
 def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
-    """Write a lens in the format that the name's ending says.
+    """Write a lens in the format of the name's ending.
 
     ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission,
     pitch_um, wavelength_um; where pillars are turned angle_rad; where they have two
@@ -48,10 +47,12 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
 
     Args:
-        path: target; its ending says the format.
+        path: target; its ending selects the format.
+        lens: the lens.
+        samples: points of a grid phase along a side.
 
     Returns:
-        largest difference in phase (rad) between the pillars and what a program
+        Largest difference in phase (rad) between the pillars and what a program
             interpolates; 0 for the arrays.
 
     Raises:
@@ -84,7 +85,8 @@ def export_lens(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
 
 
 def lens_arrays(lens: Lens) -> dict[str, Array]:
-    """Axes, diameters, wrapped phase and magnitude of every pillar, by name.
+    """{name: array} of axes, diameters, wrapped phase and magnitude of every pillar, in
+    um and rad.
 
     Args:
         lens: the lens.
@@ -99,9 +101,9 @@ def lens_arrays(lens: Lens) -> dict[str, Array]:
         "pitch_um": np.array(d.pitch_um),
         "wavelength_um": np.array(lens.wavelength_um),
     } | {
-        name: np.asarray(v)
-        for name, v in (("angle_rad", d.angle_rad), ("length_um", d.length_um))
-        if v is not None
+        name: np.asarray(values)
+        for name, values in (("angle_rad", d.angle_rad), ("length_um", d.length_um))
+        if values is not None
     }
 
 
@@ -109,11 +111,11 @@ def lens_arrays(lens: Lens) -> dict[str, Array]:
 class GridPhase:
     """Phase on a square grid, +y down as everywhere here.
 
-    phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be
+    phase_rad: (n, n), extended a few points beyond the lens, so that its rim can be
         interpolated; nan further out.
-    step_um: of the points. error_rad: largest difference between the pillars and the
-        cubic interpolation of the points, a few points inside the rim, where a program
-        has all it needs.
+    step_um: spacing of the points.
+    error_rad: largest difference between the pillars and the cubic interpolation of the
+        points, taken a few points inside the rim.
     """
 
     phase_rad: Array
@@ -121,12 +123,12 @@ class GridPhase:
     error_rad: float
 
     def text(self) -> str:
-        """The file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy
-        nodata`` a point, largest y first.
+        """Text of the file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy
+        dxy nodata`` per point, largest y first.
 
         Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the
-            program then takes differences. The blanks that end the first line say whose
-            file it is.
+            program then takes differences. The blanks at the end of the first line mark
+            it as our file.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
         lines = [f"{n} {n} {step} {step} 0 0 0\t \t"]
@@ -138,8 +140,16 @@ class GridPhase:
 
 
 def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
-    """The unwrapped phase of a lens on ``samples`` by ``samples`` points across its
-    aperture.
+    """Unwrapped phase of a lens on ``samples`` by ``samples`` points across its
+    aperture, and its interpolation error.
+
+    The phase is interpolated linearly between pillars, and extrapolated beyond the rim
+    by a parabola. The error compares it, interpolated back by a cubic spline, with the
+    pillars inside the rim.
+
+    Args:
+        lens: on a square lattice.
+        samples: points along a side.
 
     Raises:
         LensError: fewer than 5 samples, or another lattice than a square one; see
@@ -153,60 +163,69 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
         )
     if samples < 5:
         raise LensError(f"{samples} samples across the aperture: need 5 or more")
-    phase, d = unwrap_phase(lens), lens.diameters
+    phase = unwrap_phase(lens)
+    d = lens.diameters
     step = 2 * d.radius_um / (samples - 1)
     centre = [(n - 1) / 2 for n in phase.shape]
-    at = (np.arange(samples) - (samples - 1) / 2) * step / d.pitch_um
-    where = np.meshgrid(at + centre[0], at + centre[1], indexing="ij")
-    grid = map_coordinates(phase, where, order=1, cval=np.nan)
+    offset = (np.arange(samples) - (samples - 1) / 2) * step / d.pitch_um
+    sample_sites = np.meshgrid(offset + centre[0], offset + centre[1], indexing="ij")
+    grid = map_coordinates(phase, sample_sites, order=1, cval=np.nan)
     if np.isfinite(grid).sum() < samples:
         raise LensError(
             f"{samples} samples find hardly a point with pillars all around; need a wider lens"
         )
-    there = np.isfinite(phase)
-    rows, columns = np.nonzero(there)
-    back = [(rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
-            (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2]  # fmt: skip
-    inner = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
-    whole = map_coordinates(inner, back, order=1) > 1 - 1e-9
-    read = map_coordinates(
-        _filled(grid), [b[whole] for b in back], order=3, mode="nearest"
+    has_pillar = np.isfinite(phase)
+    rows, columns = np.nonzero(has_pillar)
+    pillar_points = [
+        (rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
+        (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2,
+    ]
+    interior = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
+    is_interior = map_coordinates(interior, pillar_points, order=1) > 1 - 1e-9
+    interpolated = map_coordinates(
+        _filled(grid),
+        [points[is_interior] for points in pillar_points],
+        order=3,
+        mode="nearest",
     )
-    beyond = _continued(phase, _RIM * step / d.pitch_um + 1)
+    extended = _continued(phase, _RIM * step / d.pitch_um + 1)
     return GridPhase(
-        map_coordinates(beyond, where, order=1, cval=np.nan),
+        map_coordinates(extended, sample_sites, order=1, cval=np.nan),
         step,
-        float(np.abs(read - phase[there][whole]).max(initial=0)),
+        float(np.abs(interpolated - phase[has_pillar][is_interior]).max(initial=0)),
     )
 
 
 def _continued(phase: Array, reach: float) -> Array:
-    """Sites up to ``reach`` beyond the data, by the parabola through the nearest that
-    has some and two behind it.
+    """Phase extended by up to ``reach`` sites beyond its data, by parabolas; nan
+    elsewhere.
+
+    A parabola runs through the closest site with data and two sites behind it: 3 a - 3
+    b + c. Without the third site it is a line, without the second a constant.
     """
     from scipy.ndimage import distance_transform_edt
 
-    away, nearest = distance_transform_edt(np.isnan(phase), return_indices=True)
-    at = np.argwhere((away > 0) & (away <= reach))
-    rim = nearest[:, at[:, 0], at[:, 1]].T
-    first, second, third = (_at(phase, rim - k * (at - rim)) for k in range(3))
+    distance, nearest = distance_transform_edt(np.isnan(phase), return_indices=True)
+    sites = np.argwhere((distance > 0) & (distance <= reach))
+    rim = nearest[:, sites[:, 0], sites[:, 1]].T
+    first, second, third = (_at(phase, rim - k * (sites - rim)) for k in range(3))
     straight = np.where(np.isnan(second), first, 2 * first - second)
     out = phase.copy()
-    out[at[:, 0], at[:, 1]] = np.where(
+    out[sites[:, 0], sites[:, 1]] = np.where(
         np.isnan(second + third), straight, 3 * first - 3 * second + third
     )
     return out
 
 
 def _at(grid: Array, places: Array) -> Array:
-    """Values at (n, 2) whole places; nan outside."""
+    """(n,) values of a grid at (n, 2) integer places; nan outside."""
     inside = ((places >= 0) & (places < grid.shape)).all(1)
     row, column = np.where(inside[:, None], places, 0).T
     return np.where(inside, grid[row, column], np.nan)
 
 
 def _filled(grid: Array) -> Array:
-    """Points without data take the nearest that has some."""
+    """Grid whose points without data take the value of the closest one with data."""
     from scipy.ndimage import distance_transform_edt
 
     nearest = distance_transform_edt(
@@ -216,49 +235,48 @@ def _filled(grid: Array) -> Array:
 
 
 def unwrap_phase(lens: Lens) -> Array:
-    """(y, x) phase that is continuous from pillar to pillar, nan where there is none; 0
-    at the middle.
+    """(y, x) phase that is continuous from pillar to pillar, rad; nan without a pillar,
+    and 0 in the middle.
 
-    Along the middle column first, then along every row to both sides: exact where
-    neighbours differ by less than half a turn.
+    Unwrapped along the middle column, then along every row to both sides. This is exact
+    where neighbours differ by less than half a turn.
 
     Args:
         lens: the lens.
 
     Raises:
-        LensError: gaps along the way, or neighbours that differ by half a turn whichever way
-            they are joined: a vortex, a spiral or zones with steps have no smooth
+        LensError: gaps in the middle column, or neighbours that differ by half a turn
+            after unwrapping: a vortex, a spiral or zones with steps have no smooth
             phase.
     """
     d = lens.diameters.diameter_um
-    there = np.asarray(d) > 0
-    phase = np.where(there, lens.phase_rad(), np.nan)
-    middle, column = len(phase) // 2, phase.shape[1] // 2
-    spine = np.nonzero(there[:, column])[0]
+    has_pillar = np.asarray(d) > 0
+    phase = np.where(has_pillar, lens.phase_rad(), np.nan)
+    middle = len(phase) // 2
+    column = phase.shape[1] // 2
+    column_rows = np.nonzero(has_pillar[:, column])[0]
     if (
-        len(spine) == 0
-        or len(spine) != spine[-1] - spine[0] + 1
-        or spine[0] != np.nonzero(there.any(1))[0][0]
+        len(column_rows) == 0
+        or len(column_rows) != column_rows[-1] - column_rows[0] + 1
+        or column_rows[0] != np.nonzero(has_pillar.any(1))[0][0]
     ):
         raise LensError(
             "the middle column of the lens has gaps; its phase cannot be followed from row to row"
         )
-    first, last = int(spine[0]), int(spine[-1]) + 1
+    first, last = int(column_rows[0]), int(column_rows[-1]) + 1
     right = np.unwrap(phase[first:last, column:], axis=1)
     left = np.unwrap(phase[first:last, column::-1], axis=1)[:, ::-1]
     rows = np.concatenate([left[:, :-1], right], axis=1)
-    found = np.full(phase.shape, np.nan)
-    found[first:last] = (
-        rows
-        + (np.unwrap(phase[first:last, column]) - phase[first:last, column])[:, None]
-    )
+    unwrapped = np.full(phase.shape, np.nan)
+    middle_phase = phase[first:last, column]
+    unwrapped[first:last] = rows + (np.unwrap(middle_phase) - middle_phase)[:, None]
     jump = max(
-        float(np.nanmax(np.abs(np.diff(found, axis=axis)), initial=0))
+        float(np.nanmax(np.abs(np.diff(unwrapped, axis=axis)), initial=0))
         for axis in (0, 1)
     )
-    if jump > math.pi or (np.isnan(found) & there).any():
+    if jump > math.pi or (np.isnan(unwrapped) & has_pillar).any():
         raise LensError(
             f"neighbouring pillars differ by {jump:.3g} rad whichever way the phase is followed, need below pi: a "
             "vortex, a spiral or zones with steps have no smooth phase; write .npz or .mat"
         )
-    return np.asarray(found - found[min(max(middle, first), last - 1), column])
+    return np.asarray(unwrapped - unwrapped[min(max(middle, first), last - 1), column])

@@ -11,8 +11,8 @@ import numpy as np
 from metalens.core.arrays import Array
 from metalens.core.errors import LensError
 
-# of the change: a cut through a lens solved whole changes that much less (python -m
-# benchmarks neighbours)
+# share of the factor's change that real zones may lack, as they shorten towards the
+# rim: from a full solve of a lens cut (python -m benchmarks neighbours)
 CURVED = 0.2
 _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 
@@ -21,14 +21,15 @@ _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 class NeighbourRows:
     """Supercell responses of rows of non-identical pillars of a lens.
 
-    sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
-        diagonal of the lattice.
-    factor: (2, n) complex tangential amplitude where the light should go, over that of
-        pillars one by one; of light whose field lies along the row, and across it.
-        coarse: (2, n) the same at a coarser truncation.
-    scatter: (n,) share of the transmitted power that goes elsewhere, beyond what
-        pillars one by one would send there.
-    wavelength_um: of the rows. cover: index of the medium behind the pillars.
+    sine: (n,) by which a row turns light.
+    diagonal: (n,) whether it runs along the diagonal of the lattice.
+    factor: (2, n) complex tangential amplitude in the intended direction, over that of
+        the locally periodic model; for fields along the row, and across it.
+    coarse: (2, n) the same at a coarser truncation.
+    scatter: (n,) share of the transmitted power in other directions, beyond that of the
+        locally periodic model.
+    wavelength_um: of the rows.
+    cover: index of the medium behind the pillars.
 
     Raises:
         LensError: arrays that do not belong together, no row along the lattice, a sine
@@ -44,6 +45,7 @@ class NeighbourRows:
     cover: float = 1.0
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together."""
         n = len(self.sine)
         shapes = {name: np.shape(getattr(self, name)) for name in _ARRAYS}
         if shapes != {
@@ -63,23 +65,29 @@ class NeighbourRows:
 
     @property
     def coefficients(self) -> Array:
-        """(2: along the lattice and its diagonal, 2: field along the slope and across,
-        2: a and b) complex.
+        """(2, 2, 2) complex a and b of the factor 1 + a s + b s² of the sine s, by
+        least squares.
+
+        Axes: along the lattice and its diagonal, field along the slope and across, a
+        and b. The factor is that of the power-normalised amplitude. Without diagonal
+        rows, those along the lattice are used for both.
         """
         cosine = np.sqrt(np.maximum(1 - (self.sine / self.cover) ** 2, 1e-9))
-        power = self.factor * np.stack([cosine**-0.5, cosine**0.5])
-        found: list[Array] = []
+        amplitude = self.factor * np.stack([cosine**-0.5, cosine**0.5])
+        fits: list[Array] = []
         for rows in (~self.diagonal, self.diagonal):
-            if not rows.any():  # what is known of rows along the lattice
-                return np.stack([found[0], found[0]])
+            if not rows.any():  # no rows along the diagonal
+                return np.stack([fits[0], fits[0]])
             terms = np.stack([self.sine[rows], self.sine[rows] ** 2], 1).astype(complex)
-            found.append(np.linalg.lstsq(terms, power[:, rows].T - 1, rcond=None)[0].T)
-        return np.stack(found)
+            fits.append(
+                np.linalg.lstsq(terms, amplitude[:, rows].T - 1, rcond=None)[0].T
+            )
+        return np.stack(fits)
 
     @property
     def steepest(self) -> tuple[float, float]:
-        """Largest sines that were solved, along the lattice and along its diagonal (0
-        where none was).
+        """Largest solved sines along the lattice and along its diagonal (0 where none
+        was; at most that along the lattice).
         """
         straight, diagonal = (
             float(self.sine[rows].max(initial=0.0))
@@ -88,28 +96,43 @@ class NeighbourRows:
         return straight, min(straight, diagonal)
 
     def of_field(self, field: int, sine: Any, azimuth_weight: Any) -> Any:
-        """(…) complex C of fields along the slope (0) or across it (1); NumPy or torch,
-        differentiable.
+        """(…) complex factor C of fields along the slope (0) or across it (1); NumPy or
+        torch, differentiable.
 
         Args:
-            sine: (…) by which the slope turns light of the rows' wavelength. azimuth_weight:
-                sin² 2α of its azimuth α.
+            field: 0 or 1.
+            sine: (…) by which the slope turns light of the rows' wavelength.
+            azimuth_weight: sin² 2α of its azimuth α.
         """
         return self._factor(self.coefficients[:, field], sine, azimuth_weight)
 
     def of_both(self, sine: Any, azimuth_weight: Any) -> Any:
-        """(…) mean of :meth:`of_field` over both fields."""
+        """(…) complex factor C, the mean of both fields; otherwise as :meth:`of_field`."""
         return self._factor(self.coefficients.mean(1), sine, azimuth_weight)
 
     def _factor(self, coefficients: Array, sine: Any, azimuth_weight: Any) -> Any:
+        """(…) 1 + a s + b s² + sin² 2α (a' s + b' s²), with a', b' the differences
+        between diagonal and lattice.
+
+        s is the magnitude of the sine, limited to the solved range.
+
+        Args:
+            coefficients: (2, 2) a and b, along the lattice and its diagonal.
+            sine: (…) NumPy or torch.
+            azimuth_weight: sin² 2α.
+        """
         straight, diagonal = coefficients
         (a, b), (a2, b2) = straight.tolist(), (diagonal - straight).tolist()
-        s, turned = (abs(sine).clip(max=most) for most in self.steepest)
-        return 1 + s * (a + b * s) + azimuth_weight * (turned * (a2 + b2 * turned))
+        s, s2 = (abs(sine).clip(max=limit) for limit in self.steepest)
+        return 1 + s * (a + b * s) + azimuth_weight * (s2 * (a2 + b2 * s2))
 
     def at(self, sine: Array, azimuth_rad: Array | float = 0.0) -> Array:
-        """(2, …) complex C of fields along the slope and across it, of slopes in this
-        azimuth of the lattice.
+        """(2, …) complex factor C of fields along the slope and across it, for slopes
+        in one azimuth of the lattice.
+
+        Args:
+            sine: (…) by which the slope turns light.
+            azimuth_rad: of the slope, from a lattice axis.
         """
         azimuth_weight = np.sin(2 * np.asarray(azimuth_rad)) ** 2
         return np.stack(
@@ -117,20 +140,21 @@ class NeighbourRows:
         )
 
     def mean(self, sine: Array) -> Array:
-        """(…) complex: mean of both polarisations and of all azimuths."""
+        """(…) complex factor C, the mean of both polarisations and of all azimuths."""
         return np.asarray(self.at(sine, math.pi / 8).mean(0))  # where sin² 2α is 1/2
 
     def share(self, sine: Array, weight: Array) -> float:
-        """Share of the focus power that remains with coupled neighbours, over that of
-        the locally periodic approximation.
+        """Focus power with coupled neighbours over that of the locally periodic
+        approximation: |Σ weight C(sine)|².
 
         Args:
-            sine, weight: (m,) turned by, and share of the lens, of sum 1.
+            sine: (m,) by which zones turn light.
+            weight: (m,) share of the lens in each zone, of sum 1.
         """
         return float(abs(weight @ self.mean(sine)) ** 2)
 
     def without(self, row: int) -> "NeighbourRows":
-        """The same without a row."""
+        """The rows without the one at index ``row``."""
         return replace(
             self,
             **{name: np.delete(getattr(self, name), row, axis=-1) for name in _ARRAYS},
@@ -138,29 +162,38 @@ class NeighbourRows:
 
     @property
     def coarser(self) -> "NeighbourRows":
-        """The same at the coarser truncation."""
+        """The rows with their factors at the coarser truncation."""
         return replace(self, factor=self.coarse)
 
     @property
     def others(self) -> list["NeighbourRows"]:
-        """The same without any one of the rows, as long as one along the lattice is
-        left.
+        """Leave-one-out variants of the rows, each with at least one row along the
+        lattice.
         """
-        kept = [
+        removable = [
             k
             for k in range(len(self.sine))
             if self.diagonal[k] or np.count_nonzero(~self.diagonal) > 1
         ]
-        return [self.without(k) for k in kept]
+        return [self.without(k) for k in removable]
 
     def doubted(self, sine: Array) -> list["NeighbourRows"]:
-        """What it may be as well: at the coarser truncation, without the row that
-        changes most at these sines, and with what zones that get shorter from one to
-        the next change.
+        """Variants of the rows that span their uncertainty.
+
+        They are: the coarser truncation; without the row whose removal changes the mean
+        most at these sines; and the change reduced by a fifth, for zones that shorten
+        towards the rim.
+
+        Args:
+            sine: (m,) by which zones turn light.
         """
-        mine = self.mean(sine)
+        present = self.mean(sine)
         changes = [
-            float(np.abs(other.mean(sine) - mine).max()) for other in self.others
+            float(np.abs(other.mean(sine) - present).max()) for other in self.others
         ]
-        less = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))
-        return [self.coarser, *(self.others[k] for k in np.argsort(changes)[-1:]), less]
+        reduced = replace(self, factor=1 + (1 - CURVED) * (self.factor - 1))
+        return [
+            self.coarser,
+            *(self.others[k] for k in np.argsort(changes)[-1:]),
+            reduced,
+        ]

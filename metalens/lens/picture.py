@@ -14,10 +14,11 @@ from metalens.library.axes import cell_of_sizes
 
 
 def lens_picture(lens: Lens) -> bytes:
-    """PNG: wrapped phase at the design wavelength, and single pillars halfway to the rim.
+    """PNG of the wrapped phase at the design wavelength, and of single pillars halfway
+    to the rim.
 
     A pixel has the phase of the mean of exp(iφ) over its sites and fades where the
-    phase turns within it, so that no lenses appear that are none.
+    phase turns within it, so that undersampling draws no false zones.
 
     Args:
         lens: the lens.
@@ -29,27 +30,27 @@ def lens_picture(lens: Lens) -> bytes:
 
 
 def _phase(figure: Any, axes: Any, lens: Lens) -> None:
+    """Draw the wrapped phase, and the aperture stop where there is one."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.patches import Circle
 
     d = lens.diameters
-    least = (
-        2 if d.lattice.centred else 1
-    )  # every other site of the map is none of the lattice
+    # a hexagonal lattice leaves every other site of the map empty
+    least = 2 if d.lattice.centred else 1
     field = mean_field(lens, max(least, -(-max(d.diameter_um.shape) // 420)))
     colour = colormaps["twilight"](np.mod(np.angle(field), 2 * np.pi) / (2 * np.pi))
     colour[..., 3] = np.minimum(1, np.abs(field))
-    edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
-    axes.imshow(colour, extent=edge, interpolation="nearest")
+    extent_um = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
+    axes.imshow(colour, extent=extent_um, interpolation="nearest")
     if stop := lens.layers.stop:
-        hole = Circle(
+        stop_circle = Circle(
             stop.centre_um, stop.radius_um, fill=False, color="k", linestyle="--"
         )
-        axes.add_patch(hole)
+        axes.add_patch(stop_circle)
         axes.legend(
-            [hole],
+            [stop_circle],
             [f"aperture stop, {stop.distance_um:g} µm before"],
             loc="upper right",
         )
@@ -69,26 +70,32 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
 
 
 def mean_field(lens: Lens, sites: int) -> Array:
-    """Mean of exp(iφ) over blocks of ``sites`` by ``sites``, 0 where there is no
-    pillar; complex (y, x), blocks whole.
+    """(y, x) complex mean of exp(iφ) over blocks of ``sites`` by ``sites``; sites
+    without a pillar count as 0.
 
-    Read in bands of rows: a large lens stays in its file.
+    Incomplete blocks at the end are filled with 0. Rows are read in bands: a large lens
+    stays in its file.
+
+    Args:
+        lens: the lens.
+        sites: side of a block.
     """
     d = lens.diameters.diameter_um
     centred = lens.diameters.lattice.centred
     height, width = (-(-n // sites) for n in d.shape)
     mean = np.empty((height, width), complex)
     for i in range(height):
-        at = slice(i * sites, min((i + 1) * sites, d.shape[0]))
-        rows = np.asarray(d[at])
+        band = slice(i * sites, min((i + 1) * sites, d.shape[0]))
+        rows = np.asarray(d[band])
         field = np.zeros((sites, width * sites), complex)
-        there = np.where(rows > 0, np.exp(1j * lens.rows_phase_rad(at)), 0)
-        field[: len(rows), : rows.shape[1]] = there * (2 if centred else 1)
+        phasor = np.where(rows > 0, np.exp(1j * lens.rows_phase_rad(band)), 0)
+        field[: len(rows), : rows.shape[1]] = phasor * (2 if centred else 1)
         mean[i] = field.reshape(sites, width, sites).mean(axis=(0, 2))
     return mean
 
 
 def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
+    """Draw 28 by 28 pillars halfway to the rim, coloured by size or turn."""
     from matplotlib.collections import PolyCollection
 
     d = lens.diameters
@@ -100,25 +107,25 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     columns = slice(column, column + side)
     part = d.diameter_um[rows, columns]
     x, y = np.meshgrid(d.x_um[columns], d.y_um[rows])
-    there = part > 0
-    size = part[there]
+    has_pillar = part > 0
+    size = part[has_pillar]
     turn = (
         np.zeros(len(size))
         if d.angle_rad is None
-        else d.angle_rad[rows, columns][there]
+        else d.angle_rad[rows, columns][has_pillar]
     )
     length = (
         np.zeros(len(size))
         if d.length_um is None
-        else d.length_um[rows, columns][there]
+        else d.length_um[rows, columns][has_pillar]
     )
-    drawn = [
-        _outline(lens, *one)
-        for one in zip(size, length, turn, x[there], y[there], strict=True)
+    outlines = [
+        _outline(lens, *pillar)
+        for pillar in zip(size, length, turn, x[has_pillar], y[has_pillar], strict=True)
     ]
-    shown = PolyCollection(drawn, cmap="viridis")
-    shown.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
-    axes.add_collection(shown)
+    collection = PolyCollection(outlines, cmap="viridis")
+    collection.set_array(size * 1e3 if d.angle_rad is None else np.degrees(turn))
+    axes.add_collection(collection)
     half = d.pitch_um / 2
     axes.set(
         xlim=(x.min() - half, x.max() + half),
@@ -128,7 +135,7 @@ def _pillars(figure: Any, axes: Any, lens: Lens) -> None:
     axes.set(title="single pillars", xlabel="x / µm", ylabel="y / µm")
     size_name = "size / nm" if d.length_um is None else "size along x / nm"
     figure.colorbar(
-        shown,
+        collection,
         ax=axes,
         label=size_name if d.angle_rad is None else "turn / deg",
         shrink=0.85,
@@ -144,7 +151,16 @@ def _outline(
     x_um: float,
     y_um: float,
 ) -> Array:
-    """(n, 2) corners of one pillar where it stands."""
+    """(n, 2) corners of one pillar at its place, um.
+
+    Args:
+        lens: whose cell gives the shape.
+        size_um: along x.
+        length_um: along y where it has two sizes, else 0.
+        turn_rad: in the plane.
+        x_um: of its centre.
+        y_um: of its centre.
+    """
     cell = (
         cell_of_sizes(lens.cell, float(size_um), float(length_um))
         if length_um

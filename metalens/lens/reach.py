@@ -11,7 +11,7 @@ from metalens.optics.layers import Layers
 
 @dataclass(frozen=True, slots=True)
 class ApertureSummary:
-    """What of a lens decides how far it reaches: for a lens that is yet to be made."""
+    """What determines the depth range of a lens; for one that is not designed yet."""
 
     radius_um: float
     wavelength_um: float
@@ -21,8 +21,8 @@ class ApertureSummary:
 
 
 def defocus_per_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
-    """1 / z of a source less that of best focus, 1/um, films in front taken as the air
-    that bends light as much.
+    """Defocus 1/z - 1/z0 of a source against best focus, 1/um, with films in front
+    replaced by the air that bends light as much.
 
     Args:
         lens: the lens.
@@ -33,7 +33,7 @@ def defocus_per_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 
 def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
     """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z -
-    1/z0|.
+    1/z0|, um.
 
     Args:
         lens: the lens.
@@ -47,8 +47,8 @@ def blur_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
 
 
 def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
-    """Distance in air that bends paraxial light as much as the media between pillars
-    and sensor.
+    """Reduced distance from pillars to sensor, um: the air that bends paraxial light as
+    much as the media between them.
 
     Args:
         lens: the lens.
@@ -57,31 +57,33 @@ def sensor_reach_um(lens: Lens | ApertureSummary) -> float:
 
 
 def diffraction_um(lens: Lens | ApertureSummary) -> float:
-    """Wavelength over the paraxial numerical aperture of the image side, um.
+    """Diffraction length wavelength / NA, with the paraxial numerical aperture of the
+    image side, um.
 
     Args:
         lens: the lens.
     """
-    return lens.wavelength_um * sensor_reach_um(lens) / _widest(lens)
+    return lens.wavelength_um * sensor_reach_um(lens) / _illuminated_radius(lens)
 
 
 def window_um(
     lens: Lens | ApertureSummary, depths_um: tuple[float, ...], *, airy: float
 ) -> float:
-    """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst
-    of these depths; 3 digits.
+    """Width of an image window: ``airy`` wavelength / NA, or 8 radii of the blur at the
+    worst depth, um; 3 digits.
 
     Args:
         lens: the lens.
         depths_um: distances of sources, um.
+        airy: least width in units of wavelength / NA.
     """
     blur = max(blur_um(lens, depth) for depth in depths_um)
     return _rounded(max(airy * diffraction_um(lens), 8 * blur), 3)
 
 
 def disc_um(lens: Lens | ApertureSummary) -> float:
-    """Radius of a defocused spot at which its depth can be resolved: 5.3 wavelength /
-    NA, 2 digits.
+    """Radius of a defocused spot whose depth can just be resolved: 5.3 wavelength / NA,
+    um; 2 digits.
 
     Args:
         lens: the lens.
@@ -91,7 +93,7 @@ def disc_um(lens: Lens | ApertureSummary) -> float:
 
 def pixel_um(lens: Lens | ApertureSummary) -> float:
     """Pixel pitch that samples most of the information of a spot: 0.88 wavelength / NA,
-    2 digits.
+    um; 2 digits.
 
     Args:
         lens: the lens.
@@ -100,29 +102,33 @@ def pixel_um(lens: Lens | ApertureSummary) -> float:
 
 
 def depth_step_um(lens: Lens | ApertureSummary, depth_um: float) -> float:
-    """Step of depth that moves the rim by 0.115 waves against the middle: 0.23
-    wavelength z² / R², 2 digits.
+    """Depth step that changes the defocus at the rim by 0.115 waves: 0.23 wavelength z²
+    / R², um; 2 digits.
 
-    Short enough that the image's change over it is a derivative; never above a fiftieth
-    of the depth.
+    The image's change over it is close to a derivative. It is at most a fiftieth of the
+    depth.
 
     Args:
         lens: the lens.
         depth_um: distance of the source, um.
     """
-    step = 0.23 * lens.wavelength_um * (_reduced(lens, depth_um) / _widest(lens)) ** 2
+    step = (
+        0.23
+        * lens.wavelength_um
+        * (_reduced(lens, depth_um) / _illuminated_radius(lens)) ** 2
+    )
     return _rounded(min(step, 0.02 * depth_um), 2)
 
 
 def sample_um(lens: Lens | ApertureSummary, pixel_um: float) -> float:
-    """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a
-    pixel; 2 digits.
+    """Sampling pitch of intensities: 0.86 wavelength / (4 sin(rim angle)), at most a
+    quarter of a pixel, um; 2 digits.
 
     Args:
         lens: the lens.
         pixel_um: pitch of the pixels, um.
     """
-    sine = math.sin(math.atan(_widest(lens) / sensor_reach_um(lens)))
+    sine = math.sin(math.atan(_illuminated_radius(lens) / sensor_reach_um(lens)))
     return _rounded(min(0.86 * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
 
 
@@ -130,25 +136,32 @@ def depth_range_um(
     lens: Lens | ApertureSummary, *, digits: int = 2
 ) -> tuple[float, float]:
     """(near, far) depths at which the rim is 1.75 waves out of focus, R² |1/z - 1/z0| /
-    (2 wavelength).
+    (2 wavelength), um.
 
-    Where no depth is that far out of focus, far is ten times near; near is at least the
-    lens's diameter, or the depth of focus itself. Rounded to ``digits`` digits, and
-    beyond the films in front.
+    Where no far depth is that far out of focus, it is ten times the near one. The near
+    depth is at least the lens's diameter, or the depth of focus itself. Both are
+    rounded to ``digits`` digits, and lie beyond the films in front.
 
     A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
+
+    Args:
+        lens: the lens.
+        digits: significant digits.
     """
-    radius = _widest(lens)
-    most = 3.5 * lens.wavelength_um / radius**2
+    radius = _illuminated_radius(lens)
+    largest_defocus = 3.5 * lens.wavelength_um / radius**2
     focus = _reduced(lens, lens.source_distance_um)
-    films = _thinner(lens)
-    near = max(1 / (1 / focus + most), min(2 * radius, focus))
-    far = 1 / max(1 / focus - most, 0.1 / near)
-    thick = sum(film.thickness_um for film in lens.layers.front)
-    return max(_rounded(near + films, digits), thick), _rounded(far + films, digits)
+    films = _film_shortening(lens)
+    near = max(1 / (1 / focus + largest_defocus), min(2 * radius, focus))
+    far = 1 / max(1 / focus - largest_defocus, 0.1 / near)
+    film_thickness = sum(film.thickness_um for film in lens.layers.front)
+    return max(_rounded(near + films, digits), film_thickness), _rounded(
+        far + films, digits
+    )
 
 
 def _aperture(lens: Lens | ApertureSummary) -> ApertureSummary:
+    """Summary of a lens; a summary is returned as it is."""
     if isinstance(lens, ApertureSummary):
         return lens
     distances = lens.sensor_distance_um, lens.source_distance_um
@@ -157,8 +170,8 @@ def _aperture(lens: Lens | ApertureSummary) -> ApertureSummary:
     )
 
 
-def _widest(lens: Lens | ApertureSummary) -> float:
-    """Radius, at least one pitch, of the illuminated part."""
+def _illuminated_radius(lens: Lens | ApertureSummary) -> float:
+    """Radius of the illuminated part, at least one pitch, um."""
     radius = (
         lens.radius_um
         if isinstance(lens, ApertureSummary)
@@ -168,17 +181,19 @@ def _widest(lens: Lens | ApertureSummary) -> float:
 
 
 def _illuminated_um(lens: Lens | ApertureSummary, radius_um: float) -> float:
+    """Radius limited to the footprint of the light through the stop, um."""
     return min(
         radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
     )
 
 
 def _reduced(lens: Lens | ApertureSummary, depth_um: float) -> float:
-    return depth_um - _thinner(lens)
+    """Depth less the shortening by films in front, um."""
+    return depth_um - _film_shortening(lens)
 
 
-def _thinner(lens: Lens | ApertureSummary) -> float:
-    """What films in front take off the depth: sum of t (1 - 1/n)."""
+def _film_shortening(lens: Lens | ApertureSummary) -> float:
+    """Shortening of the depth by films in front: Σ t (1 - 1/n), um."""
     before = lens.layers.before(math.inf, lens.wavelength_um)
     return sum(
         t * (1 - 1 / n)
@@ -187,4 +202,5 @@ def _thinner(lens: Lens | ApertureSummary) -> float:
 
 
 def _rounded(value: float, digits: int) -> float:
+    """Value rounded to significant digits."""
     return float(f"{value:.{digits}g}")

@@ -25,22 +25,18 @@ from metalens.optics.layers import check_gaps
 
 _NAME = "diameter_um"
 Hand = Literal["", "left", "right"]
-HANDS: dict[str, float] = {
-    "": 0.0,
-    "left": -2.0,
-    "right": 2.0,
-}  # phase in turns of the pillar, by incoming hand
-MOST_HELD_BYTES = (
-    1 << 26
-)  # of diameters, beyond which the mask reads them from the file row by row
+# phase over the turn of the pillar, by incoming hand
+HANDS: dict[str, float] = {"": 0.0, "left": -2.0, "right": 2.0}
+# largest map of diameters that is loaded whole; masks read larger ones row by row
+MOST_HELD_BYTES = 1 << 26
 
 
 _BLOCK_ROWS = 256
 
 
 class SiteSpacing(NamedTuple):
-    """Distances of columns and rows, and the area of a pillar's cell; 0: as on a square
-    lattice.
+    """Spacing of columns and rows (um), and the area of a pillar's cell (um²); 0: as on
+    a square lattice.
     """
 
     pitch_um: float
@@ -84,6 +80,7 @@ class DiameterMap:
     pillars: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
+        """Check the map in blocks of rows, and count its pillars."""
         d = self.diameter_um
         if d.ndim != 2:
             raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
@@ -132,28 +129,28 @@ class DiameterMap:
 
     @property
     def lattice_row_um(self) -> float:
-        """Distance of the rows of an exact lattice."""
+        """Row spacing of the exact lattice, um."""
         return self.lattice.periods_um(self.pitch_um)[1] / (
             2 if self.lattice.centred else 1
         )
 
     @property
     def steps_um(self) -> tuple[float, float]:
-        """(x, y) distance of neighbouring columns and rows of the map."""
+        """(x, y) spacing of neighbouring columns and rows of the map, um."""
         return self.pitch_um / (
             2 if self.lattice.centred else 1
         ), self.row_um or self.lattice_row_um
 
     @property
     def site_um2(self) -> float:
-        """Area of the cell of one pillar."""
+        """Area of the cell of one pillar, um²."""
         x, y = self.steps_um
         return x * y * (2 if self.lattice.centred else 1)
 
     @property
     def grid(self) -> "SiteSpacing":
-        """The map's sites as :func:`metalens.propagate.make_case` takes them; zeros on
-        a square lattice.
+        """Spacing of the sites for :func:`metalens.propagate.make_case`; zeros on a
+        square lattice.
         """
         square = self.lattice.kind == "square" and not self.row_um
         column, row = self.steps_um
@@ -163,7 +160,7 @@ class DiameterMap:
 
     @property
     def plain(self) -> bool:
-        """Whether it is a square lattice of pillars of one size that are not turned."""
+        """Whether it is a square lattice of pillars of one size, none of them turned."""
         return (
             self.lattice.kind == "square"
             and not self.row_um
@@ -173,37 +170,40 @@ class DiameterMap:
 
     @property
     def x_um(self) -> Array:
-        """(x,) positions of the columns."""
+        """(x,) positions of the columns, um."""
         return _axis(self.diameter_um.shape[1], self.steps_um[0])
 
     @property
     def y_um(self) -> Array:
-        """(y,) positions of the rows."""
+        """(y,) positions of the rows, um."""
         return _axis(self.diameter_um.shape[0], self.steps_um[1])
 
     @property
     def radius_um(self) -> float:
-        """Distance from the axis to the outermost pillar centre; memory of a few rows."""
+        """Distance from the axis to the outermost pillar centre, um; read in blocks of
+        rows.
+        """
         farthest = 0.0
         for start, block in _blocks(self.diameter_um):
-            there = block > 0
-            held = there.any(axis=1)
-            if held.any():
-                first = there.argmax(axis=1)
-                last = there.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
+            has_pillar = block > 0
+            occupied = has_pillar.any(axis=1)
+            if occupied.any():
+                first = has_pillar.argmax(axis=1)
+                last = has_pillar.shape[1] - 1 - has_pillar[:, ::-1].argmax(axis=1)
                 outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
                 y = self.y_um[start : start + len(block)]
-                farthest = max(farthest, float(np.hypot(outer, y)[held].max()))
+                farthest = max(farthest, float(np.hypot(outer, y)[occupied].max()))
         return farthest
 
 
 def _blocks(d: Array) -> Iterator[tuple[int, Array]]:
-    """(first row, rows) of a map, block by block."""
+    """(first row, rows) of a map in blocks of 256 rows, read as arrays."""
     for first in range(0, len(d), _BLOCK_ROWS):
         yield first, np.asarray(d[first : first + _BLOCK_ROWS])
 
 
 def _axis(count: int, pitch_um: float) -> Array:
+    """(count,) positions about 0 with equal spacing, um."""
     return (np.arange(count) - (count - 1) / 2) * pitch_um
 
 
@@ -212,12 +212,13 @@ class TwoSizeTable:
     """Transmission of pillars over the size along x and that along y, for light
     polarised along x and along y.
 
-    wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2)
-        power-normalised amplitudes that keep the polarisation, exp(-iwt).
-    focus_y_um: (sensor, source) distance of the light polarised along y; that of the
-        lens is of light along x.
-    entry_error: root mean square of the error bars of the pillars that stand in the
-        lens, relative to |t|; nan where it is not known (older files).
+    wavelength_um: (w,) vacuum wavelengths.
+    x_um, y_um: (m,) and (n,) evenly spaced sizes.
+    t: (w, m, n, 2) power-normalised amplitudes that keep the polarisation, exp(-iwt).
+    focus_y_um: (sensor, source) distances for light polarised along y; those of the
+        lens are for light along x.
+    entry_error: root mean square of the error bars of the pillars in the lens, relative
+        to |t|; nan where it is not known (older files).
     """
 
     wavelength_um: Array
@@ -228,6 +229,7 @@ class TwoSizeTable:
     entry_error: float = math.nan
 
     def __post_init__(self) -> None:
+        """Refuse values that do not fit the axes or are not finite."""
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um), 2)
         if self.t.shape != shape or min(shape) < 1 or not np.isfinite(self.t).all():
             raise LensError(
@@ -237,52 +239,70 @@ class TwoSizeTable:
     def amplitude(
         self, x_um: Array, y_um: Array, wavelength_um: float, light: str
     ) -> Array:
-        """(...) t of pillars that stand in the table; sizes of 0 are no pillar and give
-        0.
+        """(...) complex t of pillars of tabulated sizes; 0 where there is no pillar
+        (size 0).
+
+        Args:
+            x_um: (...) sizes along x, um.
+            y_um: (...) sizes along y, um.
+            wavelength_um: one of the table.
+            light: polarisation, x or y.
 
         Raises:
             DomainError: a wavelength or a size that the table does not hold.
         """
-        found = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
-        if not len(found):
-            held = ", ".join(f"{w:g}" for w in self.wavelength_um)
+        matches = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
+        if not len(matches):
+            tabulated = ", ".join(f"{w:g}" for w in self.wavelength_um)
             raise DomainError(
-                f"wavelength {wavelength_um:g} um: pillars of two sizes are known at {held} um alone"
+                f"wavelength {wavelength_um:g} um: pillars of two sizes are known at {tabulated} um alone"
             )
-        there = np.asarray(x_um) > 0
+        has_pillar = np.asarray(x_um) > 0
         row, column = (
-            _place(axis, np.where(there, v, axis[0]))
-            for axis, v in ((self.x_um, x_um), (self.y_um, y_um))
+            _place(axis, np.where(has_pillar, size, axis[0]))
+            for axis, size in ((self.x_um, x_um), (self.y_um, y_um))
         )
         return np.asarray(
-            np.where(there, self.t[found[0], row, column, "xy".index(light)], 0)
+            np.where(has_pillar, self.t[matches[0], row, column, "xy".index(light)], 0)
         )
 
     @property
     def proxy(self) -> Proxy:
-        """A proxy without a curve: domain, wavelengths and entry error alone."""
+        """Proxy without a curve: it holds domain, wavelengths and entry error only."""
         domain = float(self.x_um[0]), float(self.x_um[-1]) + 1e-9
-        ends = float(self.wavelength_um[0]), float(self.wavelength_um[-1])
-        known = 0.0 if math.isnan(self.entry_error) else self.entry_error
-        none = np.zeros((1, 0))
-        return Proxy(none, none, domain, ends, 0.0, 0.0, entry_error=known)
+        wavelengths = float(self.wavelength_um[0]), float(self.wavelength_um[-1])
+        entry_error = 0.0 if math.isnan(self.entry_error) else self.entry_error
+        no_coefficients = np.zeros((1, 0))
+        return Proxy(
+            no_coefficients,
+            no_coefficients,
+            domain,
+            wavelengths,
+            0.0,
+            0.0,
+            entry_error=entry_error,
+        )
 
 
 def _place(axis: Array, size_um: Array) -> Array:
-    """Index of sizes that the axis holds.
+    """Indices of sizes on an evenly spaced axis.
+
+    Args:
+        axis: (n,) tabulated sizes, um.
+        size_um: (...) sizes, um.
 
     Raises:
-        DomainError: one that it does not hold, to a twentieth of a step.
+        DomainError: a size off the axis by more than a twentieth of a step.
     """
     step = float(axis[1] - axis[0]) if len(axis) > 1 else 1.0
-    exact = (np.asarray(size_um, float) - float(axis[0])) / step
-    place = np.clip(np.rint(exact), 0, len(axis) - 1)
-    if np.abs(exact - place).max(initial=0.0) > 0.05:
-        wrong = float(np.asarray(size_um).ravel()[np.abs(exact - place).argmax()])
+    position = (np.asarray(size_um, float) - float(axis[0])) / step
+    index = np.clip(np.rint(position), 0, len(axis) - 1)
+    if np.abs(position - index).max(initial=0.0) > 0.05:
+        wrong = float(np.asarray(size_um).ravel()[np.abs(position - index).argmax()])
         raise DomainError(
             f"a pillar of {wrong:.6g} um: the table of this lens does not hold that size"
         )
-    return np.asarray(place.astype(int))
+    return np.asarray(index.astype(int))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -290,23 +310,24 @@ class Lens:
     """A designed (or as-built) metalens.
 
     diameters: of every pillar.
-    cell: the pillar cell that the proxy was made for.
+    cell: the pillar cell that the proxy describes.
     proxy: diameter and wavelength to phase and transmission (paper Eq. 2).
     wavelength_um: of the design.
     sensor_distance_um: lens to sensor, in the cover medium.
     source_distance_um: object distance of best focus (inf for a collimated beam).
     profile: name of the design (hyperbolic, double-helix, cubic, fisher, map,
         as-built).
-    provenance: config and inputs that made it.
+    provenance: config and inputs of the design.
     layers: films in front and behind; their cover is that of the cell.
-    hand: circular light that the lens is made for: "right" (field x + iy, the phase
-        grows by twice the turn of a pillar) or "left"; the proxy is then that of the
-        light that leaves with the other hand. Empty: any light.
-    pairs: table of pillars of two sizes in place of the proxy; None where they have
-        one. light: polarisation, "x" or "y", that phase, transmission and distances are
-        for where they have two (:meth:`seen`).
-    neighbours: rows of its own non-identical pillars (:func:`metalens.design.neighbours`),
-        whose factor PSFs and images then hold; None where none was solved.
+    hand: incident circular light of the design: "right" (field x + iy, the phase grows
+        by twice the turn of a pillar) or "left". The proxy then describes the light
+        that leaves with the other hand. Empty: any light.
+    pairs: table of pillars of two sizes in place of the proxy; None for one size.
+    light: polarisation, "x" or "y", of phase, transmission and distances where pillars
+        have two sizes (:meth:`seen`).
+    neighbours: solved rows of its own non-identical pillars
+        (:func:`metalens.design.neighbours`), whose factor PSFs and images then include;
+        None where none was solved.
 
     Raises:
         LensError: layers with another cover than the cell's; turned pillars without a
@@ -329,6 +350,7 @@ class Lens:
     neighbours: NeighbourRows | None = None
 
     def __post_init__(self) -> None:
+        """Check the parts against each other, and set the cover of the layers."""
         if (self.pairs is None) != (self.diameters.length_um is None) or (
             self.pairs is None and self.light != "x"
         ):
@@ -352,15 +374,15 @@ class Lens:
 
     @property
     def reduced_um(self) -> float:
-        """Σ thickness / index from the pillars to the sensor: samples at x um show
-        directions of tangent x over it.
+        """Reduced distance from the pillars to the sensor, Σ thickness / index, um: a
+        sample at x has the direction tangent x / reduced_um.
         """
         return self.layers.after(self.sensor_distance_um, self.wavelength_um).reduced_um
 
     @property
     def one_light(self) -> str:
-        """Which light the proxy is of, in words, where pillars of one size answer x and
-        y apart; empty for others.
+        """Polarisation that the proxy describes, in words, where pillars of one size
+        respond differently to x and y; else empty.
         """
         if self.hand or self.pairs is not None or self.cell.alike:
             return ""
@@ -372,12 +394,16 @@ class Lens:
         )
 
     def seen(self, light: Literal["x", "y"]) -> "Lens":
-        """The lens for light polarised along x or y, where it focuses that."""
+        """The lens for light polarised along x or y, with the focus distances of that
+        light.
+
+        A lens of one size per pillar is returned unchanged.
+        """
         if self.pairs is None or self.light == light:
             return self
-        mine = self.sensor_distance_um, self.source_distance_um
-        sensor, source = self.pairs.focus_y_um  # of the other light, whichever that is
-        other = replace(self.pairs, focus_y_um=mine)
+        own_focus = self.sensor_distance_um, self.source_distance_um
+        sensor, source = self.pairs.focus_y_um  # of the other polarisation
+        other = replace(self.pairs, focus_y_um=own_focus)
         return replace(
             self,
             light=light,
@@ -389,15 +415,19 @@ class Lens:
     def phase_rad(
         self, wavelength_um: float | None = None, angle_rad: float = 0.0
     ) -> Array:
-        """(y, x) phase of every pillar through the proxy or the table, and of its turn;
-        0 where there is none.
+        """(y, x) phase of every pillar, rad, by the proxy or the table, with the
+        geometric phase of its turn; 0 where there is none.
+
+        Args:
+            wavelength_um: of the design where it is left out.
+            angle_rad: of incidence in air.
         """
         return self.rows_phase_rad(slice(None), wavelength_um, angle_rad)
 
     def rows_phase_rad(
         self, rows: slice, wavelength_um: float | None = None, angle_rad: float = 0.0
     ) -> Array:
-        """As :meth:`phase_rad`, of some rows."""
+        """(rows, x) phase of some rows; otherwise as :meth:`phase_rad`."""
         d = np.asarray(self.diameters.diameter_um[rows])
         if self.pairs is not None:
             return np.asarray(
@@ -410,6 +440,7 @@ class Lens:
     def _amplitude(
         self, rows: slice, pairs: TwoSizeTable, wavelength_um: float | None
     ) -> Array:
+        """(rows, x) complex t of pillars of two sizes, from their table."""
         x = self.diameters.diameter_um[rows]
         y = self.diameters.length_um
         return pairs.amplitude(
@@ -417,8 +448,8 @@ class Lens:
         )
 
     def geometric_rad(self, rows: slice) -> Array | float:
-        """Phase that turned pillars give circular light, plus or minus twice the turn;
-        0 where none is turned.
+        """(rows, x) geometric phase of turned pillars for circular light, plus or minus
+        twice the turn, rad; 0 where none is turned.
         """
         turn = self.diameters.angle_rad
         return 0.0 if turn is None else np.asarray(HANDS[self.hand] * turn[rows], float)
@@ -426,7 +457,12 @@ class Lens:
     def transmission(
         self, wavelength_um: float | None = None, angle_rad: float = 0.0
     ) -> Array:
-        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none."""
+        """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none.
+
+        Args:
+            wavelength_um: of the design where it is left out.
+            angle_rad: of incidence in air.
+        """
         if self.pairs is not None:
             return np.minimum(
                 np.abs(self._amplitude(slice(None), self.pairs, wavelength_um)), 1.0
@@ -437,6 +473,7 @@ class Lens:
         return np.where(d > 0, level, 0)
 
     def _at(self, wavelength_um: float | None) -> float:
+        """The wavelength, or that of the design where it is None."""
         return self.wavelength_um if wavelength_um is None else wavelength_um
 
 
@@ -464,33 +501,34 @@ def load(path: str | Path) -> Lens:
 
 @typed_reader
 def load_plain(path: str | Path) -> Lens:
-    """As :func:`load`, for what knows only round or fixed pillars on a square lattice.
+    """Read a lens file for commands that take only pillars of one size, not turned, on
+    a square lattice.
 
     Args:
         path: of the file.
 
     Raises:
-        LensError: another lattice, or pillars that are turned one by one.
+        LensError: another lattice, or pillars that are turned or have two sizes.
     """
-    made = load(path)
-    if not made.diameters.plain:
-        turned = (
+    lens = load(path)
+    if not lens.diameters.plain:
+        kind = (
             ", turned one by one"
-            if made.hand
+            if lens.hand
             else ", of two sizes"
-            if made.pairs
+            if lens.pairs
             else ""
         )
         raise LensError(
-            f"{path}: pillars on a {made.diameters.lattice.kind} lattice{turned}; this command takes a square lattice "
+            f"{path}: pillars on a {lens.diameters.lattice.kind} lattice{kind}; this command takes a square lattice "
             "of pillars of one size that are not turned (psf, layout and view take any)"
         )
-    return made
+    return lens
 
 
 @typed_reader
 def load_out_of_core(path: str | Path) -> Lens:
-    """As :func:`load`; diameters that would take much memory stay in the file.
+    """Read a lens file, with a large map of diameters left in the file.
 
     ``diameters.diameter_um`` is then an HDF5 data set: blocks of its rows are arrays,
     ``numpy.asarray`` reads all of it.
@@ -499,7 +537,7 @@ def load_out_of_core(path: str | Path) -> Lens:
         path: of the file.
     """
     large = False
-    if Path(path).is_file():  # what else it is tells the loader, and what is damaged
+    if Path(path).is_file():  # the loader reports any error
         with contextlib.suppress(*store.DAMAGE), h5py.File(path, "r") as file:
             large = file[_NAME].nbytes > MOST_HELD_BYTES
     if not large:

@@ -10,22 +10,21 @@ from metalens.core.threads import run_split
 from metalens.lens.record import Lens
 from metalens.library import Proxy
 
-Polynomials = tuple[
-    float, float, int, float, Array, Array
-]  # scale, shift, power, ceiling, monomials of φ and |T|
-PART = 512  # pillars of a row at a time
+# scale, shift, power, ceiling, monomials of φ and of |T|
+Polynomials = tuple[float, float, int, float, Array, Array]
+PART = 512  # pillars of a row per pass
 FASTMATH: set[str] = {"contract", "nsz", "reassoc"}
 
 
 def fill_response(
     lens: Lens, at: tuple[float, float], phase: Array, level: Array
 ) -> None:
-    """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in
-    their dtype; 0 where there is none.
+    """Fill (y, x) arrays with the phase wrapped to ±π and the transmission of every
+    pillar, in their dtype; 0 where there is none.
 
     Args:
-        at: wavelength in um, angle of incidence in rad.
         lens: whose pillars respond.
+        at: wavelength in um, angle of incidence in rad.
         phase: (y, x) array that is filled, rad.
         level: (y, x) array that is filled.
 
@@ -35,10 +34,8 @@ def fill_response(
     """
     if lens.pairs is not None:
         turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
-        phase[:], level[:] = (
-            (turns - np.rint(turns)) * 2 * np.pi,
-            lens.transmission(at[0], at[1]),
-        )
+        phase[:] = (turns - np.rint(turns)) * 2 * np.pi
+        level[:] = lens.transmission(at[0], at[1])
         return
     turned = (
         None
@@ -58,14 +55,15 @@ def fill_response_of(
     level: Array,
     turned: Array | None = None,
 ) -> None:
-    """As :func:`fill_response`, of (y, x) diameters in um; turned: (y, x) phase in rad
-    that is added.
+    """As :func:`fill_response`, for a map of diameters and a proxy.
 
     Args:
         proxy: phase and |T| over the diameter.
         d: (y, x) sizes, um; 0 where there is no pillar.
         at: wavelength in um, angle of incidence in rad.
+        phase: (y, x) array that is filled, rad.
         level: (y, x) array that is filled.
+        turned: (y, x) geometric phase that is added, rad; None for none.
     """
     loop, numbers = _fill, response_polynomials(proxy, d, at)
     turn = np.zeros((len(d), 0)) if turned is None else turned
@@ -77,8 +75,8 @@ def fill_response_of(
 def response_polynomials(
     proxy: Proxy, diameter_um: Array, at: tuple[float, float]
 ) -> Polynomials:
-    """What :func:`evaluate_row` takes of these diameters, for a wavelength in um and an
-    angle in rad; raises as :func:`fill_response`.
+    """Numbers of the phase and |T| polynomials for :func:`evaluate_row`, after the
+    diameters are checked; raises as :func:`fill_response`.
 
     Args:
         proxy: phase and |T| over the diameter.
@@ -91,7 +89,7 @@ def response_polynomials(
         proxy.phase_rad(
             np.array([np.min(diameter_um, where=diameter_um > 0, initial=most), most]),
             *at,
-        )  # or refused
+        )  # raises outside the domain
     inner = phase.scale, phase.shift, phase.power, level.ceiling
     return (*inner, np.array(phase.monomials), np.array(level.monomials))
 
@@ -100,13 +98,15 @@ def response_polynomials(
     fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True
 )
 def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
-    """Phase in rad and |T| of a part of a row; x: work.
+    """Fill the phase in rad and |T| of a part of a row, by Horner's rule in x = scale
+    d^power + shift.
 
     Args:
         d: (n,) diameters, um.
-        numbers: polynomials of phase and |T|.
+        numbers: scale, shift, power, ceiling and monomials of phase and |T|.
+        x: (n,) work array.
         phase: (n,) that is filled, rad.
-        level: (n,) that is filled.
+        level: (n,) that is filled; 0 where there is no pillar.
     """
     scale, shift, power, ceiling, in_phase, in_level = numbers
     for j in range(d.size):
@@ -129,7 +129,15 @@ def evaluate_row(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
 
 @numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True)
 def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-def]
-    """Some rows of :func:`fill_response`."""
+    """Fill some rows of :func:`fill_response`, in parts of 512 pillars.
+
+    Args:
+        d: (rows, x) diameters, um.
+        turned: (rows, x) phase that is added, rad; (rows, 0) for none.
+        numbers: as for :func:`evaluate_row`.
+        out_phase: (rows, x) that is filled, rad within ±π.
+        out_level: (rows, x) that is filled.
+    """
     x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
     for i in range(d.shape[0]):
         for start in range(0, d.shape[1], PART):

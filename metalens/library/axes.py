@@ -24,11 +24,11 @@ from metalens.library.record import Sweep, check_light
 from metalens.library.workers import SweepJournal, Task
 
 KIND = "axes-library"
-FIT_SHARE = 0.1  # of the tolerance: residual of the rational fits
+FIT_SHARE = 0.1  # residual of the rational fits, as a share of the tolerance
 
 
-FIRST, MOST = 7, 19  # nodes along an axis: to begin with, and at most
-SOLVER_SHARE = 0.6  # of the tolerance, for the solver
+FIRST, MOST = 7, 19  # nodes along an axis: at the start, and at most
+SOLVER_SHARE = 0.6  # share of the tolerance left to the solver's truncation error
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,21 +37,20 @@ class AxesLibrary:
     normal incidence.
 
     Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the
-    pillar's foot to that of its top, as :class:`metalens.cell.response.Response` has
-    it. The sizes are those before the turn of the shape.
+    pillar's foot to that of its top, as in :class:`metalens.cell.response.Response`.
+    The sizes are those before the turn of the shape.
 
     cell, sweep: what was computed.
-    wavelength_um: (w,). x_um: (m,), y_um: (n,) sizes, evenly spaced with one step.
-    t: (w, m, n, 2, 2) Jones matrices; last axis: polarisation that comes (x, y), the
-    one before: that leaves.
+    wavelength_um: (w,) vacuum wavelengths.
+    x_um, y_um: (m,) and (n,) sizes, evenly spaced with one step.
+    t: (w, m, n, 2, 2) Jones matrices; the last axis is the incident polarisation (x,
+        y), the one before it the outgoing one.
     t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not
-    below the true error: solver and
-        interpolation.
+        below the true error: solver and interpolation.
     held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the
-    wavelength, x, y, largest
-        |interpolated - solved| on one truncation, error bar of the entry.
-    solves: behind the entries. harmonics: orders of the truncation, the same for all
-    entries.
+        wavelength, x, y, largest |interpolated - solved| on one truncation, error bar.
+    solves: number of exact solves behind the entries.
+    harmonics: orders of the truncation, the same for all entries.
     """
 
     cell: Cell
@@ -67,6 +66,7 @@ class AxesLibrary:
     provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, and values that are not finite."""
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um))
         if self.t.shape != (*shape, 2, 2) or self.t_error.shape != shape:
             raise DomainError(
@@ -78,34 +78,37 @@ class AxesLibrary:
 
     @property
     def usable(self) -> Array:
-        """(w, m, n) whether the error bar meets the tolerance; the others are the
+        """(w, m, n) mask: the error bar meets the tolerance. The others are the
         excluded bands of resonances.
         """
         return np.asarray(self.t_error <= self.sweep.bar)
 
     @property
     def missed(self) -> int:
-        """Held-out pairs whose error lies above its bar."""
+        """Number of held-out pairs whose error exceeds their error bar."""
         return int(np.count_nonzero(self.held_out[:, 3] > self.held_out[:, 4]))
 
     def at(self, wavelength_um: float) -> int:
-        """Place of a wavelength.
+        """Index of a wavelength; nothing is interpolated between wavelengths.
 
         Raises:
-            DomainError: the library does not hold it (nothing is interpolated between
-                wavelengths).
+            DomainError: the library does not hold it.
         """
-        found = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
-        if not len(found):
-            held = ", ".join(f"{w:g}" for w in self.wavelength_um)
+        places = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
+        if not len(places):
+            available = ", ".join(f"{w:g}" for w in self.wavelength_um)
             raise DomainError(
-                f"wavelength {wavelength_um:g} um: this library holds {held} um; sweep it there too"
+                f"wavelength {wavelength_um:g} um: this library holds {available} um; sweep it there too"
             )
-        return int(found[0])
+        return int(places[0])
 
 
 def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
-    """The cell whose pillar of size ``x_um`` is ``y_um`` long along its other axis."""
+    """The cell with a pillar of ``x_um`` by ``y_um``: the ratio of its shape is y / x.
+
+    Raises:
+        CellError: a shape that has one size.
+    """
     shape = cell.shape
     if not isinstance(shape, Rectangle | Ellipse):
         raise CellError(
@@ -117,16 +120,16 @@ def cell_of_sizes(cell: Cell, x_um: float, y_um: float) -> Cell:
 
 
 def check_axes_sweep(cell: Cell, sweep: Sweep) -> None:
-    """Refuse a sweep over two sizes that cannot be computed, before anything is
-    computed.
+    """Refuse a sweep over two sizes that cannot be computed.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
 
     Raises:
-        ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
-            with a ratio of its own, pillars that touch; and as
-            :func:`metalens.library.check_sweep`.
+        ConfigError: no ranges.
+        CellError: another shape than rectangle or ellipse, one with a ratio of its own,
+            pillars that touch; and as :func:`metalens.library.check_sweep`.
     """
     spans = size_ranges(sweep)
     if getattr(cell_of_sizes(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
@@ -165,18 +168,18 @@ def size_ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]
 
 
 def is_exchange_symmetric(cell: Cell, sweep: Sweep) -> bool:
-    """Whether exchanging the sizes exchanges x and y: equal ranges, on a square
-    lattice, not turned.
+    """Whether exchanging the sizes exchanges x and y: equal ranges on a square lattice,
+    and a shape turned by a multiple of 90 degrees.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
         sweep: settings of the library.
     """
-    quarter = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
+    quarter_turns = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
     return (
         cell.lattice.kind == "square"
         and sweep.diameters_um == sweep.lengths_um
-        and quarter == round(quarter)
+        and quarter_turns == round(quarter_turns)
     )
 
 
@@ -204,8 +207,9 @@ def load(path: str | Path) -> AxesLibrary:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class InterpolatedTable:
-    """value: (p, q, components) at the places asked for; doubt: (p, q), of the
-    interpolation alone.
+    """t interpolated at pairs of sizes.
+
+    value: (p, q, components). doubt: (p, q) error estimate of the interpolation alone.
     """
 
     value: Array
@@ -219,44 +223,46 @@ def interpolate_table(
     *,
     tolerance: float,
 ) -> InterpolatedTable:
-    """t at all pairs of places.
+    """t at all pairs of places by rational interpolation, and its error estimate.
+
+    The value is the mean of two orders: along x then y, and along y then x. The
+    estimate is the largest change between the orders, or against an interpolation with
+    a quarter of the nodes left out. It is spread over half a node spacing, and 0.05
+    ``tolerance`` is added.
 
     Args:
-        nodes: (m,) and (n,) rising sizes along x and y; values: (m, n, components)
-            there.
-        places: (p,) and (q,) sizes, within the nodes, evenly spaced.
+        nodes: (m,) and (n,) rising sizes along x and y, um.
+        values: (m, n, components) at the nodes.
+        places: (p,) and (q,) sizes, within the nodes, evenly spaced, um.
         tolerance: of t; sets the residual of the rational fits.
     """
     (x, y), (at_x, at_y) = nodes, places
-    first = _interpolate_in_turn(x, y, values, at_x, at_y, tolerance)
-    second = _interpolate_in_turn(
+    x_then_y = _interpolate_in_turn(x, y, values, at_x, at_y, tolerance)
+    y_then_x = _interpolate_in_turn(
         y, x, values.swapaxes(0, 1), at_y, at_x, tolerance
     ).swapaxes(0, 1)
-    difference = np.abs(first - second).max(axis=-1)
-    row, column = _rival_nodes(len(x)), _rival_nodes(len(y))
-    rival = _interpolate_in_turn(
-        x[row], y[column], values[np.ix_(row, column)], at_x, at_y, tolerance
+    difference = np.abs(x_then_y - y_then_x).max(axis=-1)
+    rows, columns = _sparser_nodes(len(x)), _sparser_nodes(len(y))
+    sparser = _interpolate_in_turn(
+        x[rows], y[columns], values[np.ix_(rows, columns)], at_x, at_y, tolerance
     )
-    difference = np.maximum(
-        difference, np.abs(rival - (first + second) / 2).max(axis=-1)
-    )
-    reach = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
+    mean = (x_then_y + y_then_x) / 2
+    difference = np.maximum(difference, np.abs(sparser - mean).max(axis=-1))
+    half_gaps = [_half_gap(node, place) for node, place in ((x, at_x), (y, at_y))]
     difference = maximum_filter(
-        difference, size=[2 * n + 1 for n in reach], mode="nearest"
+        difference, size=[2 * count + 1 for count in half_gaps], mode="nearest"
     )
-    return InterpolatedTable(
-        (first + second) / 2, np.asarray(difference + 0.05 * tolerance)
-    )
+    return InterpolatedTable(mean, np.asarray(difference + 0.05 * tolerance))
 
 
-def _rival_nodes(count: int) -> Array:
-    """Places of the nodes of the rival: one in four inner ones is left out."""
-    place = np.arange(count)
-    return np.asarray(place[(place % 4 != 2) | (place == count - 1)])
+def _sparser_nodes(count: int) -> Array:
+    """Indices of the nodes with one in four of the inner ones left out."""
+    index = np.arange(count)
+    return np.asarray(index[(index % 4 != 2) | (index == count - 1)])
 
 
 def _half_gap(nodes: Array, places: Array) -> int:
-    """Places within half the mean distance of nodes."""
+    """Number of places within half the mean spacing of the nodes."""
     if len(places) < 2:
         return 0
     return math.ceil(
@@ -267,32 +273,43 @@ def _half_gap(nodes: Array, places: Array) -> int:
 def _interpolate_in_turn(
     x: Array, y: Array, values: Array, at_x: Array, at_y: Array, tolerance: float
 ) -> Array:
-    """Along x on every line of nodes, then along y: (p, q, components)."""
-    lines = [
-        rational.fit_rational_aaa(x, values[:, k], tolerance=FIT_SHARE * tolerance)(
-            at_x
-        )
+    """(p, q, components) rational interpolation along x on every line of nodes, then
+    along y on every line of places.
+
+    Args:
+        x: (m,) nodes.
+        y: (n,) nodes.
+        values: (m, n, components).
+        at_x: (p,) places.
+        at_y: (q,) places.
+        tolerance: of t.
+    """
+    residual = FIT_SHARE * tolerance
+    fits = [
+        rational.fit_rational_aaa(x, values[:, k], tolerance=residual)(at_x)
         for k in range(len(y))
     ]
-    along = np.stack(lines, axis=1)
+    columns = np.stack(fits, axis=1)
     return np.stack(
         [
-            rational.fit_rational_aaa(y, line, tolerance=FIT_SHARE * tolerance)(at_y)
-            for line in along
+            rational.fit_rational_aaa(y, line, tolerance=residual)(at_y)
+            for line in columns
         ]
     )
 
 
 class SolvedPillar(NamedTuple):
-    """One pillar: (2, 2) Jones matrix and its error bar."""
+    """(2, 2) Jones matrix of one pillar, and its error bar."""
 
     t: Array
     error: float
 
 
 class _Nodes:
-    """Exact solves of one wavelength, by pair of sizes; where the sizes may be
-    exchanged half of them follow.
+    """Exact solves of one wavelength by pair of sizes, each solved once; where the
+    sizes may be exchanged, half of them follow by symmetry.
+
+    solves: number of pairs solved so far.
     """
 
     def __init__(
@@ -303,21 +320,26 @@ class _Nodes:
         reach: int,
         journal: SweepJournal,
     ) -> None:
-        self._cell, self._wavelength, self._reach, self._journal = (
-            cell,
-            wavelength_um,
-            reach,
-            journal,
-        )
-        self.swaps, self._tolerance = is_exchange_symmetric(cell, sweep), sweep.bar
+        self._cell = cell
+        self._wavelength = wavelength_um
+        self._reach = reach
+        self._journal = journal
+        self.swaps = is_exchange_symmetric(cell, sweep)
+        self._tolerance = sweep.bar
         self._known: dict[tuple[float, float], SolvedPillar] = {}
         self.solves = 0
 
     def solve(
         self, pairs: list[tuple[float, float]], console: Console, label: str
     ) -> list[SolvedPillar]:
-        """Of every pair."""
-        left = list(
+        """Jones matrix and error bar of every pair; new pairs are solved in parallel.
+
+        Args:
+            pairs: (x, y) sizes, um.
+            console: where progress is shown.
+            label: names the pairs in the progress.
+        """
+        new_pairs = list(
             dict.fromkeys(
                 self._first(pair)
                 for pair in pairs
@@ -334,35 +356,44 @@ class _Nodes:
                 self._tolerance,
                 harmonics=self._reach,
             )
-            for x, y in left
+            for x, y in new_pairs
         ]
-        for pair, (made,) in zip(
-            left, self._journal.run(tasks, console, label), strict=True
+        for pair, (solved,) in zip(
+            new_pairs, self._journal.run(tasks, console, label), strict=True
         ):
-            t = made.response[:, 0].reshape(2, 2)
-            self._known[pair] = SolvedPillar(t, float(made.error.max()))
-        self.solves += len(left)
+            t = solved.response[:, 0].reshape(2, 2)
+            self._known[pair] = SolvedPillar(t, float(solved.error.max()))
+        self.solves += len(new_pairs)
         return [self._of(pair) for pair in pairs]
 
     def _first(self, pair: tuple[float, float]) -> tuple[float, float]:
+        """The pair that is solved for this one; by symmetry, the larger size first."""
         return (max(pair), min(pair)) if self.swaps else pair
 
     def _of(self, pair: tuple[float, float]) -> SolvedPillar:
-        found = self._known[self._first(pair)]
-        return (
-            found
-            if self._first(pair) == pair
-            else SolvedPillar(found.t[::-1, ::-1], found.error)
-        )
+        """Pillar of a solved pair; exchanging its sizes exchanges x and y of t."""
+        pillar = self._known[self._first(pair)]
+        if self._first(pair) == pair:
+            return pillar
+        return SolvedPillar(pillar.t[::-1, ::-1], pillar.error)
 
     def grid(
         self, x: Array, y: Array, console: Console, label: str
     ) -> tuple[Array, Array]:
-        """(m, n, 4) Jones matrices and (m, n) error bars on all pairs of nodes."""
-        made = self.solve([(float(a), float(b)) for a in x for b in y], console, label)
+        """(m, n, 4) Jones matrices and (m, n) error bars of all pairs of nodes.
+
+        Args:
+            x: (m,) sizes, um.
+            y: (n,) sizes, um.
+            console: where progress is shown.
+            label: names the pairs in the progress.
+        """
+        pillars = self.solve(
+            [(float(a), float(b)) for a in x for b in y], console, label
+        )
         shape = len(x), len(y)
-        return np.array([one.t for one in made]).reshape(*shape, 4), np.array(
-            [one.error for one in made]
+        return np.array([pillar.t for pillar in pillars]).reshape(*shape, 4), np.array(
+            [pillar.error for pillar in pillars]
         ).reshape(shape)
 
 
@@ -373,18 +404,20 @@ def sweep_two_sizes(
     console: Console | None = None,
     checkpoint: Path | None = None,
 ) -> AxesLibrary:
-    """Compute a library over two sizes.
+    """Compute a library over two sizes, by exact solves on a grid of nodes and rational
+    interpolation between them.
 
     Args:
-        settings: ``diameters_um`` and ``lengths_um`` are the ranges along x and y,
-            ``samples`` the entries along the longer of them. console, checkpoint: as
-            for :func:`metalens.library.sweep`.
         cell: unit cell with its materials, shape and lattice.
+        settings: ``diameters_um`` and ``lengths_um`` are the ranges along x and y,
+            ``samples`` the entries along the longer of them.
+        console: where progress is shown.
+        checkpoint: as for :func:`metalens.library.sweep`.
 
-    Accuracy: the bar of an entry adds the truncation error of the solver, carried as a
-        small shift of the sizes, and the disagreement of interpolations, scaled by what
-        twelve pairs held out show; ``held_out`` tells how far off they and twelve more
-        are.
+    Accuracy: the bar of an entry adds two parts. One is the truncation error of the
+        solver, carried as a small shift of the sizes. The other is the disagreement of
+        interpolations, scaled by the errors of twelve held-out pairs; ``held_out``
+        lists them and twelve more.
 
     Raises:
         ConfigError, CellError, MaterialError: see :func:`check_axes_sweep`.
@@ -395,36 +428,46 @@ def sweep_two_sizes(
     journal = SweepJournal(checkpoint, cell, settings)
     places = size_entries(settings)
     reach = _choose_truncation(cell, settings)
-    t, error, held, solves = [], [], [], 0
+    t = []
+    error = []
+    held = []
+    solves = 0
     for index, wavelength in enumerate(settings.wavelengths_um):
         nodes = _Nodes(cell, settings, wavelength, reach, journal)
         x, y = _choose_lines(nodes, settings, console)
         values, bars = nodes.grid(x, y, console, "pillars")
-        made = interpolate_table((x, y), values, places, tolerance=settings.bar)
-        judged = _held_out(nodes, places, made.value, made.doubt, console)
-        # half of the pairs held out scale the bars, the other half judges them
-        wide = max(0.5, 2 * float((judged[::2, 2] / judged[::2, 3]).max()))
+        table = interpolate_table((x, y), values, places, tolerance=settings.bar)
+        held_pairs = _held_out(nodes, places, table.value, table.doubt, console)
+        # half of the held-out pairs scale the bars, the other half tests them
+        scale = max(0.5, 2 * float((held_pairs[::2, 2] / held_pairs[::2, 3]).max()))
         bar = np.minimum(
-            wide * made.doubt + _solver_error((x, y), bars, places, made.value), 2.0
+            scale * table.doubt + _solver_error((x, y), bars, places, table.value), 2.0
         )
         row, column = _held_out_places(places)
-        judged[:, 3] = bar[row, column]
-        t.append(made.value.reshape(*made.doubt.shape, 2, 2))
+        held_pairs[:, 3] = bar[row, column]
+        t.append(table.value.reshape(*table.doubt.shape, 2, 2))
         error.append(bar)
-        held.append(np.insert(judged, 0, index, axis=1))
+        held.append(np.insert(held_pairs, 0, index, axis=1))
         solves += nodes.solves
-    axes = np.array(settings.wavelengths_um), *places
-    about = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
-    found = np.concatenate(held)
+    provenance = Provenance(config=config.dumps(cell) + "\n" + config.dumps(settings))
     library = AxesLibrary(
-        cell, settings, *axes, np.array(t), np.array(error), found, solves, reach, about
+        cell,
+        settings,
+        np.array(settings.wavelengths_um),
+        *places,
+        np.array(t),
+        np.array(error),
+        np.concatenate(held),
+        solves,
+        reach,
+        provenance,
     )
     journal.finish()
     return library
 
 
 def size_entries(sweep: Sweep) -> tuple[Array, Array]:
-    """Evenly spaced sizes along x and y, with one step; the shorter range may end
+    """(x, y) evenly spaced sizes with one common step, um; the shorter range may end
     before its largest size.
 
     Args:
@@ -436,64 +479,73 @@ def size_entries(sweep: Sweep) -> tuple[Array, Array]:
         low + step * np.arange(int((high - low) / step + 1e-9) + 1)
         for low, high in spans
     )
-    return np.minimum(x, spans[0][1]), np.minimum(
-        y, spans[1][1]
-    )  # the last one, to rounding
+    # rounding may carry the last size past the range
+    return np.minimum(x, spans[0][1]), np.minimum(y, spans[1][1])
 
 
 def _choose_truncation(cell: Cell, sweep: Sweep) -> int:
-    """The least truncation whose bars meet the solver's share at four probes, or the
-    largest there is.
+    """Least number of harmonics whose error bars meet the solver's share of the
+    tolerance at four probe sizes; the largest possible one where none does.
     """
     from metalens.rcwa import jones, most_harmonics
 
     (x0, x1), (y0, y1) = size_ranges(sweep)
-    shares = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
-    sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
+    probes = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
+    sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in probes]
     most = most_harmonics(cell_of_sizes(cell, *sizes[0]), sizes[0][0])
-    for reach in range(min(5, most), most):
-        wanted = SOLVER_SHARE * sweep.bar
-        about = {"tolerance": wanted, "harmonics": reach}
+    for harmonics in range(min(5, most), most):
+        target = SOLVER_SHARE * sweep.bar
+        options = {"tolerance": target, "harmonics": harmonics}
         if all(
-            jones(cell_of_sizes(cell, x, y), x, wavelength, **about).converged  # type: ignore[arg-type]
+            jones(cell_of_sizes(cell, x, y), x, wavelength, **options).converged  # type: ignore[arg-type]
             for x, y in sizes
             for wavelength in sweep.wavelengths_um
         ):
-            return reach
+            return harmonics
     return most
 
 
 def _choose_lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
-    """Nodes along x and y: Chebyshev's, and lines between them where the interpolations
-    disagree most.
+    """(x, y) nodes: seven Chebyshev points each, and lines added between them where the
+    interpolations disagree most.
+
+    Stops at 19 nodes, or when at most 3 % of the pairs exceed the interpolation's share
+    of the tolerance.
     """
     spans = size_ranges(sweep)
     angle = np.pi * np.arange(FIRST) / (FIRST - 1)
     lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
-    look = np.linspace(*spans[0], 61), np.linspace(*spans[1], 61)
-    for made, span in zip(lines, spans, strict=True):
-        made[[0, -1]] = span
+    grid = np.linspace(*spans[0], 61), np.linspace(*spans[1], 61)
+    for line, span in zip(lines, spans, strict=True):
+        line[[0, -1]] = span
     while True:
         x, y = lines
         values, _ = nodes.grid(x, y, console, "pillars")
-        doubt = interpolate_table((x, y), values, look, tolerance=sweep.bar).doubt
-        above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
+        doubt = interpolate_table((x, y), values, grid, tolerance=sweep.bar).doubt
+        share_above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
         # a few pairs in a hundred may lie near resonances
-        if above <= 0.03 or len(x) >= MOST:
+        if share_above <= 0.03 or len(x) >= MOST:
             return x, y
-        some = np.minimum(doubt, 10 * sweep.bar)  # a resonance is not chased for ever
-        profiles = [some.mean(axis=1), some.mean(axis=0)]
+        # capped, so that one resonance does not take all lines
+        capped = np.minimum(doubt, 10 * sweep.bar)
+        profiles = [capped.mean(axis=1), capped.mean(axis=0)]
         if nodes.swaps:
             profiles = [profiles[0] + profiles[1]] * 2
-        lines = [_add_lines(*pair) for pair in zip(lines, look, profiles, strict=True)]
+        lines = [_add_lines(*pair) for pair in zip(lines, grid, profiles, strict=True)]
 
 
-def _add_lines(lines: Array, look: Array, profile: Array) -> Array:
-    """Nodes with some more, in the gaps over which the doubt adds up to most."""
+def _add_lines(lines: Array, sizes: Array, profile: Array) -> Array:
+    """Nodes with two more, each halving the gap over which the doubt sums to most.
+
+    Args:
+        lines: (m,) nodes, um.
+        sizes: (p,) um.
+        profile: (p,) doubt at these sizes.
+    """
     for _ in range(2):
         gaps = [
-            float(profile[(look > a) & (look < b)].sum())
-            for a, b in itertools.pairwise(lines)
+            float(profile[(sizes > low) & (sizes < high)].sum())
+            for low, high in itertools.pairwise(lines)
         ]
         worst = int(np.argmax(gaps))
         lines = np.insert(lines, worst + 1, (lines[worst] + lines[worst + 1]) / 2)
@@ -507,52 +559,72 @@ def _held_out(
     doubt: Array,
     console: Console,
 ) -> Array:
-    """(k, 4) x, y, error and doubt of the interpolation at the entries that are held
-    out.
+    """(k, 4) x and y in um, error, and error estimate of the interpolation at the
+    held-out entries, which are solved but not interpolated.
+
+    Args:
+        nodes: solver of the wavelength.
+        places: (p,) and (q,) sizes of the library, um.
+        value: (p, q, 4) interpolated Jones matrices.
+        doubt: (p, q) error estimate of the interpolation.
     """
-    row, column = _held_out_places(places)
+    rows, columns = _held_out_places(places)
     pairs = [
         (float(places[0][i]), float(places[1][j]))
-        for i, j in zip(row, column, strict=True)
+        for i, j in zip(rows, columns, strict=True)
     ]
-    exact = np.array([one.t.ravel() for one in nodes.solve(pairs, console, "held out")])
-    missed = np.abs(value[row, column] - exact).max(axis=1)
-    return np.column_stack([np.array(pairs), missed, doubt[row, column]])
+    exact = np.array(
+        [pillar.t.ravel() for pillar in nodes.solve(pairs, console, "held out")]
+    )
+    error = np.abs(value[rows, columns] - exact).max(axis=1)
+    return np.column_stack([np.array(pairs), error, doubt[rows, columns]])
 
 
 def _held_out_places(places: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Entries that spread over the plane (Roberts's sequence)."""
-    growth = 1.324717957244746  # its cube is itself plus one
-    steps = np.outer(np.arange(1, 25), [1 / growth, 1 / growth**2])
+    """(24,) rows and columns of entries spread evenly over the plane: Roberts's R2
+    sequence, frac(1/2 + k / g) and frac(1/2 + k / g²) with g³ = g + 1.
+    """
+    g = 1.324717957244746
+    steps = np.outer(np.arange(1, 25), [1 / g, 1 / g**2])
     shares = np.mod(steps + 0.5, 1)
-    row, column = (
+    rows, columns = (
         np.minimum((shares[:, k] * len(places[k])).astype(int), len(places[k]) - 1)
         for k in (0, 1)
     )
-    return row, column
+    return rows, columns
 
 
 def _solver_error(
     nodes: tuple[Array, Array], bars: Array, places: tuple[Array, Array], value: Array
 ) -> Array:
-    """(p, q) error of the solver between the nodes: a small shift of the sizes, so it
-    grows with the slope of t.
+    """(p, q) error of the solver between the nodes, carried as a small shift of the
+    sizes: it grows with the slope of t.
+
+    Each node's shift is its error bar over the slope. A place takes the largest shift
+    of the four nodes around it, times its own slope.
+
+    Args:
+        nodes: (m,) and (n,) sizes, um.
+        bars: (m, n) error bars of the solver at the nodes.
+        places: (p,) and (q,) sizes, um.
+        value: (p, q, components) interpolated t.
     """
-    steep = np.zeros(value.shape[:2])
+    slope = np.zeros(value.shape[:2])
     for axis in (0, 1):
-        rise = np.abs(np.gradient(value, places[axis], axis=axis)).max(axis=-1)
-        steep = np.hypot(steep, rise)
-    steep += 2 / (places[0][-1] - places[0][0])
-    place = [
-        np.interp(n, p, np.arange(len(p))) for n, p in zip(nodes, places, strict=True)
+        derivative = np.abs(np.gradient(value, places[axis], axis=axis)).max(axis=-1)
+        slope = np.hypot(slope, derivative)
+    slope += 2 / (places[0][-1] - places[0][0])  # of a curve without features
+    node_index = [
+        np.interp(node, size, np.arange(len(size)))
+        for node, size in zip(nodes, places, strict=True)
     ]
-    at = np.stack(np.meshgrid(*place, indexing="ij"))
-    shift = bars / map_coordinates(steep, at, order=1)
-    corner = np.maximum.reduce(
+    node_grid = np.stack(np.meshgrid(*node_index, indexing="ij"))
+    shift = bars / map_coordinates(slope, node_grid, order=1)
+    largest_shift = np.maximum.reduce(
         [shift[:-1, :-1], shift[1:, :-1], shift[:-1, 1:], shift[1:, 1:]]
     )
-    cell = [
-        np.clip(np.searchsorted(n, p, side="right") - 1, 0, len(n) - 2)
-        for n, p in zip(nodes, places, strict=True)
+    interval = [
+        np.clip(np.searchsorted(node, size, side="right") - 1, 0, len(node) - 2)
+        for node, size in zip(nodes, places, strict=True)
     ]
-    return np.asarray(corner[cell[0][:, None], cell[1]] * steep)
+    return np.asarray(largest_shift[interval[0][:, None], interval[1]] * slope)

@@ -15,21 +15,23 @@ from metalens.library import rational
 from metalens.library.rational import RationalFunction
 
 Solver = Callable[[float], Response]
-FIT_SHARE = 0.2  # of the tolerance: residual of the rational fit
-CALM = 2  # new nodes in a row that the fit must predict within the tolerance
-FIRST = 13  # Chebyshev points that a search begins with
-# no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles
+FIT_SHARE = 0.2  # residual of the rational fit, as a share of the tolerance
+CALM = 2  # consecutive new nodes that the fit must predict within the tolerance
+FIRST = 13  # Chebyshev points at the start of a search
+# least spacing of nodes: no lithography resolves 20 pm, and solvers place narrow poles
 # no better
 FINEST_UM = 2e-5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SolvedNodes:
-    """Exact solves of one curve, in the order they were made.
+    """Exact solves of one curve, in the order in which they were computed.
 
-    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver.
-    converged: whether the last nodes were predicted within the tolerance; reason: why
-        the search stopped.
+    diameter_um: (n,) of the pillars.
+    response: (n, 2) complex t and r.
+    error: (n,) error estimate of the solver.
+    converged: whether the last nodes were predicted within the tolerance.
+    reason: why the search stopped.
     """
 
     diameter_um: Array
@@ -39,9 +41,9 @@ class SolvedNodes:
     reason: str = ""
 
     def to_json(self) -> list[Any]:
-        """Lists of numbers, whose text gives the same numbers back."""
+        """Lists of numbers from which :meth:`from_json` restores the nodes exactly."""
         columns = self.diameter_um, self.response.view(float), self.error
-        return [*(one.tolist() for one in columns), self.converged, self.reason]
+        return [*(column.tolist() for column in columns), self.converged, self.reason]
 
     @classmethod
     def from_json(cls, row: list[Any]) -> "SolvedNodes":
@@ -72,13 +74,14 @@ class ResponseCurve:
     tolerance: float
 
     def __call__(self, diameter_um: Array) -> tuple[Array, Array]:
-        """(..., 2) t and r, and (...) error estimate of t, not below the true error.
+        """(..., 2) t and r at diameters in um, and (...) error estimate of t, not below
+        the true error.
 
         The estimate adds the largest disagreement with a rival fit, the residual of the
-        fit, a tenth of the tolerance, and the solver's error: mostly a small shift of
-        the diameter, it is carried from the neighbouring nodes in proportion to the
-        slope of t, no farther than any passive pillar can be. At a node the estimate is
-        the solver's own.
+        fit, a tenth of the tolerance, and the solver's error. The last is mostly a
+        small shift of the diameter: it is carried from the neighbouring nodes in
+        proportion to the slope of t. The estimate is capped at 1 + max(1, |t|), as a
+        pillar is passive. At a node it is the solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -90,44 +93,48 @@ class ResponseCurve:
             raise DomainError(
                 f"diameters {d.min():.6g} to {d.max():.6g} um, the curve holds {x[0]:.6g} to {x[-1]:.6g}"
             )
-        solver = self.nodes.error[order]
-        shift = solver / self._steepness(x)
+        node_error = self.nodes.error[order]
+        shift = node_error / self._steepness(x)
         value = self.best(d)
-        error = self._doubt(d) + np.maximum(
-            shift[right - 1], shift[right]
-        ) * self._steepness(d)
+        larger_shift = np.maximum(shift[right - 1], shift[right])
+        error = self._doubt(d) + larger_shift * self._steepness(d)
         for side in (right - 1, right):
-            hit = x[side] == d
-            value[hit], error[hit] = (
-                self.nodes.response[order[side[hit]]],
-                solver[side[hit]],
-            )
+            at_node = x[side] == d
+            value[at_node] = self.nodes.response[order[side[at_node]]]
+            error[at_node] = node_error[side[at_node]]
         return value, np.minimum(error, 1 + np.maximum(1.0, np.abs(value[..., 0])))
 
     def solver_error(self, diameter_um: Array) -> Array:
-        """(...) of the solver at the better of the two nodes around."""
+        """(...) error of the solver at the better of the two nodes around each
+        diameter.
+        """
         order, right = self._around(diameter_um)
         error = self.nodes.error[order]
         return np.asarray(np.minimum(error[right - 1], error[right]))
 
     def _around(self, diameter_um: Array) -> tuple[Array, Array]:
-        """The nodes from thin to thick, and the place among them of the thicker of the
-        two around each diameter.
+        """(order, right): the order of the nodes by diameter, and the place in that
+        order of the node above each diameter.
         """
         order = np.argsort(self.nodes.diameter_um)
         right = np.searchsorted(self.nodes.diameter_um[order], diameter_um)
         return order, np.clip(right, 1, len(order) - 1)
 
     def _doubt(self, d: Array) -> Array:
+        """(...) largest disagreement of t with a rival fit, plus the residual and a
+        tenth of the tolerance.
+        """
         value = self.best(d)
         doubt = np.max(
             [np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0
         )
-        floor = 0.1 * self.tolerance  # for what no rival shows
+        floor = 0.1 * self.tolerance  # for errors that all fits share
         return np.asarray(doubt + self.best.residual + floor)
 
     def _steepness(self, d: Array) -> Array:
-        """|dt/dD| and what a curve without features would have, 1/um."""
+        """|dt/dD| plus the slope 2 / (largest - least diameter) of a curve without
+        features, 1/um.
+        """
         low = self.nodes.diameter_um.min()
         high = self.nodes.diameter_um.max()
         step = FINEST_UM / 100
@@ -137,11 +144,11 @@ class ResponseCurve:
         return np.asarray(rise + 2 / (high - low))
 
     def resonances(self, half_width_um: float = 0.02) -> Array:
-        """(k, 2) diameter and half-width of the poles nearer to the real axis than
-        ``half_width_um``, um.
+        """(k, 2) diameter and half-width of the poles of t(D) with |imaginary part|
+        below ``half_width_um``, um.
 
-        Poles that a rival fit does not share (within a fifth of their width) carry no
-        meaning and are left out.
+        Poles that a rival fit does not share (within a fifth of their width) are noise
+        and are left out.
         """
         low = self.nodes.diameter_um.min()
         high = self.nodes.diameter_um.max()
@@ -163,8 +170,8 @@ class ResponseCurve:
 def starting_diameters(
     low_um: float, high_um: float, count: int = FIRST
 ) -> list[float]:
-    """Diameters that :func:`sample_adaptively` solves first: Chebyshev points with both
-    ends.
+    """(count) Chebyshev points with both ends, um: the diameters that
+    :func:`sample_adaptively` solves first.
 
     Args:
         low_um: least size, um.
@@ -187,51 +194,58 @@ def sample_adaptively(
     most: int = 80,
     cheaper_um: Array | None = None,
 ) -> SolvedNodes:
-    """Choose diameters one by one and solve them, until the rational fit predicts what
-    comes.
+    """Solve diameters one by one, each where rational fits disagree most, until the fit
+    predicts new solves within the tolerance.
+
+    Stops after two consecutive predicted solves, or after ``most``.
 
     Args:
         solve: exact response at a diameter, on one discretisation (jumps look like
             resonances).
-        first: Chebyshev points to begin with.
-        most: solves at most; where they do not suffice ``converged`` is False.
-        cheaper_um: (any,) diameters that cost less, taken where they tell half as much
-            as the best, or more.
         low_um: least size, um.
         high_um: largest size, um.
         tolerance: deviation at which predictions are accepted.
+        first: Chebyshev points at the start.
+        most: solves at most; where they do not suffice ``converged`` is False.
+        cheaper_um: (any,) diameters that cost less. One is taken where the fits
+            disagree at least half as much as at the best diameter.
     """
     cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
     cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
     x = starting_diameters(low_um, high_um, first)
-    made = [solve(v) for v in x]
-    past: list[RationalFunction] = []
-    calm = 0
-    while calm < CALM and len(x) < most:
-        fit, simpler = _fits(np.array(x), _responses(made), tolerance)
-        where, doubt = _suspect(fit, [simpler, *past[-2:]], np.array(x), cheaper)
-        enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(
-            simpler.support
+    responses = [solve(v) for v in x]
+    earlier_fits: list[RationalFunction] = []
+    predicted = 0
+    while predicted < CALM and len(x) < most:
+        fit, simpler = _fits(np.array(x), _responses(responses), tolerance)
+        place, doubt = _most_doubtful(
+            fit, [simpler, *earlier_fits[-2:]], np.array(x), cheaper
         )
-        still = enough and doubt < tolerance / 2
-        where = _widest_gap(x, cheaper) if still and calm == 0 else where
-        response = solve(where)
-        missed = np.abs(fit(np.array([where]))[0] - (response.t, response.r)).max()
-        x.append(where)
-        made.append(response)
-        past.append(fit)
-        calm = calm + 1 if still and missed < tolerance else 0
+        meets_data = simpler.residual <= FIT_SHARE * tolerance
+        has_spare_pole = len(fit.support) > len(simpler.support)
+        agreed = meets_data and has_spare_pole and doubt < tolerance / 2
+        if agreed and predicted == 0:
+            place = _widest_gap(x, cheaper)
+        response = solve(place)
+        error = np.abs(fit(np.array([place]))[0] - (response.t, response.r)).max()
+        x.append(place)
+        responses.append(response)
+        earlier_fits.append(fit)
+        predicted = predicted + 1 if agreed and error < tolerance else 0
     reason = (
         f"the last {CALM} of {len(x)} solves were predicted within {tolerance:g}"
-        if calm == CALM
+        if predicted == CALM
         else f"{most} solves do not meet {tolerance:g}"
     )
-    errors = np.array([m.t_error for m in made])
-    return SolvedNodes(np.array(x), _responses(made), errors, calm == CALM, reason)
+    errors = np.array([solved.t_error for solved in responses])
+    return SolvedNodes(
+        np.array(x), _responses(responses), errors, predicted == CALM, reason
+    )
 
 
 def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve:
-    """The rational curve through exact solves, and the rivals that judge it.
+    """Rational curve through exact solves, and three rival fits for its error estimate:
+    one of least degree, two without the last nodes.
 
     Args:
         nodes: the exact solves.
@@ -249,8 +263,8 @@ def fit_response_curve(nodes: SolvedNodes, *, tolerance: float) -> ResponseCurve
 def _fits(
     x: Array, y: Array, tolerance: float
 ) -> tuple[RationalFunction, RationalFunction]:
-    """A fit with a pole more than the data ask for, and the fit of least degree that
-    meets them.
+    """(best, simpler) rational fits: simpler is that of least degree which meets the
+    data, best has one pole more.
     """
     simpler = rational.fit_rational_aaa(x, y, tolerance=FIT_SHARE * tolerance)
     best = rational.fit_rational_aaa(
@@ -259,11 +273,21 @@ def _fits(
     return best, simpler
 
 
-def _suspect(
+def _most_doubtful(
     fit: RationalFunction, rivals: list[RationalFunction], x: Array, cheaper: Array
 ) -> tuple[float, float]:
-    """Where the fits disagree most, or nearly so at a cheaper place, and by how much at
-    most; narrow resonances are looked at on their own scale.
+    """(diameter in um, disagreement): the best next diameter, and the largest
+    disagreement of t between the fits.
+
+    Candidates are 1201 even diameters, the cheaper ones, and points around the poles of
+    the fit on the scale of their width. Those too close to a node are left out.
+
+    Args:
+        fit: the present fit.
+        rivals: fits that it is compared with.
+        x: (n,) diameters of the nodes, um.
+        cheaper: (any,) diameters that cost less, taken at half the disagreement or
+            more.
     """
     low, high = x.min(), x.max()
     poles = fit.poles()
@@ -272,37 +296,45 @@ def _suspect(
         & (poles.real < high)
         & (np.abs(poles.imag) < 0.1 * (high - low))
     ]
-    around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
+    offsets = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
     even = np.concatenate([np.linspace(low, high, 1201), cheaper])
-    near = np.concatenate(around)
+    near_poles = np.concatenate(offsets)
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
-    near = near[(near > low) & (near < high) & (_distance(near, x) > FINEST_UM)]
-    places = np.concatenate([even, near])
-    value = fit(places)[:, 0]
-    doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)
+    near_poles = near_poles[
+        (near_poles > low)
+        & (near_poles < high)
+        & (_distance(near_poles, x) > FINEST_UM)
+    ]
+    candidates = np.concatenate([even, near_poles])
+    value = fit(candidates)[:, 0]
+    doubt = np.max(
+        [np.abs(rival(candidates)[:, 0] - value) for rival in rivals], axis=0
+    )
     worst = int(np.argmax(doubt))
-    cheap = np.flatnonzero(np.isin(places, cheaper) & (doubt >= doubt[worst] / 2))
+    cheap = np.flatnonzero(np.isin(candidates, cheaper) & (doubt >= doubt[worst] / 2))
     chosen = cheap[np.argmax(doubt[cheap])] if len(cheap) else worst
-    return float(places[chosen]), float(doubt[worst])
+    return float(candidates[chosen]), float(doubt[worst])
 
 
 def _distance(places: Array, x: Array) -> Array:
+    """(n,) distance of each place from the closest node."""
     return np.asarray(np.abs(places[:, None] - x).min(axis=1, initial=np.inf))
 
 
 def _widest_gap(x: list[float], cheaper: Array) -> float:
-    """The middle of the widest gap, or the cheaper place nearest to it in the middle
-    half.
+    """Middle of the widest gap between the nodes, um, or the closest cheaper diameter
+    within a quarter of the gap.
     """
     ordered = np.sort(x)
     widest = int(np.argmax(np.diff(ordered)))
     middle = (ordered[widest] + ordered[widest + 1]) / 2
     quarter = (ordered[widest + 1] - ordered[widest]) / 4
-    away = np.abs(cheaper - middle)
-    return float(
-        cheaper[np.argmin(away)] if away.min(initial=np.inf) < quarter else middle
-    )
+    distance = np.abs(cheaper - middle)
+    if distance.min(initial=np.inf) < quarter:
+        return float(cheaper[np.argmin(distance)])
+    return float(middle)
 
 
-def _responses(made: list[Response]) -> Array:
-    return np.array([(m.t, m.r) for m in made])
+def _responses(responses: list[Response]) -> Array:
+    """(n, 2) complex t and r."""
+    return np.array([(response.t, response.r) for response in responses])

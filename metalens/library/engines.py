@@ -15,26 +15,23 @@ from metalens.core.arrays import Array
 from metalens.core.errors import CellError
 from metalens.library.curve import FIRST, starting_diameters
 
-PROBES = [
-    4,
-    7,
-    FIRST - 1,
-]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
-# that a curve takes: the one that serves most diameters, and what follows it near a
-# resonance
+# indices in the starting diameters of a curve: 0.25, 0.63 and 1 of the span
+PROBES = [4, 7, FIRST - 1]
+# modal meshes of a curve: one for most diameters, and finer ones near a resonance
 MESHES = 3
 Engine = Literal["auto", "rcwa", "modal"]
 
 
 def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
-    """``modal`` for round pillars on a square lattice (more precise, and faster where
-    upright), ``rcwa`` for others.
-
-    Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
+    """Solver of a cell: ``modal`` for round pillars on a square lattice (more precise,
+    and faster where upright), ``rcwa`` for others.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
         engine: what is asked for: auto, rcwa or modal.
+
+    Raises:
+        CellError: the modal engine for another cell.
     """
     if engine == "modal" and not cell.round:
         raise CellError(
@@ -48,7 +45,8 @@ def choose_engine(cell: Cell, engine: Engine = "auto") -> str:
 def solve_to_tolerance(
     cell: Cell, light: Incidence, *, tolerance: float, engine: str
 ) -> Callable[[float], Response]:
-    """Response at a diameter, refined until its own error estimate meets the tolerance.
+    """Solver of the response at a diameter in um, refined until its own error estimate
+    meets the tolerance.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -66,12 +64,15 @@ def solver_at_fixed_discretization(
     tolerance: float,
     engine: str,
 ) -> Callable[[float], Response]:
-    """As :func:`solve_to_tolerance`, on one discretisation for all diameters of
-    ``span_um``, so far as it goes.
+    """Solver of the response at a diameter, on one discretisation for all diameters of
+    ``span_um`` where possible.
+
+    See :func:`solvers_at_common_discretization`.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
         light: plane wave that comes.
+        span_um: (least, largest) size, um.
         tolerance: error of t that is asked for.
         engine: auto, rcwa or modal.
     """
@@ -88,20 +89,21 @@ def solvers_at_common_discretization(
     tolerance: float,
     engine: str,
 ) -> list[Callable[[float], Response]]:
-    """:func:`solver_at_fixed_discretization` for several lights, on the discretisation
-    that all of them need.
+    """A solver for each light, on the coarsest common discretisation that meets the
+    tolerance at three probe diameters.
 
-    It is the least that meets the tolerance at three probes, which a curve over the
-    span solves anyhow: responses are cached. Elsewhere the error of coupled waves may
-    exceed the tolerance (it is reported), but it has no jumps that a rational fit would
-    take for resonances. Meshes of the modal method need meet it at two of the probes:
-    near a resonance, where the error is many times that elsewhere, the next mesh
-    takes over. The jump there is the true error of the coarser mesh, some tenth of its
-    bar.
+    A curve over the span solves the probes anyhow, and responses are cached. Elsewhere
+    the error of coupled waves may exceed the tolerance (it is reported), but it has no
+    jumps that a rational fit would take for resonances. Meshes of the modal method need
+    to meet it at two of the probes only. Near a resonance, where the error is many
+    times larger, the next mesh takes over. The jump is then the true error of the
+    coarser mesh, about a tenth of its bar.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        lights: plane waves that come.
         span_um: (least, largest) size, um.
+        tolerance: error of t that is asked for.
         engine: auto, rcwa or modal.
     """
     if cell.height_um == 0 or (
@@ -113,72 +115,73 @@ def solvers_at_common_discretization(
             )
             for light in lights
         ]
-    of_lights = [
-        [
-            functools.cache(level)
-            for level in (
-                _modal_levels(cell, light, tolerance)
-                if engine == "modal"
-                else _rcwa_levels(cell, light, span_um[1], tolerance)
-            )
-        ]
+    by_light = [
+        _modal_levels(cell, light, tolerance)
+        if engine == "modal"
+        else _rcwa_levels(cell, light, span_um[1], tolerance)
         for light in lights
     ]
-    levels = list(zip(*of_lights, strict=True))
+    levels = [
+        [functools.cache(solver) for solver in level]
+        for level in zip(*by_light, strict=True)
+    ]
     probes = np.array(starting_diameters(*span_um))[PROBES].tolist()
-    allowed = 1 if engine == "modal" else 0
-    for place, level in enumerate(levels[:-1]):
-        if all(_meets(at, probes, allowed) for at in level):
-            taken = levels[place : place + MESHES] if engine == "modal" else [level]
-            return [_first_converged(meshes) for meshes in zip(*taken, strict=True)]
+    allowed_misses = 1 if engine == "modal" else 0
+    for index, level in enumerate(levels[:-1]):
+        if all(_meets(solver, probes, allowed_misses) for solver in level):
+            chosen = levels[index : index + MESHES] if engine == "modal" else [level]
+            return [_first_converged(meshes) for meshes in zip(*chosen, strict=True)]
     return list(levels[-1])
 
 
 def has_upright_walls(cell: Cell, engine: str) -> bool:
-    """Whether the modal engine solves the pillar by itself: its lights of one direction
-    then share modes and a mesh.
+    """Whether the modal engine solves a pillar with upright walls: lights of one
+    direction then share modes and a mesh.
 
     Args:
         cell: unit cell.
+        engine: rcwa or modal.
     """
     return engine == "modal" and not cell.sidewall_rad
 
 
 def is_at_finest_discretization(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`solver_at_fixed_discretization` took the finest discretisation
-    there is, by the errors of the nodes that came of it (the first ones as a curve
-    begins with): a pillar solved by itself has no less error then.
+    """Whether :func:`solver_at_fixed_discretization` took its finest discretisation: a
+    single solve of a pillar is then no better.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        errors: (n,) of t at the nodes of a curve, the starting diameters first.
         tolerance: error of t that is asked for.
     """
     return not cell.round and bool(errors[PROBES].max() > tolerance)
 
 
-def _meets(at: Callable[[float], Response], probes: list[float], allowed: int) -> bool:
-    """Whether no more probes than are allowed miss the tolerance; no more are solved
-    than it takes to know.
+def _meets(
+    solver: Callable[[float], Response], probes: list[float], allowed: int
+) -> bool:
+    """Whether at most ``allowed`` probe diameters miss the tolerance; stops solving as
+    soon as this is known.
     """
-    missing = (probe for probe in probes if not at(probe).converged)
-    return next(itertools.islice(missing, allowed, None), None) is None
+    misses = (probe for probe in probes if not solver(probe).converged)
+    return next(itertools.islice(misses, allowed, None), None) is None
 
 
 def _first_converged(
     meshes: Sequence[Callable[[float], Response]],
 ) -> Callable[[float], Response]:
-    """Response of the first mesh that meets the tolerance at a diameter, else of the
-    best; remembered.
+    """Solver by the first mesh that meets the tolerance at a diameter, else by the one
+    of least error; responses are cached.
     """
 
     @functools.cache
     def at(diameter_um: float) -> Response:
-        tried = []
+        responses = []
         for mesh in meshes:
-            tried.append(mesh(diameter_um))
-            if tried[-1].converged:
+            responses.append(mesh(diameter_um))
+            if responses[-1].converged:
                 break
-        return min(tried, key=lambda response: response.t_error)
+        return min(responses, key=lambda response: response.t_error)
 
     return at
 
@@ -186,7 +189,7 @@ def _first_converged(
 def _modal_levels(
     cell: Cell, light: Incidence, tolerance: float
 ) -> list[Callable[[float], Response]]:
-    """One level of the modal method each."""
+    """Solvers of the modal method on its meshes, coarsest first."""
     from metalens.modal import LEVELS, case_of, solve_level
 
     def respond(level: int, diameter_um: float) -> Response:
@@ -198,18 +201,26 @@ def _modal_levels(
 def _rcwa_levels(
     cell: Cell, light: Incidence, largest_um: float, tolerance: float
 ) -> list[Callable[[float], Response]]:
-    reaches: tuple[int, ...] = (6, 8, 10, 12, 14)
+    """Solvers by coupled waves, fewest harmonics first.
+
+    Args:
+        largest_um: size that limits the harmonics of shapes that are not round.
+        tolerance: of t; only decides whether a response has converged.
+    """
+    truncations: tuple[int, ...] = (6, 8, 10, 12, 14)
     if not cell.round:
         from metalens.rcwa import most_harmonics
 
         most = most_harmonics(
             cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
         )
-        reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
+        truncations = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
     settings = {"tolerance": tolerance}
     return [
-        functools.partial(_solve, "rcwa", cell, light, settings | {"harmonics": reach})
-        for reach in reaches
+        functools.partial(
+            _solve, "rcwa", cell, light, settings | {"harmonics": harmonics}
+        )
+        for harmonics in truncations
     ]
 
 
@@ -220,7 +231,15 @@ def _solve(
     settings: dict[str, Any],
     diameter_um: float,
 ) -> Response:
-    """One meta-atom by ``modal`` or ``rcwa``, imported where it is used."""
+    """Response of one pillar by ``modal`` or ``rcwa``, imported on use.
+
+    Args:
+        engine: modal or rcwa.
+        cell: unit cell.
+        light: plane wave that comes.
+        settings: keywords of the solver.
+        diameter_um: of the pillar.
+    """
     solver = importlib.import_module(f"metalens.{engine}")
     response: Response = solver.solve(
         cell,

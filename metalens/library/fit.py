@@ -18,10 +18,10 @@ from metalens.library.proxy import Proxy
 from metalens.library.record import PillarLibrary
 
 TURN = 2 * math.pi
-LEAST_ENTRIES = 12  # of a domain
-REACH = 2.0  # half-widths from a narrow resonance that are cut with it
-UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
-# deviation from entries where none is stated, and that of the entries' own bars
+LEAST_ENTRIES = 12  # diameters in a domain
+REACH = 2.0  # half-widths on either side of a narrow resonance that are excluded
+UNKNOWN = 0.5  # largest error bar of a usable entry, as a share of |t|
+# default tolerances: an absolute deviation, and a share of the entries' error bars
 FOLLOWED, KNOWN_SHARE = 1e-3, 0.5
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
@@ -51,19 +51,22 @@ class ProxyTolerances:
 
     @property
     def tolerances(self) -> tuple[float, float]:
-        """Of phase (rad) and |T|."""
+        """Tolerances of phase (rad) and |T|; 1e-3 where none is set."""
         return (
             self.phase_tolerance_rad or FOLLOWED,
             self.transmission_tolerance or FOLLOWED,
         )
 
     def with_defaults(self, entry_error: float) -> "ProxyTolerances":
-        """What is left out, by the errors of the entries themselves: no curve need
-        follow what is not known.
+        """Tolerances with missing values filled in: 1e-3, or half the error of the
+        entries where that is more.
+
+        Args:
+            entry_error: root-mean-square error bar of t, relative to |t|.
         """
-        usual = max(FOLLOWED, KNOWN_SHARE * entry_error)
-        phase = self.phase_tolerance_rad or usual
-        level = self.transmission_tolerance or usual
+        default = max(FOLLOWED, KNOWN_SHARE * entry_error)
+        phase = self.phase_tolerance_rad or default
+        level = self.transmission_tolerance or default
         return dataclasses.replace(
             self, phase_tolerance_rad=phase, transmission_tolerance=level
         )
@@ -71,7 +74,12 @@ class ProxyTolerances:
 
 @dataclass(frozen=True, slots=True)
 class FitTrial:
-    """One line of the table of error against coefficients."""
+    """Errors of a proxy with a given number of coefficients, for the table of a fit.
+
+    coefficients: of phase and |T| together.
+    power: the polynomials run in diameter^power.
+    phase_error_rad, transmission_error: largest deviation from the entries.
+    """
 
     coefficients: int
     power: int
@@ -81,17 +89,17 @@ class FitTrial:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProxyFit:
-    """A proxy and why it is as it is.
+    """A proxy with the limits of its domain and its errors.
 
-    notes: where its domain was cut, and why. table: error against the number of
-        coefficients on that domain.
-    turns: covered by the domain, the least over wavelengths and angles.
-    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their
-        mean.
-    shortfall: by how much the proxy misses the tolerances that were wanted, for a
-        person; empty where it meets them.
-    smooth_turns: covered by the diameters without resonance, as far as the proxy or
-        not.
+    proxy: the polynomials.
+    notes: where the domain was cut, and the reasons.
+    table: error against the number of coefficients on that domain.
+    turns: phase range of the domain, the least over wavelengths and angles.
+    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy describes
+        their mean.
+    shortfall: message on tolerances that the proxy misses; empty where it meets them.
+    smooth_turns: phase range of all diameters without resonance, also outside the
+        domain.
     """
 
     proxy: Proxy
@@ -110,9 +118,9 @@ class MonotonicBranch:
     phase: (angle, wavelength, diameter) rad, unwrapped along every axis.
     level: |t|, as phase.
     diameter_um, wavelength_um, angle_rad: the axes.
-    notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
-        their mean.
-    gaps_um: (least, largest) diameters inside the stretch around narrow resonances,
+    notes: what bounds the diameters.
+    polarization_spread: largest |t_s - t_p| / 2; phase and level are of their mean.
+    gaps_um: (least, largest) diameters around narrow resonances inside the branch,
         which no pillar of a lens should have.
     """
 
@@ -126,7 +134,7 @@ class MonotonicBranch:
     gaps_um: tuple[tuple[float, float], ...] = ()
 
     def part(self, some: slice) -> "MonotonicBranch":
-        """The same of some diameters."""
+        """The branch restricted to a slice of its diameters."""
         return dataclasses.replace(
             self,
             phase=self.phase[..., some],
@@ -136,48 +144,51 @@ class MonotonicBranch:
 
     @property
     def turns(self) -> float:
-        """Covered at every wavelength and angle."""
+        """Phase range over the diameters in turns, the least over wavelengths and
+        angles.
+        """
         return float(abs(self.phase[..., -1] - self.phase[..., 0]).min() / TURN)
 
 
 def longest_monotonic_branch(
     library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool = False
 ) -> MonotonicBranch:
-    """The stretch of most phase over which, at all wavelengths, angles and
-    polarisations, |t| stays above ``least_transmission``, the phase rises (of openings,
-    which leave less film the wider they are, falls), and no resonance is narrower than
-    ``least_half_width_um`` and no error bar above half of |t|.
+    """The run of diameters that covers most phase without a fault.
+
+    A fault is, at any wavelength, angle or polarisation: |t| below
+    ``least_transmission``, an error bar above half of |t|, a resonance narrower than
+    ``least_half_width_um``, or a phase that falls with the diameter. For openings,
+    which leave less film the wider they are, it is a phase that rises.
 
     Args:
         library: the swept cell.
-        wanted: limits of the stretch.
-        across_resonances: it goes on behind narrow resonances, without the entries
-            nearer to one than ``least_half_width_um`` or two half-widths.
+        wanted: limits of the run.
+        across_resonances: the run may cross narrow resonances. Entries closer to one
+            than ``least_half_width_um`` or two half-widths are then left out.
 
     Raises:
-        DomainError: fewer than 12 entries in any such stretch; the message says what is
-            in the way.
+        DomainError: no such run holds 12 entries; the message states the faults.
     """
     low, high = wanted.within_um or (0.0, np.inf)
     d = library.diameter_um
     inside = (d >= low - 1e-9) & (d <= high + 1e-9)
-    sharp = [
+    narrow = [
         (angle, wavelength, centre, width)
         for _, angle, wavelength, centre, width in library.resonances.tolist()
         if width < wanted.least_half_width_um
         and inside.any()
         and d[inside][0] <= centre <= d[inside][-1]
     ]
-    gaps = _gaps(sharp, wanted.least_half_width_um) if across_resonances else ()
-    for least, largest in gaps:
-        inside &= (d < least) | (d > largest)
+    gaps = _gaps(narrow, wanted.least_half_width_um) if across_resonances else ()
+    for start, end in gaps:
+        inside &= (d < start) | (d > end)
     d = d[inside]
     t = library.t[..., inside]
     bars = library.t_error[..., inside]
     faults = _faults(library, d, t, bars, wanted.least_transmission)
-    faults += [] if gaps else [_near_resonance(d, *one) for one in sharp]
-    bad = np.any([mask for mask, _ in faults], axis=0)
-    runs = [run for run in find_runs(~bad) if run.stop - run.start >= LEAST_ENTRIES]
+    faults += [] if gaps else [_near_resonance(d, *resonance) for resonance in narrow]
+    faulty = np.any([mask for mask, _ in faults], axis=0)
+    runs = [run for run in find_runs(~faulty) if run.stop - run.start >= LEAST_ENTRIES]
     if not runs:
         reasons = "; ".join(text for mask, text in faults if mask.any())
         raise DomainError(
@@ -190,29 +201,35 @@ def longest_monotonic_branch(
         return float(abs(phase[..., run.stop - 1] - phase[..., run.start]).min())
 
     best = max(runs, key=covered)
-    mean = t.mean(axis=0)[..., best]
-    words = [
+    mean_t = t.mean(axis=0)[..., best]  # over the polarisations
+    gap_notes = [
         f"passes over a narrow resonance between {a:.4f} and {b:.4f} um"
         for a, b in gaps
     ]
     return MonotonicBranch(
-        _unwrapped(np.angle(mean)),
-        np.abs(mean),
+        _unwrapped(np.angle(mean_t)),
+        np.abs(mean_t),
         d[best],
         library.wavelength_um,
         library.angle_rad,
-        (*_ends(best, d, faults), *words),
+        (*_ends(best, d, faults), *gap_notes),
         float(np.abs(t[0] - t[-1])[..., best].max()) / 2,
         tuple((a, b) for a, b in gaps if a < d[best][-1] and b > d[best][0]),
     )
 
 
 def _gaps(
-    sharp: Sequence[tuple[float, ...]], half_width: float
+    narrow: Sequence[tuple[float, ...]], half_width: float
 ) -> tuple[tuple[float, float], ...]:
-    """Diameters too near to a narrow resonance, joined where they overlap."""
+    """(least, largest) diameters excluded around narrow resonances, um; overlapping
+    intervals are merged.
+
+    Args:
+        narrow: (angle, wavelength, centre, half-width) of each resonance, rad and um.
+        half_width: least half-width of an interval, um.
+    """
     gaps: list[tuple[float, float]] = []
-    for _, _, centre, width in sorted(sharp, key=lambda one: one[2]):
+    for _, _, centre, width in sorted(narrow, key=lambda resonance: resonance[2]):
         reach = max(half_width, REACH * width)
         low, high = centre - reach, centre + reach
         if gaps and low <= gaps[-1][1]:
@@ -224,194 +241,217 @@ def _gaps(
 def _faults(
     library: PillarLibrary, d: Array, t: Array, bars: Array, least: float
 ) -> list[tuple[Array, str]]:
-    """(mask over the diameters, what is wrong there)."""
-    level, phase = np.abs(t), np.unwrap(np.angle(t), axis=-1)
+    """(mask, reason) of each kind of fault over the diameters.
+
+    Args:
+        d: (n,) diameters, um.
+        t: (polarization, angle, wavelength, n) complex amplitudes.
+        bars: error bars, as t.
+        least: smallest |t| that is accepted.
+    """
+    level = np.abs(t)
+    phase = np.unwrap(np.angle(t), axis=-1)
     hole = library.cell.shape.hole
-    dark = np.asarray((level < least).any(axis=(0, 1, 2)))
-    unknown = np.asarray((bars > UNKNOWN * level).any(axis=(0, 1, 2)))
-    turns = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
-    back = np.zeros(len(d), bool)
-    back[1:] |= turns
-    back[:-1] |= turns
-    wrong = (
+    too_weak = np.asarray((level < least).any(axis=(0, 1, 2)))
+    uncertain = np.asarray((bars > UNKNOWN * level).any(axis=(0, 1, 2)))
+    reversal = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
+    reversed_phase = np.zeros(len(d), bool)
+    reversed_phase[1:] |= reversal
+    reversed_phase[:-1] |= reversal
+    reversal_reason = (
         "the phase rises with the size of the opening"
         if hole
         else "the phase falls with the diameter"
     )
     return [
-        (dark, f"|t| falls to {level.min():.2f}, below {least:g}"),
-        (unknown, f"error bars reach {bars.max():.2g}, above half of |t|"),
-        (back, wrong),
+        (too_weak, f"|t| falls to {level.min():.2f}, below {least:g}"),
+        (uncertain, f"error bars reach {bars.max():.2g}, above half of |t|"),
+        (reversed_phase, reversal_reason),
     ]
 
 
 def _near_resonance(
     d: Array, angle: float, wavelength: float, centre: float, width: float
 ) -> tuple[Array, str]:
-    """As :func:`_faults`, of a narrow resonance: the diameters near it, and those on
-    either side.
+    """(mask, reason) of one narrow resonance: diameters within two half-widths, and the
+    entries next to it on either side.
     """
-    near = np.abs(d - centre) <= REACH * width
-    after = int(np.searchsorted(d, centre))
-    near[[max(0, after - 1), after]] = True
+    mask = np.abs(d - centre) <= REACH * width
+    next_entry = int(np.searchsorted(d, centre))
+    mask[[max(0, next_entry - 1), next_entry]] = True
     text = f"resonance at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({wavelength:g} um"
-    return near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")
+    return mask, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")
 
 
 def find_runs(good: Array) -> list[slice]:
-    """Places of the runs of True."""
+    """Slices of the runs of consecutive True values."""
     edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return [slice(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
 def _ends(run: slice, d: Array, faults: list[tuple[Array, str]]) -> tuple[str, ...]:
+    """What bounds a run on either side, in words.
+
+    Args:
+        run: places of its diameters.
+        d: (n,) all diameters, um.
+        faults: (mask, reason) over d.
+    """
     notes = []
-    for place, edge in ((run.start - 1, run.start), (run.stop, run.stop - 1)):
-        if 0 <= place < len(d):
-            why = "; ".join(text for mask, text in faults if mask[place])
-            notes.append(f"cut at {d[edge]:.4f} um: {why}")
+    for outside, edge in ((run.start - 1, run.start), (run.stop, run.stop - 1)):
+        if 0 <= outside < len(d):
+            reasons = "; ".join(text for mask, text in faults if mask[outside])
+            notes.append(f"cut at {d[edge]:.4f} um: {reasons}")
     return tuple(notes)
 
 
 def _unwrapped(phase: Array) -> Array:
-    """Unwrapped along the diameter, then neighbouring wavelengths and angles at the
-    thinnest pillar.
+    """Phase unwrapped along the diameter, then along wavelength and angle at the least
+    diameter, rad.
     """
     phase = np.unwrap(phase, axis=-1)
     for axis in (1, 0):
-        start = phase[..., :1]
-        phase = phase + (np.unwrap(start, axis=axis) - start)
+        first = phase[..., :1]
+        phase = phase + (np.unwrap(first, axis=axis) - first)
     return phase
 
 
 def fit(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> ProxyFit:
-    """The proxy of a library.
+    """Polynomial proxy of a library, by minimax fits of phase and |T| in
+    diameter^power.
 
-    Every other diameter is fitted (least largest deviation, by Lawson's weights), all
-    are judged: half of them the fit never saw. The phase is monotone, as the library's
-    is. Phase and |T| have their own polynomials in diameter^power; |T| is scaled until
-    its certified bound lies below 1. Where so few entries allow only a domain that
-    misses the tolerances, ``shortfall`` says so.
+    Every other diameter is fitted (least largest deviation, by Lawson's weights); the
+    errors are taken over all of them. The phase is monotone, as the library's is. |T|
+    is scaled until its certified bound lies below 1. Where the entries are too few for
+    the tolerances, ``shortfall`` says so.
 
     Args:
         wanted: tolerances and limits of the fit.
 
     Raises:
-        DomainError: no stretch of diameters without resonance holds enough entries.
+        DomainError: no run of diameters without resonance holds enough entries.
     """
     wanted = wanted or ProxyTolerances()
     if library.sweep.light == "circular":
         return _fit_converted(library, wanted)
-    found = _fit_branch(library, wanted, across_resonances=False)
+    one_side = _fit_branch(library, wanted, across_resonances=False)
     if any(width < wanted.least_half_width_um for *_, width in library.resonances):
         with contextlib.suppress(DomainError):
-            across = _fit_branch(library, wanted, across_resonances=True)
-            crosses = bool(across.proxy.gaps_um) and not across.shortfall
-            if crosses and across.turns > found.turns:
-                return across
-    return found
+            crossing = _fit_branch(library, wanted, across_resonances=True)
+            crosses = bool(crossing.proxy.gaps_um) and not crossing.shortfall
+            if crosses and crossing.turns > one_side.turns:
+                return crossing
+    return one_side
 
 
 def _fit_branch(
-    library: PillarLibrary, wanted: ProxyTolerances, *, across_resonances: bool
+    library: PillarLibrary, limits: ProxyTolerances, *, across_resonances: bool
 ) -> ProxyFit:
-    """The proxy on one side of all narrow resonances, or across them."""
-    data = longest_monotonic_branch(
-        library, wanted, across_resonances=across_resonances
+    """Proxy of the longest monotonic branch, and its table of error against
+    coefficients.
+
+    Args:
+        across_resonances: whether the branch may cross narrow resonances.
+    """
+    branch = longest_monotonic_branch(
+        library, limits, across_resonances=across_resonances
     )
-    wanted = wanted.with_defaults(entry_error(library, data.diameter_um))
-    kept, proxy, terms = _choose_coefficients(data, wanted)
+    limits = limits.with_defaults(entry_error(library, branch.diameter_um))
+    domain, proxy, terms = _choose_coefficients(branch, limits)
     low, high = proxy.domain_um
     proxy = dataclasses.replace(
         proxy,
-        entry_error=entry_error(library, kept.diameter_um),
-        gaps_um=tuple((a, b) for a, b in data.gaps_um if low < a and b < high),
+        entry_error=entry_error(library, domain.diameter_um),
+        gaps_um=tuple((a, b) for a, b in branch.gaps_um if low < a and b < high),
     )
-    counts = range(4, max(18, 2 * terms + 5), 2)
+    coefficient_counts = range(4, max(18, 2 * terms + 5), 2)
     trials = (
-        _trial(kept, proxy.power, count)
-        for count in counts
-        if count // 2 < len(kept.diameter_um) // 3
+        _trial(domain, proxy.power, count)
+        for count in coefficient_counts
+        if count // 2 < len(domain.diameter_um) // 3
     )
-    notes = data.notes
-    if len(kept.diameter_um) < len(data.diameter_um):
+    notes = branch.notes
+    if len(domain.diameter_um) < len(branch.diameter_um):
         notes += (
-            f"cut at {kept.diameter_um[-1]:.4f} um: up to {data.diameter_um[-1]:.4f} um the phase is smooth, but "
+            f"cut at {domain.diameter_um[-1]:.4f} um: up to {branch.diameter_um[-1]:.4f} um the phase is smooth, but "
             f"{2 * terms} coefficients do not describe it within the tolerances",
         )
-    short = (
+    shortfall = (
         TURNS_BACK
-        if math.isinf(_cost(proxy, wanted))
-        else tolerance_shortfall(proxy, wanted)
+        if math.isinf(_cost(proxy, limits))
+        else tolerance_shortfall(proxy, limits)
     )
     return ProxyFit(
         proxy,
         notes,
         tuple(trial for trial in trials if trial is not None),
-        kept.turns,
-        data.polarization_spread,
-        short,
-        data.turns,
+        domain.turns,
+        branch.polarization_spread,
+        shortfall,
+        branch.turns,
     )
 
 
 def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
-    """Root mean square of the error bars of t, relative to |t|, of the entries at some
-    of a library's diameters.
+    """Root-mean-square error bar of t, relative to |t|, over the entries at some
+    diameters of a library.
 
     Args:
+        library: the swept cell.
         diameter_um: of the entries, um.
     """
-    some = np.isin(library.diameter_um, diameter_um)
-    return float(
-        np.sqrt(np.mean((library.t_error / np.abs(library.t))[..., some] ** 2))
-    )
+    selected = np.isin(library.diameter_um, diameter_um)
+    relative = (library.t_error / np.abs(library.t))[..., selected]
+    return float(np.sqrt(np.mean(relative**2)))
 
 
 def _choose_coefficients(
-    data: MonotonicBranch, wanted: ProxyTolerances
+    branch: MonotonicBranch, limits: ProxyTolerances
 ) -> tuple[MonotonicBranch, Proxy, int]:
-    """The domain that a proxy follows, and its number of coefficients: those wanted;
-    more where a full turn takes them; fewer where so few entries let those wanted swing
-    between them.
+    """(domain, proxy, terms): the domain that a proxy follows, and its number of
+    coefficients for phase and for |T| each.
+
+    Starts from half of ``limits.coefficients``. Takes more where a full turn needs
+    them, fewer where the polynomial oscillates between too few entries. Cuts the last
+    diameters where the tolerances are still missed.
     """
-    terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter_um) // 3)
-    kept, proxy = _longest_domain(data, wanted, terms)
-    while more < 24 and kept.turns < 1 <= data.turns:
+    terms = more = min(max(2, limits.coefficients // 2), len(branch.diameter_um) // 3)
+    domain, proxy = _longest_domain(branch, limits, terms)
+    while more < 24 and domain.turns < 1 <= branch.turns:
         more += 2
-        with contextlib.suppress(
-            DomainError
-        ):  # more coefficients than so few entries bear: those before stand
-            longer, better = _longest_domain(data, wanted, more)
-            if _cost(better, wanted) <= 1 and len(longer.diameter_um) > len(
-                kept.diameter_um
-            ):
-                kept, proxy, terms = longer, better, more
-    for fewer in range(terms - 1, 1, -1) if _cost(proxy, wanted) > 1 else ():
-        other = _best_power(kept, wanted, fewer)
-        if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
-            proxy, terms = other, fewer
-    shorter = (
-        _cut_last_diameters(kept, wanted, terms) if _cost(proxy, wanted) > 1 else None
-    )
-    return shorter or (kept, proxy, terms)
+        # so many coefficients may take |T| below 0: then the last result stands
+        with contextlib.suppress(DomainError):
+            longer_domain, longer_proxy = _longest_domain(branch, limits, more)
+            is_longer = len(longer_domain.diameter_um) > len(domain.diameter_um)
+            if _cost(longer_proxy, limits) <= 1 and is_longer:
+                domain, proxy, terms = longer_domain, longer_proxy, more
+    if _cost(proxy, limits) <= 1:
+        return domain, proxy, terms
+    for fewer in range(terms - 1, 1, -1):
+        candidate = _best_power(domain, limits, fewer)
+        if candidate is not None and _cost(candidate, limits) < _cost(proxy, limits):
+            proxy, terms = candidate, fewer
+    if _cost(proxy, limits) <= 1:
+        return domain, proxy, terms
+    return _cut_last_diameters(domain, limits, terms) or (domain, proxy, terms)
 
 
 def _cut_last_diameters(
-    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
 ) -> tuple[MonotonicBranch, Proxy, int] | None:
-    """Without the last diameters, next to what bounds the domain, where the tolerances
-    are met so; they are excluded as the resonance is, up to a tenth of the phase. None
-    where that is not enough.
+    """(domain, proxy, terms) without the last diameters, next to the fault that ends
+    the branch, where this meets the tolerances.
+
+    At most a tenth of the phase is cut; None where that is not enough.
     """
-    for count in range(len(data.diameter_um) - 1, LEAST_ENTRIES - 1, -1):
-        some = data.part(slice(count))
-        if some.turns < 0.9 * data.turns:
+    for count in range(len(branch.diameter_um) - 1, LEAST_ENTRIES - 1, -1):
+        domain = branch.part(slice(count))
+        if domain.turns < 0.9 * branch.turns:
             return None
         fewer = min(terms, count // 3)
-        other = _best_power(some, wanted, fewer)
-        if other is not None and _cost(other, wanted) <= 1:
-            return some, other, fewer
+        candidate = _best_power(domain, limits, fewer)
+        if candidate is not None and _cost(candidate, limits) <= 1:
+            return domain, candidate, fewer
     return None
 
 
@@ -426,7 +466,7 @@ def fit_proxy(library: PillarLibrary, wanted: ProxyTolerances | None = None) -> 
 
 
 def proxy_of(library: PillarLibrary) -> Proxy:
-    """The proxy that a library holds, fitted now where it holds none.
+    """The stored proxy of a library, or a newly fitted one where none is stored.
 
     Raises:
         DomainError: no proxy fits.
@@ -435,36 +475,43 @@ def proxy_of(library: PillarLibrary) -> Proxy:
 
 
 def _longest_domain(
-    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
 ) -> tuple[MonotonicBranch, Proxy]:
-    """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
-    tolerances.
+    """(domain, proxy) of the longest domain from the least diameter on which ``terms``
+    coefficients meet the tolerances.
+
+    Bisection in the number of diameters, from 3 ``terms`` of them to all.
+
+    Raises:
+        DomainError: no polynomial stays between 0 and 1 even on the shortest domain.
     """
-    good = min(len(data.diameter_um), 3 * terms)
-    bad = len(data.diameter_um) + 1
-    best = _best_power(data.part(slice(good)), wanted, terms)
+    fitted = min(len(branch.diameter_um), 3 * terms)
+    too_many = len(branch.diameter_um) + 1
+    best = _best_power(branch.part(slice(fitted)), limits, terms)
     if best is None:
         raise DomainError(
             f"no polynomial of {terms} coefficients follows the library between 0 and 1 even up to "
-            f"{data.diameter_um[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
+            f"{branch.diameter_um[fitted - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
         )
-    while bad - good > 1:
-        middle = (
-            (good + bad + 1) // 2 if bad > len(data.diameter_um) else (good + bad) // 2
+    while too_many - fitted > 1:
+        count = (
+            (fitted + too_many + 1) // 2
+            if too_many > len(branch.diameter_um)
+            else (fitted + too_many) // 2
         )
-        trial = _best_power(data.part(slice(middle)), wanted, terms)
-        if trial is not None and _cost(trial, wanted) <= 1:
-            good, best = middle, trial
+        trial = _best_power(branch.part(slice(count)), limits, terms)
+        if trial is not None and _cost(trial, limits) <= 1:
+            fitted, best = count, trial
         else:
-            bad = middle
-    return data.part(slice(good)), best
+            too_many = count
+    return branch.part(slice(fitted)), best
 
 
 def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
-    """By how much a proxy misses its tolerances, for a person; empty where it meets
-    them.
+    """Message on how far a proxy misses its tolerances; empty where it meets them.
 
     Args:
+        proxy: phase and |T| over the diameter.
         wanted: tolerances and limits of the fit.
     """
     if tolerance_ratio(proxy, wanted) <= 1:
@@ -478,7 +525,7 @@ def tolerance_shortfall(proxy: Proxy, wanted: ProxyTolerances) -> str:
 
 
 def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
-    """The larger error in units of its tolerance.
+    """The larger of phase error and |T| error, each over its tolerance.
 
     Args:
         proxy: phase and |T| over the diameter.
@@ -489,91 +536,111 @@ def tolerance_ratio(proxy: Proxy, wanted: ProxyTolerances) -> float:
 
 
 def _best_power(
-    data: MonotonicBranch, wanted: ProxyTolerances, terms: int
+    branch: MonotonicBranch, limits: ProxyTolerances, terms: int
 ) -> Proxy | None:
-    """Of the powers of the diameter, the one with the least error in units of the
-    tolerances; None where each takes |T| below 0 between the entries.
+    """Proxy in diameter, its square or its cube, whichever has the least error in units
+    of the tolerances; None where each takes |T| below 0 between the entries.
     """
-    found = []
+    proxies = []
     for power in (3, 2, 1):
         with contextlib.suppress(DomainError):
-            found.append(fit_terms(data, power, terms))
-    return min(found, key=lambda proxy: _cost(proxy, wanted), default=None)
+            proxies.append(fit_terms(branch, power, terms))
+    return min(proxies, key=lambda proxy: _cost(proxy, limits), default=None)
 
 
-def _cost(proxy: Proxy, wanted: ProxyTolerances) -> float:
-    """As :func:`tolerance_ratio`; infinite where the phase turns back (the library's
-    does not).
+def _cost(proxy: Proxy, limits: ProxyTolerances) -> float:
+    """:func:`tolerance_ratio`, or infinity where the phase is not monotone (the
+    library's is); tested at the ends and the middle of the wavelengths and at both
+    end angles.
     """
-    middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
+    wavelengths_um = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
     monotone = all(
-        proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}
+        proxy.monotone(wavelength, angle)
+        for wavelength in wavelengths_um
+        for angle in {0.0, proxy.max_angle_rad}
     )
-    return tolerance_ratio(proxy, wanted) if monotone else math.inf
+    return tolerance_ratio(proxy, limits) if monotone else math.inf
 
 
 def fit_terms(data: MonotonicBranch, power: int, terms: int) -> Proxy:
-    """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
-    many for |T|.
+    """Proxy with ``terms`` coefficients in diameter^power for the phase, and as many
+    for |T|, by minimax fits to every other diameter.
 
     Args:
-        data: phase and |T| of the entries.
+        data: phase and |T| of the entries; the errors are the largest over all of them.
     """
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
     level = _minimax(axes, data.level, terms)
-    high = polynomial.certified_bounds(level, points=64 if level.size > terms else 512)[
-        1
-    ]
-    if high > 1 - HEADROOM:
-        level = level * ((1 - HEADROOM) / high)
+    points = 64 if level.size > terms else 512
+    _, upper_bound = polynomial.certified_bounds(level, points=points)
+    if upper_bound > 1 - HEADROOM:
+        level = level * ((1 - HEADROOM) / upper_bound)
     errors = [
-        float(np.abs(_evaluate(axes, c) - values).max())
-        for c, values in ((phase, data.phase), (level, data.level))
+        float(np.abs(_evaluate(axes, coefficients) - values).max())
+        for coefficients, values in ((phase, data.phase), (level, data.level))
     ]
-    flat = len(data.angle_rad) == 1
+    one_angle = len(data.angle_rad) == 1
     return Proxy(
-        phase[0] if flat else phase,
-        level[0] if flat else level,
+        phase[0] if one_angle else phase,
+        level[0] if one_angle else level,
         (float(data.diameter_um[0]), float(data.diameter_um[-1])),
         (float(data.wavelength_um[0]), float(data.wavelength_um[-1])),
         errors[0],
         errors[1],
         power,
-        0.0 if flat else float(data.angle_rad[-1]),
+        0.0 if one_angle else float(data.angle_rad[-1]),
     )
 
 
-def _axes(data: MonotonicBranch, power: int) -> tuple[Array, Array, Array]:
-    """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does."""
-    sine = np.sin(data.angle_rad) ** 2
+def _axes(branch: MonotonicBranch, power: int) -> tuple[Array, Array, Array]:
+    """Angle, wavelength and diameter mapped to [-1, 1] as :class:`Proxy` does: linear
+    in sin² angle, wavelength and diameter^power.
+    """
+    sine_squared = np.sin(branch.angle_rad) ** 2
     return (
-        2 * sine / sine[-1] - 1 if len(sine) > 1 else np.zeros(1),
-        _unit(data.wavelength_um) if len(data.wavelength_um) > 1 else np.zeros(1),
-        _unit(data.diameter_um**power),
+        2 * sine_squared / sine_squared[-1] - 1
+        if len(sine_squared) > 1
+        else np.zeros(1),
+        _unit(branch.wavelength_um) if len(branch.wavelength_um) > 1 else np.zeros(1),
+        _unit(branch.diameter_um**power),
     )
 
 
 def _unit(values: Array) -> Array:
+    """Rising values mapped linearly to [-1, 1]."""
     return np.asarray((2 * values - values[0] - values[-1]) / (values[-1] - values[0]))
 
 
 def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
-    a, w, d = (
+    """(angle, wavelength, diameter) values of a tensor Chebyshev sum on three axes."""
+    angle_basis, wavelength_basis, diameter_basis = (
         chebyshev.chebvander(x, n - 1)
         for x, n in zip(axes, coefficients.shape, strict=True)
     )
     return np.asarray(
-        np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True)
+        np.einsum(
+            "ai,wj,dk,ijk->awd",
+            angle_basis,
+            wavelength_basis,
+            diameter_basis,
+            coefficients,
+            optimize=True,
+        )
     )
 
 
 def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
-    """Tensor coefficients: every curve by itself in the diameter, then its coefficients
-    in wavelength and angle.
+    """([angle, wavelength, diameter] degree + 1) Chebyshev coefficients of least
+    largest deviation in the diameter.
 
-    Up to five wavelengths or angles are met exactly by polynomials of them, more by
-    least squares.
+    Each curve is fitted by itself in the diameter, then its coefficients in wavelength
+    and angle: up to five values of those are met exactly, more by least squares.
+
+    Args:
+        axes: angle, wavelength and diameter in [-1, 1].
+        values: (angle, wavelength, diameter) that are fitted, at every other diameter.
+        terms: coefficients in the diameter.
     """
     curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
     for axis in (0, 1):
@@ -585,29 +652,37 @@ def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Arr
 
 
 def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
-    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson
-    1961: weights times deviation).
+    """(..., terms) coefficients of least largest deviation, by Lawson's iteration
+    (1961): weighted least squares, with weights multiplied by the deviations in each
+    round.
+
+    Args:
+        basis: (n, terms) basis functions at the points.
+        values: (..., n) that are fitted.
+        rounds: number of iterations; the best of them is returned.
     """
     weight = np.ones(values.shape)
     best = np.zeros((*values.shape[:-1], basis.shape[1]))
-    least = np.full(values.shape[:-1], np.inf)
+    least_deviation = np.full(values.shape[:-1], np.inf)
     for _ in range(rounds):
         root = np.sqrt(weight)[..., None]
         q, r = np.linalg.qr(basis * root)
-        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[
-            ..., 0
-        ]
-        off = np.abs(np.einsum("nk,...k->...n", basis, c) - values)
-        worst = off.max(axis=-1)
-        better = worst < least
-        best[better], least[better] = c[better], worst[better]
-        weight *= off / np.maximum(worst, 1e-300)[..., None] + 1e-9
+        projected = np.swapaxes(q, -1, -2) @ (values[..., None] * root)
+        coefficients = np.linalg.solve(r, projected)[..., 0]
+        deviation = np.abs(np.einsum("nk,...k->...n", basis, coefficients) - values)
+        largest = deviation.max(axis=-1)
+        better = largest < least_deviation
+        best[better] = coefficients[better]
+        least_deviation[better] = largest[better]
+        weight *= deviation / np.maximum(largest, 1e-300)[..., None] + 1e-9
         weight /= weight.sum(axis=-1, keepdims=True)
     return best
 
 
 def _trial(data: MonotonicBranch, power: int, coefficients: int) -> FitTrial | None:
-    """One line of the table; None where |T| falls below 0 between the entries."""
+    """Errors of a proxy with this many coefficients in total; None where |T| falls
+    below 0 between the entries.
+    """
     try:
         proxy = fit_terms(data, power, coefficients // 2)
     except DomainError:
@@ -617,78 +692,82 @@ def _trial(data: MonotonicBranch, power: int, coefficients: int) -> FitTrial | N
     )
 
 
-def _fit_converted(library: PillarLibrary, wanted: ProxyTolerances) -> ProxyFit:
-    """The proxy of the light converted to the other hand, (t_x - t_y)/2, on the widest
-    run of sizes around the best one that meets the tolerances.
+def _fit_converted(library: PillarLibrary, limits: ProxyTolerances) -> ProxyFit:
+    """Proxy of the light converted to the other hand, (t_x - t_y)/2, on the widest run
+    of sizes around the best one that meets the tolerances.
 
-    Pillars of such a lens may all have one size: their turn carries the phase, and the
-    proxy tells what another size does (bias, tolerance).
+    Pillars of such a lens may all have one size: their turn carries the phase. The
+    proxy describes what another size does (bias, tolerance).
 
     Raises:
         DomainError: fewer than 12 sizes without resonance around the best one.
     """
-    t, d = library.cross_polarized, library.diameter_um
+    t = library.cross_polarized
+    d = library.diameter_um
     middle = int(np.searchsorted(d, library.best_converting_um))
-    least = 0.85 * np.abs(t[:, middle]).min()  # of the largest conversion
-    good = (np.abs(t).min(axis=0) >= least) & ~_sharp(
-        library, wanted.least_half_width_um
-    )
-    if wanted.within_um is not None:
-        good &= (d >= wanted.within_um[0]) & (d <= wanted.within_um[1])
-    around = (run for run in find_runs(good) if run.start <= middle < run.stop)
-    run = next(around, slice(0, 0))
+    conversion = np.abs(t[:, middle]).min()
+    good = np.abs(t).min(axis=0) >= 0.85 * conversion
+    good &= ~_near_narrow_resonances(library, limits.least_half_width_um)
+    if limits.within_um is not None:
+        good &= (d >= limits.within_um[0]) & (d <= limits.within_um[1])
+    runs = (run for run in find_runs(good) if run.start <= middle < run.stop)
+    run = next(runs, slice(0, 0))  # empty where the best size itself is excluded
     if run.stop - run.start < LEAST_ENTRIES:
         raise DomainError(
             f"fewer than {LEAST_ENTRIES} sizes around {d[middle]:.4g} um, where most light is converted "
-            f"({np.abs(t[:, middle]).min() ** 2:.0%}), are free of resonances: sweep with more samples, or another cell"
+            f"({conversion**2:.0%}), are free of resonances: sweep with more samples, or another cell"
         )
     phase = np.unwrap(np.angle(t[:, run]), axis=-1)
-    phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[
-        :, None
-    ]
-    kept = MonotonicBranch(
+    at_best = phase[:, middle - run.start]
+    phase += (np.unwrap(at_best) - at_best)[:, None]  # along the wavelengths
+    branch = MonotonicBranch(
         phase[None],
         np.abs(t[:, run])[None],
         d[run],
         library.wavelength_um,
         library.angle_rad,
     )
-    wanted = wanted.with_defaults(entry_error(library, kept.diameter_um))
-    proxy = _widest_domain(kept, middle - run.start, wanted)
+    limits = limits.with_defaults(entry_error(library, branch.diameter_um))
+    proxy = _widest_domain(branch, middle - run.start, limits)
     inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
     notes = (
-        f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",
+        f"converted light: at {d[middle]:.4f} um {conversion**2:.3f} of it changes hand",
     )
     return ProxyFit(
-        proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, wanted), math.nan
+        proxy, notes, (), math.nan, 0.0, tolerance_shortfall(proxy, limits), math.nan
     )
 
 
-def _sharp(library: PillarLibrary, least_half_width_um: float) -> Array:
-    """(size,) whether a narrow resonance lies there."""
-    near = np.zeros(len(library.diameter_um), bool)
+def _near_narrow_resonances(
+    library: PillarLibrary, least_half_width_um: float
+) -> Array:
+    """(size,) mask of sizes within two half-widths of a narrow resonance."""
+    mask = np.zeros(len(library.diameter_um), bool)
     for *_, centre, width in library.resonances:
         if width < least_half_width_um:
-            near |= np.abs(library.diameter_um - centre) <= 2 * width
-    return near
+            mask |= np.abs(library.diameter_um - centre) <= 2 * width
+    return mask
 
 
 def _widest_domain(
-    data: MonotonicBranch, middle: int, wanted: ProxyTolerances
+    branch: MonotonicBranch, middle: int, limits: ProxyTolerances
 ) -> Proxy:
-    """The widest run about ``middle`` on which as many coefficients as are wanted meet
-    the tolerances.
+    """Proxy on the widest run about the place ``middle`` that meets the tolerances,
+    with the requested number of coefficients; at the least 12 entries.
+
+    The half-length of the run shrinks by a tenth in each round.
     """
-    reach = max(middle, len(data.diameter_um) - 1 - middle)
+    half_length = max(middle, len(branch.diameter_um) - 1 - middle)
     while True:
-        part = slice(max(0, middle - reach), middle + reach + 1)
-        some = data.part(part)
-        count = len(some.diameter_um)
-        proxy = fit_terms(some, 1, min(max(2, wanted.coefficients // 2), count // 3))
-        if tolerance_ratio(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
+        domain = branch.part(
+            slice(max(0, middle - half_length), middle + half_length + 1)
+        )
+        count = len(domain.diameter_um)
+        proxy = fit_terms(domain, 1, min(max(2, limits.coefficients // 2), count // 3))
+        if tolerance_ratio(proxy, limits) <= 1 or count <= LEAST_ENTRIES:
             return proxy
-        nearer = max(LEAST_ENTRIES // 2, int(0.9 * reach))
-        if nearer >= reach:
+        shorter = max(LEAST_ENTRIES // 2, int(0.9 * half_length))
+        if shorter >= half_length:
             return proxy
-        reach = nearer
+        half_length = shorter

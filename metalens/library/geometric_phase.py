@@ -22,12 +22,13 @@ STEPS = 3
 class GeometricPhase:
     """Solved cells of one pillar, turned in its lattice.
 
-    size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one
-        period of the lattice.
-    t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver.
-    earlier: (n, k, 2, 2) t of coarser
-    truncations: shares of the light have ``rcwa.SAFETY`` times their farthest change
-        over them as error bar.
+    size_um: of the pillar.
+    wavelength_um: in vacuum.
+    angle_rad: (n,) turns over one period of the lattice.
+    t: (n, 2, 2) Jones matrices in x and y.
+    t_error: (n,) error bars of the solver.
+    earlier: (n, k, 2, 2) t of coarser truncations. The error bar of a share of the
+        light is ``rcwa.SAFETY`` times its largest change over them.
     """
 
     size_um: float
@@ -38,44 +39,54 @@ class GeometricPhase:
     earlier: Array
 
     def converted(self, hand: float) -> Array:
-        """(n,) amplitude that leaves with the other hand, without the geometric phase;
-        hand +1: x + iy comes.
+        """(n,) amplitude that leaves with the other hand, with its geometric phase
+        removed: times exp(-2i hand angle).
+
+        Args:
+            hand: +1 where x + iy comes, -1 where x - iy does.
         """
         return np.asarray(
             to_circular_basis(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad)
         )
 
     def _share(self, of: Callable[["GeometricPhase"], float]) -> tuple[float, float]:
-        """A number that follows from t, and its error bar."""
-        here = of(self)
-        before = [
+        """A quantity of t, and its error bar: SAFETY times its largest change over the
+        coarser truncations, or SAFETY where there are none.
+
+        Args:
+            of: the quantity, as a function of solved cells.
+        """
+        present = of(self)
+        coarser = [
             of(dataclasses.replace(self, t=self.earlier[:, k]))
             for k in range(self.earlier.shape[1])
         ]
-        return here, SAFETY * max((abs(value - here) for value in before), default=1.0)
+        return present, SAFETY * max(
+            (abs(value - present) for value in coarser), default=1.0
+        )
 
     def efficiency(self, hand: float) -> tuple[float, float]:
-        """Share of the light in the converted wave, averaged over all turns, and the
-        error bar of it.
+        """Share of the light in the converted wave, and its error bar: |mean over the
+        turns of the converted amplitude without geometric phase|².
 
-        |mean over the turns of the converted amplitude, its geometric phase taken
-        off|²: what its spread over the turns
-        scatters is no part of it.
+        What the spread over the turns scatters is not included.
         """
-        return self._share(lambda one: float(abs(one.converted(hand).mean()) ** 2))
+        return self._share(lambda cells: float(abs(cells.converted(hand).mean()) ** 2))
 
     def unconverted(self, hand: float) -> tuple[float, float]:
         """Share of the light that keeps its hand, the mean over all turns, and its
         error bar.
         """
         return self._share(
-            lambda one: float((np.abs(to_circular_basis(one.t, hand)[0]) ** 2).mean())
+            lambda cells: float(
+                (np.abs(to_circular_basis(cells.t, hand)[0]) ** 2).mean()
+            )
         )
 
     @property
     def model_error(self) -> float:
-        """Largest |solved - isolated| of the converted amplitude: the isolated pillar
-        is that at angle 0, turned.
+        """Largest |solved - model| of the converted amplitude, over all turns and both
+        hands; the model turns the pillar solved at angle 0.
         """
         return max(
             float(
@@ -91,17 +102,19 @@ def to_circular_basis(t: Array, hand: float) -> tuple[Array, Array]:
     """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1)
     through Jones matrices.
 
+    With c = (1, i hand)/sqrt(2): kept = t c . conj(c), converted = t c . c.
+
     Args:
         t: (..., 2, 2) Jones matrices in x and y.
     """
-    come = np.array([1.0, 1j * hand]) / math.sqrt(2)
-    leave = t @ come
-    return np.asarray(leave @ come.conj()), np.asarray(leave @ come)
+    incoming = np.array([1.0, 1j * hand]) / math.sqrt(2)
+    outgoing = t @ incoming
+    return np.asarray(outgoing @ incoming.conj()), np.asarray(outgoing @ incoming)
 
 
 def mirror_jones(t: Array) -> Array:
-    """Jones matrices of the mirror image (y to -y): those of the pillar turned the
-    other way.
+    """Jones matrices of the mirror image (y to -y), which is the pillar turned the
+    other way: the cross terms change sign.
 
     Args:
         t: (..., 2, 2) Jones matrices in x and y.
@@ -110,8 +123,8 @@ def mirror_jones(t: Array) -> Array:
 
 
 def period_rad(cell: Cell) -> float:
-    """Turn after which lattice and pillar are those of angle 0, turned as a whole, but for
-    the axes of the pillar.
+    """Turn of the pillar in its lattice after which the Jones matrix repeats, in the
+    pillar's axes, rad: pi/2 (square), pi/3 (hexagonal), else pi.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -138,11 +151,11 @@ def check_geometric_phase(cell: Cell, size_um: float) -> None:
         raise CellError(
             f"circular light: a {cell.shape.name} without mirrors along x and y; need angle_rad = 0"
         )
-    quarter = getattr(cell.shape, "ratio", 1.0) != 1.0 and cell.shape.kind in (
+    elongated = getattr(cell.shape, "ratio", 1.0) != 1.0 and cell.shape.kind in (
         "rectangle",
         "ellipse",
     )
-    if not quarter and cell.shape.kind != "polygon":
+    if not elongated and cell.shape.kind != "polygon":
         raise CellError(
             f"circular light: a {cell.shape.name} responds equally to x and y and gives no geometric phase; "
             "need a rectangle, an ellipse or an own polygon that is longer along one axis"
@@ -152,8 +165,8 @@ def check_geometric_phase(cell: Cell, size_um: float) -> None:
 def solve_rotations(
     cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float
 ) -> GeometricPhase:
-    """Solve the pillar turned in its lattice, over one period; half of it follows from
-    the mirror of the lattice.
+    """Solve the pillar at turns over one period of its lattice; the negative turns
+    follow from the mirror image.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
@@ -168,10 +181,10 @@ def solve_rotations(
     check_geometric_phase(cell, size_um)
     period = period_rad(cell)
     angles = np.arange(STEPS + 1) / (2 * STEPS) * period
-    found = []
+    solutions = []
     for angle in angles.tolist():
         shape = dataclasses.replace(cell.shape, angle_rad=angle)
-        found.append(
+        solutions.append(
             jones(
                 dataclasses.replace(cell, shape=shape),
                 size_um,
@@ -179,15 +192,15 @@ def solve_rotations(
                 tolerance=tolerance,
             )
         )
-    t = np.array([one.t for one in found])
-    error = np.array([one.t_error for one in found])
-    earlier = np.array([one.earlier for one in found])
-    back = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
+    t = np.array([solution.t for solution in solutions])
+    error = np.array([solution.t_error for solution in solutions])
+    earlier = np.array([solution.earlier for solution in solutions])
+    mirrored = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
     return GeometricPhase(
         size_um,
         wavelength_um,
-        np.concatenate([angles, -angles[back]]),
-        np.concatenate([t, mirror_jones(t[back])]),
-        np.concatenate([error, error[back]]),
-        np.concatenate([earlier, mirror_jones(earlier[back])]),
+        np.concatenate([angles, -angles[mirrored]]),
+        np.concatenate([t, mirror_jones(t[mirrored])]),
+        np.concatenate([error, error[mirrored]]),
+        np.concatenate([earlier, mirror_jones(earlier[mirrored])]),
     )

@@ -14,7 +14,7 @@ from metalens.library.polynomial import ChebyshevCurve
 
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
-TABLE, DENSE = 4096, 16  # entries of the table, and points of the curve for each
+TABLE, DENSE = 4096, 16  # entries of the table, and samples of the curve per entry
 TURN = 2 * math.pi
 
 
@@ -29,15 +29,20 @@ def invert_phase(
     gap: str,
     excluded_um: Intervals = (),
 ) -> Values:
-    """Diameters on a curve of the phase; see :meth:`metalens.proxy.Proxy.diameter_um`.
-
-    excluded_um: (least, largest) of diameters that are moved to the nearer end.
+    """Diameters in um whose phase on a curve is ``phase_rad`` modulo 2 pi; see
+    :meth:`metalens.library.Proxy.diameter_um`.
 
     Args:
         p: phase over the diameter.
-        phase_rad: (*shape) wanted phases, rad.
-        within_um: (least, largest) diameter that is considered, um.
+        phase_rad: (*shape) phases, rad.
+        within_um: (least, largest) diameter that is considered, um; the whole domain
+            without it.
         gap: refuse or nearest, for phases that no pillar has.
+        excluded_um: (least, largest) of intervals of diameters; one inside is moved to
+            the closer end.
+
+    Raises:
+        DomainError: the phase is not monotone there, or no pillar has a phase.
     """
     low, high = within_um or (p.low, p.high)
     if not p.low - 1e-9 <= low < high <= p.high + 1e-9:
@@ -67,10 +72,23 @@ def _solve(
     gap: str,
     excluded: Intervals,
 ) -> Array:
+    """Diameters of NumPy phases, um: the phase above that of one end, modulo 2 pi, is
+    inverted on the monotone curve.
+
+    With less than a turn covered, a phase beyond it is refused or takes the closer end.
+
+    Args:
+        p: phase over the diameter.
+        phase: (*shape) rad.
+        within: (least, largest) diameter, um.
+        gap: refuse or nearest.
+        excluded: intervals of diameters, um.
+    """
     if not np.isfinite(phase).all():
         raise DomainError(f"phase at index {_first(~np.isfinite(phase))} is not finite")
-    ends = polynomial.evaluate_curve(p, np.array(within))
-    start, cover = float(ends.min()), float(abs(ends[1] - ends[0]))
+    end_phases = polynomial.evaluate_curve(p, np.array(within))
+    start = float(end_phases.min())
+    cover = float(abs(end_phases[1] - end_phases[0]))
     if gap == "refuse" and cover < TURN:
         missing = (phase.astype(float) - start) % TURN > cover + 1e-6
         if missing.any():
@@ -81,21 +99,23 @@ def _solve(
             )
     table = _tabulate_inverse(p, within)
 
-    def work(chunk: Array) -> Array:
+    def invert(chunk: Array) -> Array:
         target = (chunk.astype(np.float64) - start) % TURN
         if cover < TURN:
             beyond = target > cover
             target[beyond] = np.where(
                 target[beyond] - cover <= TURN - target[beyond], cover, 0.0
             )
-        found = _newton(p, target, start, cover, table)
-        return _move_out_of(found, excluded, within).astype(chunk.dtype)
+        diameter = _newton(p, target, start, cover, table)
+        return _move_out_of(diameter, excluded, within).astype(chunk.dtype)
 
-    return polynomial.over_chunks(work, phase)
+    return polynomial.over_chunks(invert, phase)
 
 
 def _move_out_of(d: Array, excluded: Intervals, within: tuple[float, float]) -> Array:
-    """Diameters out of the excluded intervals, to the nearer end inside ``within``."""
+    """Diameters d (um) moved out of the excluded intervals, to the closer end inside
+    ``within``; in place.
+    """
     for low, high in excluded:
         ends = [end for end in (low, high) if within[0] <= end <= within[1]]
         inside = (d > low) & (d < high)
@@ -108,11 +128,18 @@ def _move_out_of(d: Array, excluded: Intervals, within: tuple[float, float]) -> 
 def _newton(
     p: ChebyshevCurve, target: Array, start: float, cover: float, table: Array
 ) -> Array:
-    """Diameters whose phase is start + target: linear in the table, then steps of
-    Newton, one as a rule.
+    """Diameters whose phase is start + target, by linear interpolation in the table and
+    Newton's steps, d -= (phase(d) - start - target) / slope(d).
 
-    Each squares what is left, but where the slope ends in 0: there it halves it, and
-    leaves what has no slope.
+    Convergence is quadratic, and one step is the rule. It is linear (by halves) where
+    the slope vanishes at the root; a diameter of zero slope stays.
+
+    Args:
+        p: phase over the diameter.
+        target: (n,) phases above ``start``, rad, from 0 to ``cover``.
+        start: least phase, rad.
+        cover: range of the phase, rad.
+        table: (TABLE,) diameters at even steps of the phase, um.
     """
     place = target * ((TABLE - 1) / cover)
     index = np.minimum(place.astype(np.int64), TABLE - 2)
@@ -120,22 +147,28 @@ def _newton(
     d = table[index]
     d += place * np.diff(table)[index]
     for _ in range(54):  # a double has 53 bits
-        missed = (
+        error = (
             polynomial.evaluate_horner(p.monomials, polynomial.to_unit_interval(p, d))
             - start
             - target
         )
-        # far below the 1e-10 that is promised, above rounding of 100 rad
-        if np.abs(missed).max(initial=0.0) < 1e-12:
+        # below the documented 1e-10 rad, above the rounding of 100 rad
+        if np.abs(error).max(initial=0.0) < 1e-12:
             break
-        rise = polynomial.slope_of(p, d)
-        d -= np.divide(missed, rise, out=np.zeros_like(d), where=rise != 0)
+        slope = polynomial.slope_of(p, d)
+        d -= np.divide(error, slope, out=np.zeros_like(d), where=slope != 0)
         np.clip(d, table.min(), table.max(), out=d)
     return d
 
 
 def _tabulate_inverse(p: ChebyshevCurve, within: tuple[float, float]) -> Array:
-    """(TABLE,) diameters at even steps of the phase, from the end of least phase."""
+    """(TABLE,) diameters at even steps of the phase, from the end of least phase, um;
+    by linear interpolation of a dense sampling.
+
+    Args:
+        p: monotone phase over the diameter.
+        within: (least, largest) diameter, um.
+    """
     d = np.linspace(*within, DENSE * TABLE)
     phase = polynomial.evaluate_curve(p, d)
     if phase[-1] < phase[0]:
@@ -150,16 +183,21 @@ def _torch(
     gap: str,
     excluded: Intervals,
 ) -> Any:
-    """One differentiable Newton step on the detached answer: its derivative is exactly
-    1 / (dphase/dD).
+    """Differentiable diameters of a tensor of phases: one Newton step on the detached
+    answer, whose derivative is exactly 1 / (dphase/dD).
+
+    The arguments are those of :func:`_solve`.
     """
     import torch
 
     values = phase.detach().cpu().numpy()
-    found = _solve(p, values, within, gap, excluded)
-    rise = torch.from_numpy(polynomial.evaluate_slope(p, found)).to(phase.device)
-    return torch.from_numpy(found).to(phase.device) + (phase - phase.detach()) / rise
+    diameter = _solve(p, values, within, gap, excluded)
+    slope = torch.from_numpy(polynomial.evaluate_slope(p, diameter)).to(phase.device)
+    return (
+        torch.from_numpy(diameter).to(phase.device) + (phase - phase.detach()) / slope
+    )
 
 
 def _first(mask: Array) -> tuple[int, ...]:
+    """Index of the first True value."""
     return tuple(int(i) for i in np.argwhere(mask)[0])

@@ -29,9 +29,11 @@ DEG, NM = 180 / np.pi, 1e3
 def write_study(
     folder: Path, study: CellStudy, verdicts: list[CellVerdict], *, command: str
 ) -> None:
-    """cell_study.json, README.md and cell_study.png in ``folder``, which must exist.
+    """Write cell_study.json, README.md and cell_study.png to ``folder``, which must
+    exist.
 
     Args:
+        folder: that is written to.
         study: what is compared.
         verdicts: of all its cells.
         command: that wrote the page, shown in it.
@@ -48,8 +50,8 @@ def write_study(
 
 
 def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> None:
-    """Turns covered over pitch and height, a panel a wavelength; the line is one full
-    turn.
+    """PNG of the turns covered over pitch and height, one panel per wavelength; the
+    colour scale is centred on one full turn.
 
     Args:
         path: of the PNG.
@@ -63,8 +65,8 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
     pitch = NM * np.array(study.pitches_um)
     height = NM * np.array(study.heights_um)
     for panel, wavelength in zip(panels, study.wavelengths_um, strict=True):
-        found = [v.turns for v in verdicts if v.wavelength_um == wavelength]
-        turns = np.array(found[: len(height) * len(pitch)]).reshape(
+        values = [v.turns for v in verdicts if v.wavelength_um == wavelength]
+        turns = np.array(values[: len(height) * len(pitch)]).reshape(
             len(height), len(pitch)
         )
         image = panel.imshow(
@@ -92,8 +94,8 @@ def study_figure(path: Path, study: CellStudy, verdicts: list[CellVerdict]) -> N
 def library_figure(
     path: Path, library: "PillarLibrary", made: "ProxyFit | None"
 ) -> None:
-    """Phase and |t| with error bars, the bars by themselves with the tolerance, and
-    what the proxy leaves.
+    """PNG of a library over the diameter: phase, |t|, error bars with the tolerance,
+    and the residuals of the proxy.
 
     Args:
         path: of the PNG.
@@ -101,7 +103,7 @@ def library_figure(
         made: the fit of its proxy; None where there is none.
     """
     figure = Figure(figsize=(7.5, 8.5), layout="constrained", dpi=110)
-    phase, level, bars, rest = figure.subplots(
+    phase, level, bars, residual_panel = figure.subplots(
         4, 1, sharex=True, height_ratios=(3, 2, 1.2, 1.8)
     )
     d = NM * library.diameter_um
@@ -110,17 +112,17 @@ def library_figure(
         label = f"{NM * library.wavelength_um[k]:g} nm"
         if len(library.angle_rad) > 1:
             label += f", {DEG * library.angle_rad[j]:.3g}° {library.polarization[i]}"
-        size = np.abs(t)
+        magnitude = np.abs(t)
         turns = np.unwrap(np.angle(t)) / (2 * np.pi)
-        kind: dict[str, Any] = {"lw": 0.9, "elinewidth": 2.5, "alpha": 0.9}
+        style: dict[str, Any] = {"lw": 0.9, "elinewidth": 2.5, "alpha": 0.9}
         phase.errorbar(
             d,
             turns - turns[0],
-            error / np.maximum(size, error) / (2 * np.pi),
+            error / np.maximum(magnitude, error) / (2 * np.pi),
             label=label,
-            **kind,
+            **style,
         )
-        level.errorbar(d, size, error, **kind)
+        level.errorbar(d, magnitude, error, **style)
         bars.semilogy(d, error, lw=0.9)
     phase.set_ylabel("phase (turns)")
     level.set(ylabel="|t|", ylim=(0, 1.05))
@@ -133,45 +135,53 @@ def library_figure(
         f"pitch {NM * cell.pitch_um:g} nm, height {NM * cell.height_um:g} nm, engine {library.engine}"
     )
     if made is not None:
-        _residuals(rest, library, made)
+        _residuals(residual_panel, library, made)
         for panel in (phase, level):
             panel.axvspan(
                 *(NM * v for v in made.proxy.domain_um), color="0.92", zorder=0
             )
-    rest.set(xlabel="diameter (nm)", ylabel="proxy - library")
+    residual_panel.set(xlabel="diameter (nm)", ylabel="proxy - library")
     _write(figure, path)
 
 
-def _residuals(panel: Any, library: "PillarLibrary", made: "ProxyFit") -> None:
-    """Deviation of the proxy from the entries of its domain, phase (rad) and |T|."""
-    proxy = made.proxy
+def _residuals(panel: Any, library: "PillarLibrary", fit: "ProxyFit") -> None:
+    """Plot the deviation of the proxy from the entries of its domain, phase (rad) and
+    |T|, averaged over the polarisations.
+    """
+    proxy = fit.proxy
     low, high = proxy.domain_um
     inside = (library.diameter_um >= low - 1e-9) & (library.diameter_um <= high + 1e-9)
     d = library.diameter_um[inside]
     mean = library.t[..., inside].mean(axis=0)
-    first = True
+    is_first = True
     for j, k in np.ndindex(*mean.shape[:2]):
-        place = (float(library.wavelength_um[k]), float(library.angle_rad[j]))
-        turned = np.angle(np.exp(1j * proxy.phase_rad(d, *place)) / mean[j, k])
-        panel.plot(NM * d, turned, "C0.", ms=2, label="phase (rad)" if first else None)
+        light = (float(library.wavelength_um[k]), float(library.angle_rad[j]))
+        phase_error = np.angle(np.exp(1j * proxy.phase_rad(d, *light)) / mean[j, k])
+        panel.plot(
+            NM * d, phase_error, "C0.", ms=2, label="phase (rad)" if is_first else None
+        )
         panel.plot(
             NM * d,
-            proxy.transmission(d, *place) - np.abs(mean[j, k]),
+            proxy.transmission(d, *light) - np.abs(mean[j, k]),
             "C1.",
             ms=2,
-            label="|T|" if first else None,
+            label="|T|" if is_first else None,
         )
-        first = False
+        is_first = False
     panel.legend(fontsize=7)
 
 
 def _write(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
     with replace_atomically(path) as part:
         figure.savefig(part, format="png", metadata={"Software": "metalens"})
 
 
 def axes_library_figure(path: Path, library: "AxesLibrary") -> None:
-    """PNG of the first wavelength; pairs of sizes above the tolerance are blank.
+    """PNG of a library over two sizes at its first wavelength: phase, |t|, error bars
+    and held-out pairs.
+
+    Pairs of sizes above the tolerance are blank.
 
     Args:
         path: of the PNG.
@@ -180,17 +190,17 @@ def axes_library_figure(path: Path, library: "AxesLibrary") -> None:
     canvas, panels = report.make_figure(2, 3, size=(11, 6.6))
     t, usable = library.t[0], library.usable[0]
     for row, name in enumerate("xy"):
-        own = np.where(usable, t[..., row, row], np.nan)
+        own_t = np.where(usable, t[..., row, row], np.nan)
         title = f"{name}-polarised, {NM * library.wavelength_um[0]:g} nm"
         _map(
             canvas,
             panels[row][0],
             library,
-            np.angle(own) / (2 * np.pi) % 1,
+            np.angle(own_t) / (2 * np.pi) % 1,
             (title, "phase / turns"),
             "twilight",
         )
-        _map(canvas, panels[row][1], library, np.abs(own), (title, "|t|"), "viridis")
+        _map(canvas, panels[row][1], library, np.abs(own_t), (title, "|t|"), "viridis")
     bar = np.log10(np.maximum(library.t_error[0], 1e-6))
     _map(
         canvas, panels[0][2], library, bar, ("error bar", "log10 |t - exact|"), "magma"
@@ -204,28 +214,38 @@ def _map(
     panel: Any,
     library: "AxesLibrary",
     values: Array,
-    words: tuple[str, str],
+    labels: tuple[str, str],
     colours: str,
 ) -> None:
-    ends = [
+    """Draw (x, y) values over the two sizes, with a colour bar.
+
+    Args:
+        canvas: figure that takes the colour bar.
+        panel: axes of the map.
+        library: whose sizes are the axes.
+        values: (m, n).
+        labels: title, and label of the colour bar.
+        colours: name of the colour map.
+    """
+    extent_nm = [
         NM * v
         for v in (library.x_um[0], library.x_um[-1], library.y_um[0], library.y_um[-1])
     ]
     image = panel.imshow(
         values.T,
         origin="lower",
-        extent=ends,
+        extent=extent_nm,
         aspect="equal",
         cmap=colours,
         interpolation="nearest",
     )
-    panel.set(title=words[0], xlabel="along x / nm", ylabel="along y / nm")
+    panel.set(title=labels[0], xlabel="along x / nm", ylabel="along y / nm")
     panel.grid(visible=False)
-    canvas.colorbar(image, ax=panel, label=words[1], shrink=0.8)
+    canvas.colorbar(image, ax=panel, label=labels[1], shrink=0.8)
 
 
 def _held_out(panel: Any, library: "AxesLibrary") -> None:
-    """Errors of pairs that were solved but not interpolated, over their bars."""
+    """Plot the errors of the held-out pairs over their error bars."""
     error, bar = library.held_out[:, 3], library.held_out[:, 4]
     panel.loglog(bar, np.maximum(error, 1e-6), ".")
     ends = np.array([bar.min() / 2, 2 * bar.max()])

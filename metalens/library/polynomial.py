@@ -16,7 +16,7 @@ from numpy.polynomial import chebyshev
 from metalens.core.arrays import Array
 from metalens.core.errors import DomainError
 
-CHUNK = 65536  # pillars a pass: its work arrays stay in the cache
+CHUNK = 65536  # pillars per pass: its work arrays stay in the cache
 EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
 Monomials = tuple[float, ...]  # Python floats never raise the dtype of an array
 
@@ -58,8 +58,13 @@ def chebyshev_curve(
     power: int,
     ceiling: float = math.inf,
 ) -> ChebyshevCurve:
-    """The curve of 1-D Chebyshev ``coefficients`` on ``domain``, see
-    :class:`ChebyshevCurve` for ``power`` and ``ceiling``.
+    """Curve of a 1-D Chebyshev sum on a domain.
+
+    Args:
+        coefficients: (degree + 1,) of the sum.
+        domain: (least, largest) diameter, um.
+        power: of the diameter, see :class:`ChebyshevCurve`.
+        ceiling: upper limit of the values.
     """
     monomials = _to_monomials(tuple(coefficients.tolist()))
     return ChebyshevCurve(monomials, *domain, power, ceiling)
@@ -67,11 +72,17 @@ def chebyshev_curve(
 
 @functools.lru_cache(maxsize=256)
 def _to_monomials(coefficients: tuple[float, ...]) -> Monomials:
+    """Coefficients of 1, x, x², … of a Chebyshev sum."""
     return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
 def _derivative(p: ChebyshevCurve, monomials: Monomials) -> Monomials:
-    """Of dq/dD over D^(power-1): dx/dD = scale power D^(power-1)."""
+    """Monomials in x of (dq/dD) / D^(power - 1), by dx/dD = scale power D^(power - 1).
+
+    Args:
+        p: curve that maps D to x.
+        monomials: of q.
+    """
     inner = p.scale * p.power
     return tuple(k * inner * c for k, c in enumerate(monomials))[1:] or (0.0,)
 
@@ -100,13 +111,13 @@ def evaluate_slope(p: ChebyshevCurve, diameter: Any) -> Any:
 
 
 def slope_of(p: ChebyshevCurve, diameter: Array) -> Array:
-    """dp/dD at ``diameter`` (um) without a check of the domain of ``p``."""
+    """dp/dD at ``diameter`` (um), without a check of the domain of ``p``."""
     slope = _derivative(p, p.monomials)
     return np.asarray(_term(p, slope, p.power - 1, diameter))
 
 
 def to_unit_interval(p: ChebyshevCurve, diameter: Any) -> Any:
-    """x of ``diameter`` (um) on the curve ``p``."""
+    """x of ``diameter`` (um) on the curve ``p``: scale diameter^power + shift."""
     x = diameter * p.scale
     for _ in range(p.power - 1):
         x *= diameter
@@ -124,7 +135,14 @@ def evaluate_horner(monomials: Monomials, x: Any) -> Any:
 
 
 def _term(p: ChebyshevCurve, monomials: Monomials, exponent: int, diameter: Any) -> Any:
-    """D^exponent q(x(D)) with q of these monomials, NumPy or torch."""
+    """D^exponent q(x(D)), NumPy or torch.
+
+    Args:
+        p: curve that maps D to x.
+        monomials: of q.
+        exponent: of D.
+        diameter: D, um.
+    """
     total = evaluate_horner(monomials, to_unit_interval(p, diameter))
     for _ in range(exponent):
         total *= diameter
@@ -143,10 +161,10 @@ def _evaluate_term(
 
 @functools.cache
 def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
-    """:func:`_term` as a torch function that keeps its input alone for derivatives.
+    """:func:`_term` as a torch function that saves only its input for derivatives.
 
-    Terms are closed under differentiation: with a = dx/d(D^m) and m = power,
-    d/dD [D^k q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
+    Terms are closed under differentiation: with a = dx/d(D^m) and m = power, d/dD [D^k
+    q(x)] = k D^(k-1) q(x) + D^(k+m-1) a m q'(x).
     """
     import torch
 
@@ -155,8 +173,8 @@ def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
         def forward(diameter: Any, p: Any, monomials: Any, exponent: Any) -> Any:
             if diameter.device.type == "cpu":
                 values = diameter.detach().numpy()
-                found = _evaluate_term(p, monomials, exponent, values)
-                return torch.from_numpy(found)
+                value = _evaluate_term(p, monomials, exponent, values)
+                return torch.from_numpy(value)
             check_domain(p, diameter)
             return _term(p, monomials, exponent, diameter)
 
@@ -168,41 +186,45 @@ def _torch_term() -> Callable[[Any, ChebyshevCurve, Monomials, int], Any]:
 
         @staticmethod
         def backward(ctx: Any, *gradients: Any) -> Any:
-            return gradients[0] * rise(ctx), None, None, None
+            return gradients[0] * term_slope(ctx), None, None, None
 
         @staticmethod
         def jvp(ctx: Any, *tangents: Any) -> Any:
-            return tangents[0] * rise(ctx)
+            return tangents[0] * term_slope(ctx)
 
         @staticmethod
         def vmap(info: Any, dims: Any, diameter: Any, *term: Any) -> Any:
             return apply(diameter, *term), dims[0]
 
-    def rise(ctx: Any) -> Any:
+    def term_slope(ctx: Any) -> Any:
         (diameter,), (p, q, k) = ctx.saved_tensors, ctx.term
-        found = apply(diameter, p, _derivative(p, q), k + p.power - 1)
-        return found + k * apply(diameter, p, q, k - 1) if k else found
+        value = apply(diameter, p, _derivative(p, q), k + p.power - 1)
+        return value + k * apply(diameter, p, q, k - 1) if k else value
 
     apply: Callable[..., Any] = Term.apply
     return apply
 
 
 def over_chunks(work: Callable[[Array], Array], values: Array) -> Array:
-    """``work`` elementwise over the array ``values`` in cache-sized chunks, on all
-    cores that the process may use.
+    """Elementwise ``work`` on an array, in cache-sized chunks on all cores that the
+    process may use.
+
+    Args:
+        work: function of a 1-D array that keeps its shape and dtype.
+        values: array of any shape.
     """
     flat = np.ascontiguousarray(values).ravel()
     if flat.size <= CHUNK:
         return work(flat).reshape(values.shape)
     out = np.empty_like(flat)
 
-    def run(start: int) -> None:
+    def fill(start: int) -> None:
         out[start : start + CHUNK] = work(flat[start : start + CHUNK])
 
     with ThreadPoolExecutor(
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     ) as pool:
-        list(pool.map(run, range(0, flat.size, CHUNK)))
+        list(pool.map(fill, range(0, flat.size, CHUNK)))
     return out.reshape(values.shape)
 
 
@@ -227,8 +249,8 @@ def check_domain(p: ChebyshevCurve, diameter: Any) -> None:
 
 
 def is_monotonic(p: ChebyshevCurve, within: tuple[float, float]) -> bool:
-    """Whether ``p`` rises or falls throughout ``within`` (um): no root of its slope
-    lies inside (certified, not sampled).
+    """Whether ``p`` rises or falls throughout ``within`` (um): its slope has no root
+    inside, by the roots of the polynomial, not by sampling.
     """
     low, high = to_unit_interval(p, np.array(within, float))
     slope = _derivative(p, p.monomials)
@@ -245,21 +267,22 @@ def certified_bounds(coefficients: Array, *, points: int = 64) -> tuple[float, f
     """Certified (lower, upper) bound of a tensor Chebyshev sum on [-1, 1]^n.
 
     With N >= points * degree Chebyshev nodes on the last axis (24 * degree on the
-    others), a polynomial q of degree d has max|q| <= max over the nodes
-    |q| / cos(pi d / 2N) an axis (Ehlich and Zeller 1964); applied to q = p - middle.
+    others), a polynomial q of degree d has max|q| <= max over the nodes |q| / cos(pi d
+    / 2N) per axis (Ehlich and Zeller 1964); applied to q = p - middle.
 
     Args:
-        coefficients: (…) of the sum, an axis a variable.
-        points: nodes a degree on the last axis.
+        coefficients: (…) of the sum, one axis per variable.
+        points: nodes per degree on the last axis.
 
     Accuracy: the bound is too wide by at most 3e-4 (points = 64) of the polynomial's
         half-range for the last axis and 2e-3 for each other.
     """
-    values, slack = np.asarray(coefficients, float), 1.0
+    values = np.asarray(coefficients, float)
+    slack = 1.0
     for axis, count in enumerate(values.shape):
         degree = count - 1
-        dense = points if axis == values.ndim - 1 else 24
-        nodes = chebyshev.chebpts1(max(1, dense * degree))
+        per_degree = points if axis == values.ndim - 1 else 24
+        nodes = chebyshev.chebpts1(max(1, per_degree * degree))
         basis = chebyshev.chebvander(nodes, degree)
         values = np.moveaxis(np.tensordot(basis, values, (1, axis)), 0, axis)
         slack /= math.cos(math.pi * degree / (2 * len(nodes))) if degree else 1.0

@@ -15,17 +15,18 @@ from metalens.core.errors import DomainError
 from metalens.library import inverse, polynomial
 from metalens.library.inverse import Values, is_tensor
 
-# of t: the largest tolerance of a library; pillars known less well (root mean square)
-# make no lens
+# largest error of t: the tolerance of a library, and for the pillars of a lens the
+# root mean square of their error bars over |t|
 MOST_ERROR = 0.1
 
 
 def height_hint(height_um: float, turns: float) -> str:
-    """What would cover a turn of phase where pillars of this height cover less
-    (``turns``), for a person.
+    """Advice where pillars of this height cover less than a turn of phase: the height
+    or material that would.
 
     Args:
         height_um: of the pillars today, um.
+        turns: of phase that they cover.
     """
     return (
         f"take pillars of about {height_um / max(turns, 0.05):.3g} um ({height_um:g} um now; phase grows with the "
@@ -71,6 +72,7 @@ class Proxy:
     gaps_um: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse an empty domain, and |T| outside [0, 1] by its certified bounds."""
         low, high = self.domain_um
         if not 0 <= low < high < math.inf:
             raise DomainError(
@@ -79,9 +81,8 @@ class Proxy:
         if not self.phase_coefficients.size:
             return
         least, most = polynomial.certified_bounds(self.transmission_coefficients)
-        slack = (
-            3e-3 * (most - least) + 1e-12
-        )  # the width of the certificate, not of the polynomial
+        # the bounds are wider than the polynomial by up to this
+        slack = 3e-3 * (most - least) + 1e-12
         if not (least >= -slack and most <= 1 + slack):
             raise DomainError(
                 f"|T| of the proxy runs from {least:.6f} to {most:.6f}, need 0 to 1: fit it again"
@@ -132,19 +133,21 @@ class Proxy:
         within_um: tuple[float, float] | None = None,
         gap: Literal["refuse", "nearest"] = "refuse",
     ) -> Values:
-        """Diameter of the pillar with a phase, any phase taken modulo 2 pi into the
-        domain.
+        """Diameter of the pillar with a given phase modulo 2 pi, um; shape, dtype and
+        device of ``phase_rad``.
 
         Args:
+            phase_rad: (*shape) rad, array, tensor or number.
+            wavelength_um: within the proxy's range.
+            angle_rad: of incidence in air.
             within_um: (least, largest) diameter to use; the whole domain without it.
                 Where it covers more than a turn the end with the lesser phase is used:
                 move ``within_um`` to choose the branch.
             gap: what to do with a phase that no pillar has (less than a turn covered).
 
-        Accuracy:
-            phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
-                gradients are exact. A diameter in one of ``gaps_um`` moves to its
-                nearer end.
+        Accuracy: phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32.
+            Torch gradients are exact. A diameter in one of ``gaps_um`` moves to its
+            closer end.
 
         Raises:
             DomainError: the phase is not monotone within ``within_um``, or no pillar
@@ -164,15 +167,17 @@ class Proxy:
         angle_rad: float = 0.0,
         within_um: tuple[float, float] | None = None,
     ) -> float:
-        """Phase range between the ends of ``within_um`` (the whole domain without it)."""
-        ends = self.phase_rad(
+        """Phase range between the ends of ``within_um`` (the whole domain without it),
+        rad.
+        """
+        phases = self.phase_rad(
             np.array(within_um or self.domain_um), wavelength_um, angle_rad
         )
-        return float(abs(ends[1] - ends[0]))
+        return float(abs(phases[1] - phases[0]))
 
     def error(self, wavelength_um: float) -> float:
-        """What t by the curves may be wrong by, relative to its mean: deviation from
-        entries, and the entries' own.
+        """Error estimate of t relative to the mean |T|: root sum of squares of the
+        phase error, the |T| error and that of the entries.
         """
         level = np.asarray(
             self.transmission(np.linspace(*self.domain_um, 65), wavelength_um)
@@ -185,10 +190,10 @@ class Proxy:
 
     @property
     def doubt(self) -> str:
-        """Why no lens is to be made of these pillars, for a person: how little a solver
-        knows of them; else empty.
+        """Message that the pillars' own error bars are too large for a lens; empty
+        where they are not.
 
-        Not for the curve's own deviation: that is the tolerances' of a fit.
+        The deviation of the curve is not counted: it is for the tolerances of a fit.
         """
         if self.entry_error <= MOST_ERROR:
             return ""
@@ -204,8 +209,8 @@ class Proxy:
         angle_rad: float = 0.0,
         within_um: tuple[float, float] | None = None,
     ) -> bool:
-        """Whether the phase rises or falls throughout: no root of its slope lies inside
-        (certified, not sampled).
+        """Whether the phase rises or falls throughout the diameters: its slope has no
+        root inside, by the roots of the polynomial, not by sampling.
         """
         return polynomial.is_monotonic(
             self.at(wavelength_um, angle_rad), within_um or self.domain_um
@@ -232,6 +237,19 @@ class Proxy:
         angle_rad: float,
         ceiling: float = math.inf,
     ) -> polynomial.ChebyshevCurve:
+        """Curve of the diameter at one wavelength and angle, by Chebyshev sums in sin²
+        angle and then wavelength.
+
+        Args:
+            coefficients: of the phase or of |T|.
+            wavelength_um: within the proxy's range.
+            angle_rad: of incidence in air.
+            ceiling: largest value of the curve.
+
+        Raises:
+            DomainError: the wavelength or angle lies outside, or there are no
+                coefficients.
+        """
         if not coefficients.size:
             raise DomainError(
                 "pillars of two sizes (width and length) have a table, no proxy of one "
@@ -251,11 +269,18 @@ class Proxy:
                 f"wavelength {wavelength_um:.7g} um, but the proxy holds from {low:.7g} to {high:.7g} um: sweep a "
                 "library over the wavelengths ([sweep] wavelengths_um)"
             )
-        unit = 0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
-        row = np.asarray(chebyshev.chebval(unit, coefficients))
-        return polynomial.chebyshev_curve(row, self.domain_um, self.power, ceiling)
+        wavelength_unit = (
+            0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
+        )
+        diameter_coefficients = np.asarray(
+            chebyshev.chebval(wavelength_unit, coefficients)
+        )
+        return polynomial.chebyshev_curve(
+            diameter_coefficients, self.domain_um, self.power, ceiling
+        )
 
     def _angle_unit(self, angle_rad: float) -> float:
+        """Angle mapped to [-1, 1]: 2 (sin angle / sin largest angle)² - 1."""
         if not abs(angle_rad) <= self.max_angle_rad + 1e-9:
             raise DomainError(
                 f"angle {angle_rad} rad, but the proxy holds up to {self.max_angle_rad} rad"
@@ -270,7 +295,13 @@ def _evaluate(
     curve: polynomial.ChebyshevCurve,
     diameter_um: Values,
 ) -> Values:
-    """A curve at diameters, which leave as they came: array, tensor or number."""
+    """Values of a curve at diameters in um, in their type: array, tensor or number.
+
+    Args:
+        evaluator: :func:`polynomial.evaluate_curve` or its slope.
+        curve: of the diameter.
+        diameter_um: array, tensor or number.
+    """
     if is_tensor(diameter_um):
         return cast(Values, evaluator(curve, diameter_um))
     array = np.asarray(diameter_um)

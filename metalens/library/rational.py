@@ -27,35 +27,37 @@ class RationalFunction:
     residual: float
 
     def __call__(self, x: Array) -> Array:
-        """(*shape of x, components); the support values where ``x`` meets a support
-        point.
+        """(*shape of x, components) values of r; those of the support where ``x`` meets
+        a support point.
         """
-        flat = np.asarray(x, float).reshape(-1)
-        gap = flat[:, None] - self.support
-        row, column = np.nonzero(gap == 0)
-        gap[row] = 1.0
-        cauchy = self.weights / gap
+        points = np.asarray(x, float).reshape(-1)
+        distance = points[:, None] - self.support
+        row, column = np.nonzero(distance == 0)
+        distance[row] = 1.0
+        cauchy = self.weights / distance
         cauchy[row] = 1.0  # replaced below; the weights themselves may add up to 0
         out = (cauchy @ self.values) / cauchy.sum(1)[:, None]
         out[row] = self.values[column]
         return np.asarray(out.reshape(*np.shape(x), self.values.shape[1]))
 
     def poles(self) -> Array:
-        """(m - 1,) complex poles at most: finite eigenvalues of the arrow pencil of the
-        denominator.
+        """Complex poles, (m - 1,) at most: the finite generalised eigenvalues of the
+        arrowhead pencil [[0, w], [1, diag(z)]] against diag(0, 1, ..., 1).
         """
         m = len(self.support)
         if m < 2:
             return np.empty(0, complex)
-        left = np.zeros((m + 1, m + 1), complex)
-        left[0, 1:], left[1:, 0], left[1:, 1:] = self.weights, 1, np.diag(self.support)
-        right = np.eye(m + 1)
-        right[0, 0] = 0
-        top, bottom = scipy.linalg.eig(
-            left, right, right=False, homogeneous_eigvals=True
+        pencil = np.zeros((m + 1, m + 1), complex)
+        pencil[0, 1:] = self.weights
+        pencil[1:, 0] = 1
+        pencil[1:, 1:] = np.diag(self.support)
+        mass = np.eye(m + 1)
+        mass[0, 0] = 0
+        alpha, beta = scipy.linalg.eig(
+            pencil, mass, right=False, homogeneous_eigvals=True
         )
-        finite = np.abs(bottom) > 1e-10 * np.abs(top)
-        return np.asarray(top[finite] / bottom[finite])
+        finite = np.abs(beta) > 1e-10 * np.abs(alpha)
+        return np.asarray(alpha[finite] / beta[finite])
 
 
 def fit_rational_aaa(
@@ -66,7 +68,8 @@ def fit_rational_aaa(
     terms: int | None = None,
     start: Array | None = None,
 ) -> RationalFunction:
-    """The rational function of least degree that meets the data within ``tolerance``.
+    """Rational function of least degree that meets the data within ``tolerance``, by
+    the AAA algorithm.
 
     Nakatsukasa, Sète and Trefethen, "The AAA algorithm for rational approximation",
     SIAM J. Sci. Comput. 40, A1494 (2018): support points are taken where the fit is
@@ -74,7 +77,7 @@ def fit_rational_aaa(
 
     Args:
         x: (n,) distinct real points.
-        y: (n, components).
+        y: (n, components) values.
         tolerance: largest deviation that is accepted; below the noise of the data poles
             without meaning appear.
         terms: most support points; n // 2 + 1 without it, where all data can be met.
@@ -100,23 +103,29 @@ def fit_rational_aaa(
 
 
 def _weights(x: Array, y: Array, support: list[int]) -> tuple[Array, Array]:
-    """Barycentric weights on the support, and the deviation at every data point (0 on
-    the support).
+    """(weights, error): (m,) barycentric weights on the support, and the (n,) deviation
+    at every data point, 0 on the support.
+
+    Args:
+        x: (n,) points.
+        y: (n, components) values.
+        support: indices of the m support points.
     """
-    rest = np.ones(len(x), bool)
-    rest[support] = False
+    others = np.ones(len(x), bool)
+    others[support] = False
     error = np.zeros(len(x))
-    if not rest.any():
+    if not others.any():
         return np.ones(len(support), complex), error
-    cauchy = 1 / (x[rest, None] - x[support])
-    loewner = (y[rest, None, :] - y[support]) * cauchy[..., None]
+    cauchy = 1 / (x[others, None] - x[support])
+    loewner = (y[others, None, :] - y[support]) * cauchy[..., None]
     loewner = loewner.transpose(0, 2, 1).reshape(-1, len(support))
-    wide = loewner.shape[0] < loewner.shape[1]
-    weights = np.linalg.svd(loewner, full_matrices=wide)[2][-1].conj()
-    bottom = cauchy @ weights
+    underdetermined = loewner.shape[0] < loewner.shape[1]
+    weights = np.linalg.svd(loewner, full_matrices=underdetermined)[2][-1].conj()
+    denominator = cauchy @ weights
     with np.errstate(divide="ignore", invalid="ignore"):
         deviation = np.abs(
-            (cauchy @ (weights[:, None] * y[support])) / bottom[:, None] - y[rest]
+            (cauchy @ (weights[:, None] * y[support])) / denominator[:, None]
+            - y[others]
         ).max(1)
-    error[rest] = np.where(np.isfinite(deviation), deviation, np.inf)
+    error[others] = np.where(np.isfinite(deviation), deviation, np.inf)
     return weights, error

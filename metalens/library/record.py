@@ -26,12 +26,9 @@ from metalens.library.proxy import MOST_ERROR, Proxy
 PLAIN = Index(3.6)
 DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
 MOST_ALONG = 1000  # samples along a size, where there are two
-USUAL = {
-    "modal": 1e-3,
-    "rcwa": 0.02,
-    "axes": 0.05,
-}  # round pillars, others (corners converge slowly), two sizes
-# a sweep ends this far below the pitch: 10 nm of bias beyond a printable gap of 60 nm
+# default tolerances: round pillars, others (corners converge slowly), two sizes
+USUAL = {"modal": 1e-3, "rcwa": 0.02, "axes": 0.05}
+# least gap of a default sweep: a printable gap of 60 nm, less 10 nm of bias
 EDGE_GAP_UM = 0.05
 
 
@@ -65,6 +62,7 @@ class Sweep:
     lengths_um: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        """Refuse settings out of range."""
         for name, values in (
             ("wavelengths_um", self.wavelengths_um),
             ("angles_deg", self.angles_deg),
@@ -97,6 +95,14 @@ class Sweep:
             self._check_lengths(self.lengths_um)
 
     def _check_lengths(self, lengths: tuple[float, float]) -> None:
+        """Refuse ranges of two sizes, and settings that do not apply to them.
+
+        Args:
+            lengths: (least, largest) size along y, um.
+
+        Raises:
+            ConfigError: naming the setting.
+        """
         for name, span in (
             ("diameters_um", self.diameters_um or (0, 0)),
             ("lengths_um", lengths),
@@ -105,12 +111,12 @@ class Sweep:
                 raise ConfigError(
                     f"{name} = {list(span)}: with lengths_um both need 0 < least < largest"
                 )
-        plain = (
+        supported = (
             self.angles_deg == (0.0,)
             and self.light == "linear"
             and self.engine != "modal"
         )
-        if not plain or self.samples > MOST_ALONG:
+        if not supported or self.samples > MOST_ALONG:
             raise ConfigError(
                 f"lengths_um = {list(lengths)}: a library over two sizes is for normal incidence (angles_deg = [0.0]), "
                 f'light = "linear", engine auto or rcwa, and at most {MOST_ALONG} samples'
@@ -118,8 +124,8 @@ class Sweep:
 
     @property
     def polarizations(self) -> tuple[Polarization, ...]:
-        """x at normal incidence alone (a square lattice responds equally to x and y), else s
-        and p; x and y for circular.
+        """Polarisations that are solved: x at normal incidence (a square lattice
+        responds equally to x and y), else s and p; x and y for circular light.
         """
         if self.light == "circular":
             return ("x", "y")
@@ -127,22 +133,23 @@ class Sweep:
 
     @property
     def bar(self) -> float:
-        """The tolerance, that of round pillars where none is stated."""
+        """The tolerance of t, or that of round pillars where none is stated."""
         return USUAL["modal"] if self.tolerance is None else self.tolerance
 
     def with_tolerance(self, cell: Cell) -> "Sweep":
-        """The same with the tolerance that pillars of such a cell have where none is
-        stated.
+        """The settings with the default tolerance of such a cell filled in where none
+        is stated.
         """
         if self.tolerance is not None:
             return self
-        usual = (
+        kind = (
             "axes" if self.lengths_um is not None else "modal" if cell.round else "rcwa"
         )
-        return dataclasses.replace(self, tolerance=USUAL[usual])
+        return dataclasses.replace(self, tolerance=USUAL[kind])
 
     def span_um(self, cell: Cell) -> tuple[float, float]:
-        """(least, largest) diameter.
+        """(least, largest) diameter of the sweep, um; the default range where none is
+        stated.
 
         Raises:
             CellError: the diameters do not fit into the cell.
@@ -201,6 +208,7 @@ class PillarLibrary:
     turned: GeometricPhase | None = None
 
     def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, and values that are not finite."""
         shape = (
             len(self.polarization),
             len(self.angle_rad),
@@ -222,45 +230,48 @@ class PillarLibrary:
 
     @property
     def lost(self) -> Array:
-        """As t: share of the power that is absorbed or leaves in orders other than zero
-        (of a shape without a mirror along x or y, or in the other polarisation).
+        """Share of the power outside the zero order of the incident polarisation, as t:
+        it is absorbed, or in other orders or the other polarisation.
         """
         return np.asarray(np.maximum(1 - self.energy, 0.0))
 
     @property
     def cross_polarized(self) -> Array:
-        """(wavelength, size) amplitude (t_x - t_y)/2 that leaves with the other hand,
-        of circular light on pillars that are not turned.
+        """(wavelength, size) amplitude (t_x - t_y)/2 that circular light sends to the
+        other hand, for pillars that are not turned.
         """
         return np.asarray(self.t[0, 0] - self.t[1, 0]) / 2
 
     @property
     def best_converting_um(self) -> float:
-        """The size whose least conversion over the wavelengths is largest, off
-        resonances (bars within the tolerance).
+        """Size whose least conversion over the wavelengths is largest, um; only sizes
+        whose bars meet the tolerance, if there are any.
         """
-        least = np.abs(self.cross_polarized).min(axis=0)
-        sure = (self.t_error <= self.sweep.bar).all(axis=(0, 1, 2))
-        place = int(np.where(sure | ~sure.any(), least, -1.0).argmax())
+        conversion = np.abs(self.cross_polarized).min(axis=0)
+        accurate = (self.t_error <= self.sweep.bar).all(axis=(0, 1, 2))
+        place = int(np.where(accurate | ~accurate.any(), conversion, -1.0).argmax())
         return float(self.diameter_um[place])
 
     def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
         """Mean of :attr:`lost` over pillars, at the least angle of the library.
 
-        diameter_um: of the pillars, 0 where there is none. wavelength_um: the nearest
-            of the library is taken; polarisations are averaged.
+        Args:
+            diameter_um: of the pillars, um; 0 where there is none.
+            wavelength_um: the closest one of the library is taken; polarisations are
+                averaged.
         """
-        wave = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
+        nearest = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
         pillars = np.ravel(diameter_um)[np.ravel(diameter_um) > 0]
-        of_size = self.lost[:, 0, wave].mean(axis=0)
-        return float(np.interp(pillars, self.diameter_um, of_size).mean())
+        loss = self.lost[:, 0, nearest].mean(axis=0)
+        return float(np.interp(pillars, self.diameter_um, loss).mean())
 
 
 def check_sweep(cell: Cell, sweep: Sweep) -> None:
-    """Refuse a sweep that cannot be computed, before anything is computed.
+    """Refuse a sweep that cannot be computed.
 
     Args:
         cell: unit cell with its materials, shape and lattice.
+        sweep: settings of the library.
 
     Raises:
         CellError: pillars touch, or diffraction orders propagate in the cover (named).
@@ -278,7 +289,7 @@ def check_sweep(cell: Cell, sweep: Sweep) -> None:
 
 def check_light(cell: Cell, sweep: Sweep) -> None:
     """Refuse wavelengths that a material does not hold, half-spaces that absorb, and
-    orders that propagate in the cover.
+    diffraction orders that propagate in the cover.
 
     Args:
         cell: unit cell with its materials, shape and lattice.

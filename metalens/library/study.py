@@ -68,6 +68,7 @@ class CellStudy:
     cell: Cell | None = None
 
     def __post_init__(self) -> None:
+        """Refuse settings that contradict each other or leave no printable pillar."""
         if self.cell is not None and self.pillar != PLAIN:
             raise ConfigError(
                 "pillar and cell are both given: a cell has its own material; give pillar inside cell"
@@ -84,14 +85,15 @@ class CellStudy:
 
     @property
     def material(self) -> Material:
-        """Of the pillars."""
+        """Material of the pillars."""
         return self.pillar if self.cell is None else self.cell.pillar
 
     def made(
         self, pitch_um: float, height_um: float, pillar: Material | None = None
     ) -> Cell:
-        """One cell of the study, or the same of another material; of layers those of
-        the pillar's own take the height.
+        """One cell of the study, or the same with another pillar material.
+
+        Where the pillar has layers, those of its own material take the height.
 
         Raises:
             CellError: a height that the films of other materials fill.
@@ -102,16 +104,16 @@ class CellStudy:
 
 @dataclass(frozen=True, slots=True)
 class CellVerdict:
-    """One cell at one wavelength.
+    """Result of one cell at one wavelength, on its longest smooth run of diameters.
 
-    turns: of phase that the longest smooth stretch covers; from_um, to_um: its
-        diameters.
-    least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in
-        phase.
+    turns: of phase that the run covers.
+    from_um, to_um: its diameters.
+    least_transmission: smallest |t| on it.
+    mean_power: mean |t|² over it, weighted evenly in phase.
     ends: what bounds it above.
     max_angle_deg: of incidence in air up to which no diffraction order propagates, in
         substrate or cover.
-    error: largest error estimate of t on the stretch.
+    error: largest error estimate of t on it.
     pillar: name of the material, or n + ik.
     """
 
@@ -135,14 +137,14 @@ def run_study(
     *,
     journal: SweepJournal | None = None,
 ) -> list[CellVerdict]:
-    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell
+    """Verdicts on every combination, wavelength by wavelength, then on the best cell
     with other materials.
 
     Args:
-        journal: of the curves that an interrupted run has solved; the verdicts are the
-            same.
         study: what is compared.
         console: where progress is shown.
+        journal: of the curves that an interrupted run has solved; the verdicts are the
+            same.
 
     Raises:
         CellError: a pitch at which diffraction orders propagate in the cover; it is
@@ -154,40 +156,43 @@ def run_study(
         check_light(
             study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
         )
-    tried, _ = other_materials(study)
-    shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
+    materials_tried, _ = other_materials(study)
+    combinations = itertools.product(
+        study.wavelengths_um, study.heights_um, study.pitches_um
+    )
     cases = [
-        (study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes
+        (study.made(pitch, height), wavelength)
+        for wavelength, height, pitch in combinations
     ]
     journal = journal or SweepJournal(None)
     verdicts = _judge_cells(study, cases, journal, console or Console(quiet=True))
     best = best_cell(study, verdicts)
     if best is None:
         return verdicts
-    cells = [study.made(*best, other) for other in tried]
-    again = [
+    cells = [study.made(*best, material) for material in materials_tried]
+    best_cases = [
         (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
     ]
-    return verdicts + _judge_cells(study, again, journal, Console(quiet=True))
+    return verdicts + _judge_cells(study, best_cases, journal, Console(quiet=True))
 
 
 def other_materials(study: CellStudy) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Other materials that are tried, without the study's own; and those whose sources
-    lack a wavelength.
+    """(tried, untried) other materials than the study's own: those whose sources hold
+    all the wavelengths, and those that lack one.
 
     Raises:
         MaterialError: an unknown name or a file that cannot be read.
     """
-    named_else = [
-        name for name in dict.fromkeys(study.others) if name != study.material
-    ]
-    ranges = {name: materials.find_material(name).range_um for name in named_else}
-    held = [
-        all(low <= w <= high for w in study.wavelengths_um)
+    names = [name for name in dict.fromkeys(study.others) if name != study.material]
+    ranges = {name: materials.find_material(name).range_um for name in names}
+    covered = [
+        all(low <= wavelength <= high for wavelength in study.wavelengths_um)
         for low, high in ranges.values()
     ]
-    tried = tuple(name for name, holds in zip(named_else, held, strict=True) if holds)
-    return tried, tuple(name for name in named_else if name not in tried)
+    tried = tuple(
+        name for name, is_covered in zip(names, covered, strict=True) if is_covered
+    )
+    return tried, tuple(name for name in names if name not in tried)
 
 
 def _judge_cells(
@@ -196,7 +201,12 @@ def _judge_cells(
     journal: SweepJournal,
     console: Console,
 ) -> list[CellVerdict]:
-    """One rational curve t(D) a case, on all cores."""
+    """Verdict on every case, from one rational curve t(D) each, solved on all cores.
+
+    Args:
+        cases: (cell, wavelength in um).
+        journal: of curves that are solved already.
+    """
     tasks = [
         Task(
             "curves",
@@ -216,7 +226,7 @@ def _judge_cells(
 
 
 def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
-    """(least, largest) printable size.
+    """(least, largest) printable size of a cell, um.
 
     Raises:
         CellError: there is none.
@@ -234,7 +244,10 @@ def _span(study: CellStudy, cell: Cell) -> tuple[float, float]:
 def judge_cell(
     study: CellStudy, cell: Cell, wavelength_um: float, curve: ResponseCurve
 ) -> CellVerdict:
-    """The smooth stretch that covers most phase on one curve.
+    """Verdict on one curve: the run of sizes without a fault that covers most phase.
+
+    A fault is |t| below the limit, a falling phase (rising, of openings), an error bar
+    above half of |t|, or a narrow resonance. The curve is sampled at 600 sizes.
 
     Args:
         study: what is compared.
@@ -244,30 +257,28 @@ def judge_cell(
     nodes = curve.nodes.diameter_um
     d = np.linspace(nodes.min(), nodes.max(), 600)
     value, error = curve(d)
-    hole = (
-        cell.shape.hole
-    )  # the wider an opening, the less phase: taken with the other sign
+    hole = cell.shape.hole  # the wider an opening, the less phase: its sign is changed
     level = np.abs(value[:, 0])
     phase = np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
-    back = "the phase rises" if hole else "the phase falls"
+    reversal = "the phase rises" if hole else "the phase falls"
     faults = {
         "|t| falls": level < study.least_transmission,
-        back: np.diff(phase, append=np.inf) < 0,
+        reversal: np.diff(phase, append=np.inf) < 0,
     }
     faults["an error bar above half of |t|"] = error > UNKNOWN * level
-    sharp = np.zeros(len(d), bool)
+    near_resonance = np.zeros(len(d), bool)
     for centre, width in curve.resonances(study.least_half_width_um):
-        sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
-    faults["a narrow resonance"] = sharp
+        near_resonance |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
+    faults["a narrow resonance"] = near_resonance
     run = max(
         find_runs(~np.any(list(faults.values()), axis=0)),
-        key=lambda one: phase[one.stop - 1] - phase[one.start],
+        key=lambda candidate: phase[candidate.stop - 1] - phase[candidate.start],
         default=slice(0, 0),
     )
     start, stop = run.start, run.stop
-    why = [name for name, mask in faults.items() if stop < len(d) and mask[stop]] or [
-        "the printable range"
-    ]
+    reasons = [
+        name for name, mask in faults.items() if stop < len(d) and mask[stop]
+    ] or ["the printable range"]
     return CellVerdict(
         cell.pitch_um,
         cell.height_um,
@@ -277,7 +288,7 @@ def judge_cell(
         float(d[max(start, stop - 1)]),
         float(level[run].min(initial=1.0)),
         _mean_over_phase(phase[run], level[run] ** 2),
-        " and ".join(why),
+        " and ".join(reasons),
         max_angle_deg(cell, wavelength_um),
         float(error[run].max(initial=0.0)),
         material_name(cell.pillar),
@@ -285,8 +296,10 @@ def judge_cell(
 
 
 def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
-    """Angle of incidence in air up to which no other order propagates on either side:
-    sin = wavelength / spacing of rows - largest n.
+    """Angle of incidence in air up to which only the zero order propagates on either
+    side, deg.
+
+    sin(angle) = wavelength / row spacing - largest n.
 
     Args:
         cell: whose substrate and cover count.
@@ -300,6 +313,7 @@ def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
 
 
 def _mean_over_phase(phase: Array, power: Array) -> float:
+    """Mean of the power over the phase, by the trapezoidal rule; 0 below two samples."""
     if len(phase) < 2:
         return 0.0
     return float(np.trapezoid(power, phase) / (phase[-1] - phase[0]))
@@ -308,8 +322,8 @@ def _mean_over_phase(phase: Array, power: Array) -> float:
 def study_markdown(
     study: CellStudy, verdicts: list[CellVerdict], *, command: str
 ) -> str:
-    """The study as a page with one table a wavelength: turns covered (least |t|), pitch
-    across, height down.
+    """The study as a Markdown page with one table per wavelength: turns covered (mean
+    |t|²), pitch across, height down.
 
     Args:
         verdicts: of all its cells.
@@ -337,33 +351,33 @@ def study_markdown(
                 [v for v in _own(study, verdicts) if v.wavelength_um == wavelength],
             ),
         ]
-    missed = uncertain_entries(study, verdicts)
-    lines += ["", missed[0].upper() + missed[1:] + "."] if missed else []
+    uncertain = uncertain_entries(study, verdicts)
+    lines += ["", uncertain[0].upper() + uncertain[1:] + "."] if uncertain else []
     return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
 
 
 def uncertain_entries(study: CellStudy, verdicts: Iterable[CellVerdict]) -> str:
-    """On how many stretches an error bar of t lies above the tolerance, in words; empty
-    where on none.
+    """Sentence on how many runs have an error bar of t above the tolerance, with the
+    largest; empty where none has.
 
     Args:
         study: what is compared.
         verdicts: of all its cells.
     """
-    every = [v for v in verdicts if v.turns > 0]
-    missed = [v for v in every if v.error > study.tolerance]
-    if not missed:
+    runs = [v for v in verdicts if v.turns > 0]
+    uncertain = [v for v in runs if v.error > study.tolerance]
+    if not uncertain:
         return ""
-    worst = max(missed, key=lambda v: v.error)
+    worst = max(uncertain, key=lambda v: v.error)
     place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
     return (
-        f"on {len(missed)} of {len(every)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
+        f"on {len(uncertain)} of {len(runs)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
         f"largest of {worst.error:.2g} ({worst.pillar}, {place})"
     )
 
 
 def _subject(study: CellStudy) -> str:
-    """What the pillars are, in words."""
+    """The pillars of the study with their materials, in words."""
     if study.cell is None:
         return f"Round pillars of {material_name(study.pillar)} on fused silica in air"
     substrate = material_name(study.cell.substrate)
@@ -372,7 +386,7 @@ def _subject(study: CellStudy) -> str:
 
 
 def _limits(study: CellStudy) -> str:
-    """What is printed, in words."""
+    """The printable sizes, in words."""
     least = f"{1e3 * study.min_diameter_um:.4g} nm"
     gap = f"{1e3 * study.min_gap_um:.4g} nm"
     if study.made(study.pitches_um[0], study.heights_um[0]).round:
@@ -393,11 +407,13 @@ def material_name(material: Material) -> str:
 
 
 def _own(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[CellVerdict]:
+    """Verdicts on the study's own material."""
     return [v for v in verdicts if v.pillar == material_name(study.material)]
 
 
 def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
-    found = {(v.height_um, v.pitch_um): v for v in verdicts}
+    """Markdown lines of one wavelength: turns (mean |t|²), pitch across, height down."""
+    by_cell = {(v.height_um, v.pitch_um): v for v in verdicts}
     head = (
         "| height \\ pitch (nm) | "
         + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um)
@@ -405,7 +421,7 @@ def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
     )
     lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
     for height in study.heights_um:
-        cells = [found[height, pitch] for pitch in study.pitches_um]
+        cells = [by_cell[height, pitch] for pitch in study.pitches_um]
         texts = [
             f"**{v.turns:.2f}** ({v.mean_power:.2f})"
             if v.turns >= 1
@@ -419,8 +435,10 @@ def _table(study: CellStudy, verdicts: Iterable[CellVerdict]) -> list[str]:
 def best_cell(
     study: CellStudy, verdicts: list[CellVerdict]
 ) -> tuple[float, float] | None:
-    """(pitch, height) in um that covers a full turn at every wavelength with most turns
-    at the worst of them, at the least height; None where no cell does.
+    """(pitch, height) in um of the lowest pillars that cover a full turn at every
+    wavelength; None where no cell does.
+
+    Among pitches of equal height, the one with most turns at its worst wavelength.
 
     Args:
         study: what is compared.
@@ -429,22 +447,26 @@ def best_cell(
     by_cell: dict[tuple[float, float], list[float]] = {}
     for v in _own(study, verdicts):
         by_cell.setdefault((v.height_um, v.pitch_um), []).append(v.turns)
-    good = {cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1}
-    if not good:
+    worst_turns = {
+        cell: min(turns) for cell, turns in by_cell.items() if min(turns) >= 1
+    }
+    if not worst_turns:
         return None
-    height = min(cell[0] for cell in good)
+    height = min(cell[0] for cell in worst_turns)
     best = max(
-        (cell for cell in good if cell[0] == height), key=lambda cell: good[cell]
+        (cell for cell in worst_turns if cell[0] == height),
+        key=lambda cell: worst_turns[cell],
     )
     return best[1], best[0]
 
 
 def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
+    """Markdown lines on the best cell, with each material and wavelength."""
     waves = " and ".join(f"{1e3 * w:g}" for w in study.wavelengths_um)
     best = best_cell(study, verdicts)
     if best is None:
         return [f"No cell covers a full turn at {waves} nm."]
-    found = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
+    chosen = [v for v in verdicts if (v.pitch_um, v.height_um) == best]
     lines = [
         "## Choice",
         "",
@@ -452,7 +474,7 @@ def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
         f"them the pitch of {1e3 * best[0]:g} nm has most to spare.",
         "",
     ]
-    for v in found:
+    for v in chosen:
         lines.append(
             f"- {v.pillar}, {1e3 * v.wavelength_um:g} nm: {v.turns:.2f} turns from {1e3 * v.from_um:.0f} to "
             f"{1e3 * v.to_um:.0f} nm "
@@ -467,8 +489,8 @@ def _choice(study: CellStudy, verdicts: list[CellVerdict]) -> list[str]:
 
 
 def round_to_tolerance(value: object) -> object:
-    """Six significant digits: what the tolerance carries, and the same text on any
-    machine.
+    """The value with all numbers at six significant digits, so that the text is the
+    same on any machine.
 
     Args:
         value: a number, text, list or dictionary.

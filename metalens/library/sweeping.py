@@ -21,7 +21,7 @@ from metalens.library.record import PillarLibrary, Sweep, check_sweep
 from metalens.library.workers import SweepJournal, Task
 
 Rows = dict[Incidence, Array]  # (3, diameter) complex: t, r, error estimate
-POINTS = 8  # entries a task when solved one by one
+POINTS = 8  # entries per task when solved one by one
 NODES = 5  # values of an axis that are solved first, where it has more than six
 
 
@@ -33,14 +33,16 @@ def sweep(
     console: Console | None = None,
     checkpoint: Path | None = None,
 ) -> PillarLibrary:
-    """Compute a library.
+    """Compute a library: response over diameter at all wavelengths, angles and
+    polarisations.
 
     Args:
-        settings: what it holds; wavelengths_um: instead of those of the settings.
-        console: where progress is shown.
-        checkpoint: file for finished curves; a sweep that was interrupted goes on from
-            it, to the same result.
         cell: unit cell with its materials, shape and lattice.
+        settings: what the library holds.
+        wavelengths_um: in place of those of the settings.
+        console: where progress is shown.
+        checkpoint: file for finished curves; an interrupted sweep resumes from it, with
+            the same result.
 
     Raises:
         CellError, MaterialError: see :func:`metalens.library.record.check_sweep`.
@@ -49,68 +51,76 @@ def sweep(
     if wavelengths_um is not None:
         settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
     check_sweep(cell, settings)
-    work = _SweepRun(cell, settings.with_tolerance(cell), console, checkpoint)
-    return work.library()
+    run = _SweepRun(cell, settings.with_tolerance(cell), console, checkpoint)
+    return run.library()
 
 
 class _SweepRun:
-    """The curves of a sweep that was checked, by plane wave."""
+    """The curves t(D) of a checked sweep, by plane wave."""
 
     def __init__(
         self, cell: Cell, sweep: Sweep, console: Console | None, checkpoint: Path | None
     ) -> None:
-        self.cell, self.sweep, self.span = cell, sweep, sweep.span_um(cell)
+        self.cell = cell
+        self.sweep = sweep
+        self.span = sweep.span_um(cell)
         self.console = console or Console(quiet=True)
         self.engine = engines.choose_engine(cell, sweep.engine)  # type: ignore[arg-type]
         self.journal = SweepJournal(checkpoint, cell, sweep)
         self.curves: dict[Incidence, ResponseCurve] = {}
 
     def library(self) -> PillarLibrary:
-        """Curves are solved at a few wavelengths and angles first; those that
-        polynomials between them do not give within the tolerance are solved too, and
-        single entries that are still above it one by one.
+        """Run the sweep: curves at a few wavelengths and angles, and polynomials
+        between them.
+
+        Rows with over 20 entries above the tolerance get a curve of their own. Single
+        entries that are still above it are solved one by one.
         """
         sweep = self.sweep
-        nodes = pick_nodes(sweep.wavelengths_um), pick_nodes(sweep.angles_deg)
+        wavelengths = pick_nodes(sweep.wavelengths_um)
+        angles = pick_nodes(sweep.angles_deg)
         self.solve(
             [
                 self.wave(wavelength, angle, polarization)
-                for angle in nodes[1]
+                for angle in angles
                 for polarization in sweep.polarizations
-                for wavelength in nodes[0]
+                for wavelength in wavelengths
             ],
             "curves",
         )
         diameters = _diameters(self.span, sweep.samples, list(self.curves.values()))
         rows = self.rows(diameters)
-        weak = [  # a curve takes some twenty solves
+        inaccurate = [  # 20 entries: a curve takes about as many solves
             light
             for light, row in rows.items()
             if light not in self.curves and self.misses(row).sum() > 20
         ]
-        if weak:
-            self.solve(weak, "more curves")
+        if inaccurate:
+            self.solve(inaccurate, "more curves")
             rows = self.rows(diameters)
         points = self.points(diameters, rows)
         solved = self.journal.run(points, self.console, "entries one by one")
-        for task, (made,) in zip(points, solved, strict=True):
+        for task, (entries,) in zip(points, solved, strict=True):
             row = rows[task.lights[0]]
-            place = np.searchsorted(diameters, made.diameter_um)
-            better = made.error < row[2, place].real
-            values = np.concatenate([made.response.T, made.error[None]])
-            row[:, place[better]] = values[:, better]
-        count = sum(len(one.nodes.diameter_um) for one in self.curves.values())
-        count += sum(len(task.sizes_um) for task in points)
-        found = self.record(diameters, rows, count)
+            index = np.searchsorted(diameters, entries.diameter_um)
+            better = entries.error < row[2, index].real
+            values = np.concatenate([entries.response.T, entries.error[None]])
+            row[:, index[better]] = values[:, better]
+        solve_count = sum(
+            len(curve.nodes.diameter_um) for curve in self.curves.values()
+        )
+        solve_count += sum(len(task.sizes_um) for task in points)
+        result = self.record(diameters, rows, solve_count)
         self.journal.finish()
-        return found
+        return result
 
     def wave(
         self, wavelength_um: float, angle_deg: float, polarization: Polarization
     ) -> Incidence:
-        """The plane wave of an entry. At normal incidence s and p are x and y: of cells
-        that respond equally to both x alone, of others s is y (the plane of incidence is
-        along x).
+        """Plane wave of an entry, with s and p written as x and y at normal incidence.
+
+        The plane of incidence is along x: s is y, and p is x. Cells that respond
+        equally to both use x for s as well.
         """
         if not angle_deg and polarization in ("s", "p"):
             along_y = polarization == "s" and not self.cell.alike
@@ -118,81 +128,91 @@ class _SweepRun:
         return Incidence(wavelength_um, math.radians(angle_deg), polarization)
 
     def solve(self, lights: list[Incidence], label: str) -> None:
-        """Add the curves of some plane waves.
+        """Solve and store the curves of plane waves.
 
-        Those of one wavelength and direction share their work in one task where the
+        Waves of one wavelength and direction share their work in one task where the
         solver can. Oblique light comes first: it takes several times as long as normal
-        incidence, which then fills the end.
+        incidence.
         """
         share = engines.has_upright_walls(self.cell, self.engine)
         groups: dict[object, list[Incidence]] = {}
-        for one in sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad):
-            key = (one.wavelength_um, one.angle_rad) if share else one
-            groups.setdefault(key, []).append(one)
-        about = self.sweep.bar, self.engine
+        for wave in sorted(dict.fromkeys(lights), key=lambda light: -light.angle_rad):
+            key = (wave.wavelength_um, wave.angle_rad) if share else wave
+            groups.setdefault(key, []).append(wave)
+        options = self.sweep.bar, self.engine
         tasks = [
-            Task("curves", self.cell, tuple(group), self.span, *about)
+            Task("curves", self.cell, tuple(group), self.span, *options)
             for group in groups.values()
         ]
         for task, solved in zip(
             tasks, self.journal.run(tasks, self.console, label), strict=True
         ):
-            made = workers.fit_curves(solved, tolerance=self.sweep.bar)
-            self.curves |= dict(zip(task.lights, made, strict=True))
+            curves = workers.fit_curves(solved, tolerance=self.sweep.bar)
+            self.curves |= dict(zip(task.lights, curves, strict=True))
 
     def misses(self, row: Array) -> Array:
-        """Entries of a row whose error is above the tolerance."""
+        """(diameter,) mask of the entries of a row whose error exceeds the tolerance."""
         return np.asarray(row[2].real > self.sweep.bar)
 
     def rows(self, diameters: Array) -> Rows:
-        """All rows of the sweep: those of the curves, then between wavelengths, then
-        between angles.
+        """All rows of the sweep: those of the curves, then interpolated between
+        wavelengths, then between angles (in sin²).
         """
         rows: Rows = {}
-        sharp = {}
+        resonances = {}
         for light, curve in self.curves.items():
             value, error = curve(diameters)
             rows[light] = np.stack([value[:, 0], value[:, 1], error])
-            sharp[light] = curve.resonances(0.005)  # between nodes it shows at neither
+            resonances[light] = curve.resonances(0.005)  # narrow ones only
         sweep = self.sweep
         for polarization in sweep.polarizations:
             for angle in sweep.angles_deg:
                 family = {
-                    w: self.wave(w, angle, polarization) for w in sweep.wavelengths_um
+                    wavelength_um: self.wave(wavelength_um, angle, polarization)
+                    for wavelength_um in sweep.wavelengths_um
                 }
-                _interpolate_family(rows, family, sharp, diameters)
+                _interpolate_family(rows, family, resonances, diameters)
             for wavelength in sweep.wavelengths_um:
                 family = {
-                    math.sin(math.radians(a)) ** 2: self.wave(
-                        wavelength, a, polarization
+                    math.sin(math.radians(angle_deg)) ** 2: self.wave(
+                        wavelength, angle_deg, polarization
                     )
-                    for a in sweep.angles_deg
+                    for angle_deg in sweep.angles_deg
                 }
-                _interpolate_family(rows, family, sharp, diameters)
+                _interpolate_family(rows, family, resonances, diameters)
         return rows
 
     def points(self, diameters: Array, rows: Rows) -> list[Task]:
-        """Tasks for the entries whose error bar is above the tolerance, but where a
-        solve by itself is no better.
+        """Tasks for the entries whose error bar exceeds the tolerance.
+
+        Left out are those at the solver's finest discretisation, where a single solve
+        has no less error.
         """
         tasks = []
         for light, row in rows.items():
-            misses, bar = self.misses(row), self.sweep.bar
+            misses = self.misses(row)
+            bar = self.sweep.bar
             curve = self.curves.get(light)
             if curve and engines.is_at_finest_discretization(
                 self.cell, curve.nodes.error, bar * workers.SOLVE_SHARE
             ):
                 misses &= curve.solver_error(diameters) <= bar
-            bad = diameters[misses].tolist()
-            for start in range(0, len(bad), POINTS):
-                some = tuple(bad[start : start + POINTS])
+            inaccurate = diameters[misses].tolist()
+            for start in range(0, len(inaccurate), POINTS):
+                sizes = tuple(inaccurate[start : start + POINTS])
                 tasks.append(
-                    Task("points", self.cell, (light,), some, bar, self.engine)
+                    Task("points", self.cell, (light,), sizes, bar, self.engine)
                 )
         return tasks
 
     def record(self, diameters: Array, rows: Rows, solves: int) -> PillarLibrary:
-        """The library of all rows."""
+        """The library of all rows.
+
+        Args:
+            diameters: (n,) um.
+            rows: of every plane wave.
+            solves: exact solves behind them.
+        """
         sweep = self.sweep
         axes = sweep.polarizations, sweep.angles_deg, sweep.wavelengths_um
         shape = (*map(len, axes), len(diameters))
@@ -229,18 +249,23 @@ class _SweepRun:
 def _diameters(
     span: tuple[float, float], samples: int, curves: list[ResponseCurve]
 ) -> Array:
-    """Even samples, and more where t turns fast: around every resonance, on its own
-    scale.
+    """(n,) evenly spaced diameters, um, and up to 400 more around resonances, at 0.3, 1
+    and 3 half-widths on either side.
+
+    Args:
+        span: (least, largest) diameter, um.
+        samples: evenly spaced diameters.
+        curves: whose resonances count.
     """
     low, high = span
     most = 400  # diameters that are added
     even = np.linspace(low, high, samples)
-    sharp = np.concatenate([curve.resonances() for curve in curves])
-    wide = 3 * (even[1] - even[0])  # well sampled already
+    poles = np.concatenate([curve.resonances() for curve in curves])
+    widest = 3 * (even[1] - even[0])  # well sampled by the even diameters
     # resonances narrower than 0.1 nm cannot be printed, and are not sampled
-    sharp = sharp[(sharp[:, 1] > 1e-4) & (sharp[:, 1] < wide)]
-    half_widths = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])
-    added = (sharp[:, :1] + half_widths * sharp[:, 1:]).ravel()
+    poles = poles[(poles[:, 1] > 1e-4) & (poles[:, 1] < widest)]
+    offsets = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])
+    added = (poles[:, :1] + offsets * poles[:, 1:]).ravel()
     added = np.unique(np.round(added[(added > low) & (added < high)], 6))
     return np.unique(
         np.concatenate([even, added[:: max(1, math.ceil(len(added) / most))]])
@@ -248,11 +273,10 @@ def _diameters(
 
 
 def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
-    """The values to solve first: all of a few, else five Leja points.
+    """The values to solve first: all of up to six, else five Leja points.
 
-    Each is where the product of the distances to those before it is largest, which
-    keeps that product, the factor of the error of the polynomial through them, small
-    everywhere.
+    Each Leja point maximises the product of its distances to those before it. This
+    keeps the error factor of the polynomial through them small everywhere.
     """
     if len(values) <= NODES + 1:
         return values
@@ -266,92 +290,105 @@ def pick_nodes(values: tuple[float, ...]) -> tuple[float, ...]:
 def _interpolate_family(
     rows: Rows,
     family: dict[float, Incidence],
-    sharp: dict[Incidence, Array],
+    resonances: dict[Incidence, Array],
     diameters: Array,
 ) -> None:
-    """Add the rows of a family (position: light) that are missing, where at least five
-    are there.
+    """Add the missing rows of a family by polynomials through its rows, in place, where
+    at least five exist.
 
-    Where a narrow resonance moves from one node to the next, the diameters it passes
-    have an error of 1: they must be solved.
+    Where a narrow resonance moves from one node to the next, the diameters that it
+    passes get an error of 1: they must be solved.
+
+    Args:
+        rows: by plane wave; extended.
+        family: {position: plane wave} along wavelength or sin² of the angle.
+        resonances: (k, 2) narrow ones of each curve: diameter and half-width, um.
+        diameters: (n,) um.
     """
-    have = {x: wave for x, wave in family.items() if wave in rows}
-    if len(have) < NODES:
+    solved = {x: wave for x, wave in family.items() if wave in rows}
+    if len(solved) < NODES:
         return
-    nodes = np.array(list(have))
-    table = np.stack([rows[wave] for wave in have.values()])
+    nodes = np.array(list(solved))
+    table = np.stack([rows[wave] for wave in solved.values()])
     for x, wave in family.items():
         if wave not in rows:
             row = interpolate_row(nodes, table, x)
             right = int(np.searchsorted(nodes, x))
-            first, second = (
-                sharp.get(have[float(nodes[i])], np.empty((0, 2)))
+            below, above = (
+                resonances.get(solved[float(nodes[i])], np.empty((0, 2)))
                 for i in (right - 1, right)
             )
-            passed = _crossed_by_resonances(first, second, diameters)
-            row[2] = np.where(passed, 1.0, row[2])
+            crossed = _crossed_by_resonances(below, above, diameters)
+            row[2] = np.where(crossed, 1.0, row[2])
             rows[wave] = row
 
 
 def _crossed_by_resonances(first: Array, second: Array, diameters: Array) -> Array:
-    """Mask of the diameters that narrow resonances may pass between two neighbouring
-    nodes.
+    """(n,) mask of the diameters that narrow resonances may pass between two
+    neighbouring nodes.
+
+    A resonance moves to the closest one of the other node, if that is within 0.02 um;
+    else it may move 0.02 um either way. Four half-widths are added.
+
+    Args:
+        first: (k, 2) diameter and half-width at one node, um.
+        second: the same at the other.
+        diameters: (n,) um.
     """
     mask = np.zeros(len(diameters), bool)
-    moves_um = 0.02  # at most, from one node to the next
-    for here, there in ((first, second), (second, first)):
-        for centre, width in here:
-            gap = np.abs(there[:, 0] - centre)
-            end = (
-                float(there[np.argmin(gap), 0])
-                if gap.size and gap.min() < moves_um
-                else None
-            )
-            low, high = (
-                (centre - moves_um, centre + moves_um)
-                if end is None
-                else sorted((centre, end))
-            )
+    reach_um = 0.02  # largest move from one node to the next
+    for poles, others in ((first, second), (second, first)):
+        for centre, width in poles:
+            distance = np.abs(others[:, 0] - centre)
+            low, high = centre - reach_um, centre + reach_um
+            if distance.size and distance.min() < reach_um:
+                low, high = sorted((centre, float(others[np.argmin(distance), 0])))
             mask |= (diameters >= low - 4 * width) & (diameters <= high + 4 * width)
     return mask
 
 
 def interpolate_row(nodes: Array, table: Array, x: float) -> Array:
-    """(3, diameter) row at ``x`` by the polynomial through all nodes.
+    """(3, diameter) row at ``x`` by the polynomial through all nodes: t, r, error
+    estimate.
 
-    The error is extrapolated. Leaving out one node changes the row by the error of the
-    next lower degree, leaving out two by that of the degree below; where the second is
-    less than the first by some factor, the polynomial through all nodes is better by
-    that factor again. Changes are taken as the largest of neighbouring diameters, as
-    any one may vanish by chance; the result is trebled, and the errors of the nodes are
-    added as they enter.
+    The error of t is extrapolated from leave-out tests. The first change c1 is that of
+    t by leaving out one node, the second c2 by leaving out another one as well. Each
+    node is taken to reduce the error by c1 / c2: error = 3 c1 min(1, c1 / c2), plus the
+    nodes' errors times |weight|. Changes are the largest of nine neighbouring
+    diameters, as one alone may vanish by chance.
 
-    nodes: (m,). table: (m, 3, diameter).
+    Args:
+        nodes: (m,) positions.
+        table: (m, 3, diameter) rows at the nodes.
+        x: position of the new row.
     """
     weights = lagrange_weights(nodes, x)
     row: Array = np.tensordot(weights, table, 1)
-    one, two = np.zeros(table.shape[2]), np.zeros(table.shape[2])
+    first_change = np.zeros(table.shape[2])
+    second_change = np.zeros(table.shape[2])
     for k in range(len(nodes)):
-        keep = np.arange(len(nodes)) != k
-        without = np.tensordot(lagrange_weights(nodes[keep], x), table[keep, 0], 1)
-        one = np.maximum(one, np.abs(without - row[0]))
+        all_but_k = np.arange(len(nodes)) != k
+        reduced = np.tensordot(
+            lagrange_weights(nodes[all_but_k], x), table[all_but_k, 0], 1
+        )
+        first_change = np.maximum(first_change, np.abs(reduced - row[0]))
         for j in range(k):
-            fewer = keep & (np.arange(len(nodes)) != j)
-            two = np.maximum(
-                two,
-                np.abs(
-                    np.tensordot(lagrange_weights(nodes[fewer], x), table[fewer, 0], 1)
-                    - without
-                ),
+            all_but_jk = all_but_k & (np.arange(len(nodes)) != j)
+            twice_reduced = np.tensordot(
+                lagrange_weights(nodes[all_but_jk], x), table[all_but_jk, 0], 1
             )
-    one, two = (maximum_filter1d(change, 9) for change in (one, two))
-    gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
-    row[2] = 3 * gain * one + np.abs(weights) @ table[:, 2].real
+            second_change = np.maximum(second_change, np.abs(twice_reduced - reduced))
+    first_change = maximum_filter1d(first_change, 9)
+    second_change = maximum_filter1d(second_change, 9)
+    gain = np.minimum(1.0, first_change / np.maximum(second_change, 1e-300))
+    row[2] = 3 * gain * first_change + np.abs(weights) @ table[:, 2].real
     return row
 
 
 def lagrange_weights(nodes: Array, x: float) -> Array:
-    """(m,) weights of the values at the nodes in the polynomial through them at ``x``."""
+    """(m,) Lagrange weights at ``x``: w_i = product over j != i of (x - x_j) / (x_i -
+    x_j).
+    """
     ratio = (x - nodes[None, :]) / (
         nodes[:, None] - nodes[None, :] + np.eye(len(nodes))
     )

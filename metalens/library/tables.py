@@ -17,7 +17,7 @@ from metalens.core.errors import DomainError
 from metalens.library.proxy import MOST_ERROR
 from metalens.library.record import PillarLibrary, Sweep
 
-LIGHT_UM_THZ = 299.792458  # wavelength in um times frequency in THz
+LIGHT_UM_THZ = 299.792458  # speed of light: wavelength in um times frequency in THz
 LENGTHS = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6}
 FREQUENCIES = {"thz": 1.0, "ghz": 1e-3, "hz": 1e-12}
 ANGLES = {"deg": math.pi / 180, "degrees": math.pi / 180, "rad": 1.0}
@@ -35,7 +35,7 @@ KINDS = {  # quantity: names of its column, without unit
     "imaginary": ("im_t", "t_im", "t_imag", "imag_t", "im_s21", "s21_im", "s21_imag"),
     "error": ("t_error", "error", "sigma"),
 }
-LEAST_SIZES = 12  # of a smooth proxy
+LEAST_SIZES = 12  # that a smooth proxy needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,32 +83,36 @@ def from_table(
         >>> from metalens.library import from_table
         >>> d = np.linspace(80, 200, 25)
         >>> arrays = {"diameter_nm": d, "phase_deg": 3.0 * d, "transmission": 0.9 + 0 * d}
-        >>> made = from_table(arrays, Cell(0.3), wavelength_um=0.85)
-        >>> round(float(abs(made.t[0, 0, 0, 3])), 4)
+        >>> library = from_table(arrays, Cell(0.3), wavelength_um=0.85)
+        >>> round(float(abs(library.t[0, 0, 0, 3])), 4)
         0.9487
     """
     where = "the table" if isinstance(table, Mapping) else str(table)
-    named = table if isinstance(table, Mapping) else _read(Path(table), columns)
-    found = _recognise(named, where)
-    t, words = _amplitudes(found, where)
-    size_um = _sizes(found, where)
-    waves_um = _wavelengths(found, wavelength_um, len(size_um), where)
-    angles_rad = found["angle"].values if "angle" in found else np.zeros(len(size_um))
-    error = found["error"].values if "error" in found else np.full(len(t), np.nan)
-    axes, place = _grid(angles_rad, waves_um, size_um, where)
-    t, error = t[place], error[place]
-    t, turned = _with_rising_phase(t)
-    words.append(
+    raw_columns = table if isinstance(table, Mapping) else _read(Path(table), columns)
+    quantities = _recognise(raw_columns, where)
+    t, notes = _amplitudes(quantities, where)
+    size_um = _sizes(quantities, where)
+    wavelengths_um = _wavelengths(quantities, wavelength_um, len(size_um), where)
+    angles_rad = (
+        quantities["angle"].values if "angle" in quantities else np.zeros(len(size_um))
+    )
+    error = (
+        quantities["error"].values if "error" in quantities else np.full(len(t), np.nan)
+    )
+    axes, rows = _grid(angles_rad, wavelengths_um, size_um, where)
+    t, error = t[rows], error[rows]
+    t, conjugated = _with_rising_phase(t)
+    notes.append(
         "phase fell with the size: conjugated to exp(-iwt)"
-        if turned
+        if conjugated
         else "phase rises with the size, as of exp(-iwt)"
     )
-    if "error" in found:
-        words.append("error bars from their column")
+    if "error" in quantities:
+        notes.append("error bars from their column")
     else:
         error = _left_out_errors(axes[2], t)
-        words.append("error bars from a cubic that leaves each entry out")
-    return _library(cell, axes, t, np.maximum(error, 0.0), tuple(words))
+        notes.append("error bars from a cubic that leaves each entry out")
+    return _library(cell, axes, t, np.maximum(error, 0.0), tuple(notes))
 
 
 def _library(
@@ -118,11 +122,20 @@ def _library(
     error: Array,
     notes: tuple[str, ...],
 ) -> PillarLibrary:
-    angles, waves, sizes = axes
-    lights = ("x",) if len(angles) == 1 and angles[0] == 0 else ("s", "p")
-    entries = np.broadcast_to(t, (len(lights), *t.shape)).copy()
+    """Library of engine ``table`` from gridded entries.
+
+    Args:
+        cell: of which the table is.
+        axes: angles (rad), wavelengths (um) and sizes (um).
+        t: (angle, wavelength, size) complex amplitudes.
+        error: error bars, as t.
+        notes: what was recognised, in words.
+    """
+    angles, wavelengths, sizes = axes
+    polarizations = ("x",) if len(angles) == 1 and angles[0] == 0 else ("s", "p")
+    entries = np.broadcast_to(t, (len(polarizations), *t.shape)).copy()
     sweep = Sweep(
-        wavelengths_um=tuple(map(float, waves)),
+        wavelengths_um=tuple(map(float, wavelengths)),
         angles_deg=tuple(map(float, np.degrees(angles))),
         diameters_um=(float(sizes[0]), float(sizes[-1])),
         samples=max(20, len(sizes)),
@@ -131,9 +144,9 @@ def _library(
     return PillarLibrary(
         cell,
         sweep,
-        lights,
+        polarizations,
         angles,
-        waves,
+        wavelengths,
         sizes,
         entries,
         np.zeros_like(entries),
@@ -147,31 +160,41 @@ def _library(
 
 
 def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
-    """{column: values} of a file."""
+    """{column: (n,) values} of a CSV, TSV, NPZ or MAT file.
+
+    Args:
+        path: of the file.
+        columns: names in place of the header of a text file.
+
+    Raises:
+        DomainError: not readable, empty, or rows that are not numbers.
+    """
     try:
         if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as held:
-                return {name: np.ravel(held[name]) for name in held.files}
+            with np.load(path, allow_pickle=False) as content:
+                return {name: np.ravel(content[name]) for name in content.files}
         if path.suffix.lower() == ".mat":
             from scipy.io import loadmat
 
-            held = loadmat(path)
-            return {k: np.ravel(v) for k, v in held.items() if not k.startswith("__")}
+            content = loadmat(path)
+            return {
+                k: np.ravel(v) for k, v in content.items() if not k.startswith("__")
+            }
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError, NotImplementedError) as fault:
+    except (OSError, ValueError, NotImplementedError) as error:
         raise DomainError(
-            f"{path}: not read ({fault}); give CSV, TSV, NPZ or MAT of version 5"
+            f"{path}: not read ({error}); give CSV, TSV, NPZ or MAT of version 5"
         ) from None
     lines = [ln for ln in text.splitlines() if ln.strip() and ln[0] not in "#%"]
     if not lines:
         raise DomainError(f"{path}: empty; need a header and a row for each entry")
-    mark = next((m for m in "\t;," if m in lines[0]), None)
-    if mark in (";", "\t"):
+    separator = next((m for m in "\t;," if m in lines[0]), None)
+    if separator in (";", "\t"):
         lines = [line.replace(",", ".") for line in lines]
     rows = (
         [ln.split() for ln in lines]
-        if mark is None
-        else [*csv.reader(lines, delimiter=mark)]
+        if separator is None
+        else [*csv.reader(lines, delimiter=separator)]
     )
     header = list(columns) or rows.pop(0)
     try:
@@ -190,18 +213,28 @@ def _read(path: Path, columns: Sequence[str]) -> dict[str, Any]:
 
 
 def _numbers(row: list[str]) -> bool:
+    """Whether every field of a row is a number."""
     try:
         return all(map(float, row)) or True
     except ValueError:
         return False
 
 
-def _recognise(named: Mapping[str, Any], where: str) -> dict[str, _Column]:
-    """Columns by quantity, in um, rad and shares."""
-    found: dict[str, _Column] = {}
-    for name, given in named.items():
+def _recognise(raw_columns: Mapping[str, Any], where: str) -> dict[str, _Column]:
+    """{quantity: column} of a table, in um, rad and fractions.
+
+    Args:
+        raw_columns: {name: values}.
+        where: names the table in errors.
+
+    Raises:
+        DomainError: an unknown or repeated column, unequal lengths, or values that are
+            not finite.
+    """
+    quantities: dict[str, _Column] = {}
+    for name, content in raw_columns.items():
         kind, unit = _quantity(str(name))
-        values = np.ravel(np.asarray(given))
+        values = np.ravel(np.asarray(content))
         if kind == "power" and np.iscomplexobj(values):
             kind = "complex"
         if not kind:
@@ -209,20 +242,24 @@ def _recognise(named: Mapping[str, Any], where: str) -> dict[str, _Column]:
                 f"{where}: column {name!r} is unknown; known are "
                 f"{', '.join(n[0] for n in KINDS.values())} with a unit (diameter_nm)"
             )
-        if kind in found:
+        if kind in quantities:
             raise DomainError(f"{where}: two columns of {kind}")
-        found[kind] = _Column(kind, *_scaled(kind, unit, values, f"{where}: {name!r}"))
-    lengths = {len(column.values) for column in found.values()}
+        quantities[kind] = _Column(
+            kind, *_scaled(kind, unit, values, f"{where}: {name!r}")
+        )
+    lengths = {len(column.values) for column in quantities.values()}
     if len(lengths) != 1:
         raise DomainError(f"{where}: columns of different lengths {sorted(lengths)}")
-    for kind, column in found.items():
+    for kind, column in quantities.items():
         if not np.isfinite(column.values).all():
             raise DomainError(f"{where}: {kind} holds values that are not finite")
-    return found
+    return quantities
 
 
 def _quantity(name: str) -> tuple[str, str]:
-    """(kind, unit) of a column's name; the kind is empty where it is not known."""
+    """(kind, unit) of a column's name, as ("diameter", "nm") of "Diameter (nm)"; the
+    kind is empty where it is not known.
+    """
     plain = name.strip().lower().replace("μ", "u").replace("µ", "u").replace("°", "deg")
     plain = re.sub(r"\|t\|(\^2|²)", "transmission", plain).replace("|t|", "abs_t")
     plain = re.sub(r"[^\w]+", "_", plain).strip("_")
@@ -236,7 +273,13 @@ def _quantity(name: str) -> tuple[str, str]:
 
 
 def _scaled(kind: str, unit: str, values: Array, where: str) -> tuple[float, Array]:
-    known: dict[str, dict[str, float]] = {
+    """(scale, scaled values) of a column in um, THz or rad; scale 1 for quantities
+    without a unit.
+
+    Raises:
+        DomainError: no unit that this kind has.
+    """
+    units: dict[str, dict[str, float]] = {
         "diameter": LENGTHS,
         "radius": LENGTHS,
         "wavelength": LENGTHS,
@@ -244,61 +287,73 @@ def _scaled(kind: str, unit: str, values: Array, where: str) -> tuple[float, Arr
         "angle": ANGLES,
         "phase": PHASES,
     }
-    if kind not in known:
+    if kind not in units:
         return 1.0, values
-    if unit not in known[kind]:
+    if unit not in units[kind]:
         raise DomainError(
             f"{where} states no unit; name the column {kind}_UNIT, of "
-            f"{', '.join(known[kind])}"
+            f"{', '.join(units[kind])}"
         )
-    return known[kind][unit], values * known[kind][unit]
+    return units[kind][unit], values * units[kind][unit]
 
 
-def _amplitudes(found: dict[str, _Column], where: str) -> tuple[Array, list[str]]:
-    """Complex t of the rows, and how it was stated."""
-    if "complex" in found:
-        t = found["complex"].values.astype(complex)
-        words = ["complex t"]
-    elif {"real", "imaginary"} <= found.keys():
-        t = found["real"].values + 1j * found["imaginary"].values
-        words = ["t from its real and imaginary part"]
-    elif "phase" in found and ("power" in found or "amplitude" in found):
-        by_power = "power" in found
-        level = found["power" if by_power else "amplitude"].values
+def _amplitudes(quantities: dict[str, _Column], where: str) -> tuple[Array, list[str]]:
+    """(n,) complex t of the rows, and a note on how it was stated.
+
+    Args:
+        quantities: {quantity: column}.
+        where: names the table in errors.
+
+    Raises:
+        DomainError: missing columns, or |t| above 1.
+    """
+    if "complex" in quantities:
+        t = quantities["complex"].values.astype(complex)
+        notes = ["complex t"]
+    elif {"real", "imaginary"} <= quantities.keys():
+        t = quantities["real"].values + 1j * quantities["imaginary"].values
+        notes = ["t from its real and imaginary part"]
+    elif "phase" in quantities and ("power" in quantities or "amplitude" in quantities):
+        by_power = "power" in quantities
+        level = quantities["power" if by_power else "amplitude"].values
         if level.min() < 0:
             raise DomainError(f"{where}: transmission {level.min():g} is below 0")
         level = np.sqrt(level) if by_power else level
-        t = level * np.exp(1j * found["phase"].values)
-        words = [f"|t| from {'a share of power' if by_power else 'an amplitude'}"]
+        t = level * np.exp(1j * quantities["phase"].values)
+        notes = [f"|t| from {'a share of power' if by_power else 'an amplitude'}"]
     else:
         raise DomainError(
-            f"{where}: columns of {', '.join(sorted(found))}; need phase with "
+            f"{where}: columns of {', '.join(sorted(quantities))}; need phase with "
             "transmission or amplitude, or t_re with t_im"
         )
-    most = float(np.abs(t).max())
-    if most > 1.001:
+    peak = float(np.abs(t).max())
+    if peak > 1.001:
         raise DomainError(
-            f"{where}: |t| reaches {most:.4g}; t is normalised to power, so that |t|² "
+            f"{where}: |t| reaches {peak:.4g}; t is normalised to power, so that |t|² "
             "is the share that passes (n_cover cos / n_substrate cos times |E|²)"
         )
-    return t / max(1.0, most), words
+    return t / max(1.0, peak), notes
 
 
-def _sizes(found: dict[str, _Column], where: str) -> Array:
-    if "diameter" in found:
-        return np.asarray(found["diameter"].values)
-    if "radius" in found:
-        return np.asarray(2 * found["radius"].values)
+def _sizes(quantities: dict[str, _Column], where: str) -> Array:
+    """(n,) sizes of the rows, um: diameters, or twice the radii."""
+    if "diameter" in quantities:
+        return np.asarray(quantities["diameter"].values)
+    if "radius" in quantities:
+        return np.asarray(2 * quantities["radius"].values)
     raise DomainError(f"{where}: no column of the size; need diameter_nm or radius_nm")
 
 
 def _wavelengths(
-    found: dict[str, _Column], stated_um: float | None, rows: int, where: str
+    quantities: dict[str, _Column], stated_um: float | None, rows: int, where: str
 ) -> Array:
-    if "wavelength" in found:
-        return np.asarray(found["wavelength"].values)
-    if "frequency" in found:
-        return np.asarray(LIGHT_UM_THZ / found["frequency"].values)
+    """(n,) wavelengths of the rows, um: their column, 299.79 um THz / frequency, or the
+    stated one.
+    """
+    if "wavelength" in quantities:
+        return np.asarray(quantities["wavelength"].values)
+    if "frequency" in quantities:
+        return np.asarray(LIGHT_UM_THZ / quantities["frequency"].values)
     if stated_um is None:
         raise DomainError(
             f"{where}: no column of the wavelength; state it (wavelength_um)"
@@ -307,44 +362,63 @@ def _wavelengths(
 
 
 def _grid(
-    angles: Array, waves: Array, sizes: Array, where: str
+    angles: Array, wavelengths: Array, sizes: Array, where: str
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Axes and (angle, wavelength, size) places of the rows."""
-    axes = tuple(np.unique(np.round(v, 9)) for v in (angles, waves, sizes))
+    """Axes (angle, wavelength, size) of the table, and the (angle, wavelength, size)
+    array of row numbers.
+
+    Args:
+        angles: (n,) rad of the rows.
+        wavelengths: (n,) wavelengths, um.
+        sizes: (n,) um.
+        where: names the table in errors.
+
+    Raises:
+        DomainError: under 12 sizes, or entries that are missing or repeated.
+    """
+    axes = tuple(np.unique(np.round(v, 9)) for v in (angles, wavelengths, sizes))
     shape = tuple(map(len, axes))
     if shape[2] < LEAST_SIZES:
         raise DomainError(f"{where}: {shape[2]} sizes; need {LEAST_SIZES} at least")
-    place = np.full(shape, -1)
-    spots = tuple(
+    row_of = np.full(shape, -1)
+    positions = tuple(
         np.searchsorted(axis, np.round(v, 9))
-        for axis, v in zip(axes, (angles, waves, sizes), strict=True)
+        for axis, v in zip(axes, (angles, wavelengths, sizes), strict=True)
     )
-    place[spots] = np.arange(len(sizes))
-    if (place < 0).any():
-        a, w, s = np.argwhere(place < 0)[0]
+    row_of[positions] = np.arange(len(sizes))
+    if (row_of < 0).any():
+        a, w, s = np.argwhere(row_of < 0)[0]
         raise DomainError(
-            f"{where}: {int((place < 0).sum())} entries are missing, the first at "
+            f"{where}: {int((row_of < 0).sum())} entries are missing, the first at "
             f"{math.degrees(axes[0][a]):g} deg, {axes[1][w]:g} um, size {axes[2][s]:g} um"
         )
-    if len(sizes) > place.size:
-        raise DomainError(f"{where}: {len(sizes) - place.size} entries stand twice")
-    return (axes[0], axes[1], axes[2]), place
+    if len(sizes) > row_of.size:
+        raise DomainError(f"{where}: {len(sizes) - row_of.size} entries stand twice")
+    return (axes[0], axes[1], axes[2]), row_of
 
 
 def _with_rising_phase(t: Array) -> tuple[Array, bool]:
-    """t with a phase that rises with the size, and whether it had to be conjugated."""
-    rise = np.unwrap(np.angle(t), axis=-1)
-    falls = float(np.median(rise[..., -1] - rise[..., 0])) < 0
+    """t, conjugated where its phase falls with the size (median over wavelengths and
+    angles), and whether it was.
+    """
+    phase = np.unwrap(np.angle(t), axis=-1)
+    falls = float(np.median(phase[..., -1] - phase[..., 0])) < 0
     return (t.conj() if falls else t), falls
 
 
 def _left_out_errors(sizes: Array, t: Array) -> Array:
-    """Distance of each entry from a cubic spline through the entries of other parity."""
+    """Error bars from interpolation: distance of each entry from a cubic spline through
+    the entries of the other parity of place.
+
+    Args:
+        sizes: (n,) um.
+        t: (angle, wavelength, n) complex amplitudes.
+    """
     error = np.empty(t.shape)
-    every = np.arange(len(sizes))
+    index = np.arange(len(sizes))
     for parity in (0, 1):
-        mine = every[every % 2 == parity]
-        others = every[every % 2 != parity]
+        tested = index[index % 2 == parity]
+        others = index[index % 2 != parity]
         spline = CubicSpline(sizes[others], t[..., others], axis=-1)
-        error[..., mine] = np.abs(spline(sizes[mine]) - t[..., mine])
+        error[..., tested] = np.abs(spline(sizes[tested]) - t[..., tested])
     return error

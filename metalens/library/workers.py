@@ -17,7 +17,7 @@ from metalens.core.report import Console
 from metalens.library import curve, engines
 from metalens.library.curve import ResponseCurve, SolvedNodes
 
-# of an entry's tolerance: for the solver, and for the rational fit
+# shares of an entry's tolerance: for the solver, and for the rational fit
 SOLVE_SHARE, FIT_SHARE = 0.5, 0.4
 
 
@@ -48,57 +48,68 @@ class Task:
 
 
 def run_task(task: Task) -> list[SolvedNodes]:
-    """The solves of a task: a curve a light, or one set of rows."""
+    """Solve a task: one set of nodes per light of ``curves``, else a single set.
+
+    ``jones`` gives four rows of t and r. ``points`` gives a row per size. ``curves``
+    are sampled adaptively; later lights prefer diameters of earlier ones, which cost
+    less.
+    """
     cell, light = task.cell, task.lights[0]
-    about: dict[str, Any] = {"tolerance": task.tolerance, "engine": task.engine}
+    options: dict[str, Any] = {"tolerance": task.tolerance, "engine": task.engine}
     if task.kind == "jones":
         from metalens.rcwa import jones
 
         size = task.sizes_um[0]
-        found = jones(cell, size, light.wavelength_um, harmonics=task.harmonics)
-        response = np.stack([found.t.ravel(), found.r.ravel()], 1)
-        return [SolvedNodes(np.full(4, size), response, np.full(4, found.t_error))]
+        solution = jones(cell, size, light.wavelength_um, harmonics=task.harmonics)
+        response = np.stack([solution.t.ravel(), solution.r.ravel()], 1)
+        return [SolvedNodes(np.full(4, size), response, np.full(4, solution.t_error))]
     if task.kind == "points":
-        solve = engines.solve_to_tolerance(cell, light, **about)
-        made = [solve(d) for d in task.sizes_um]
-        response = np.array([(one.t, one.r) for one in made])
-        error = np.array([one.t_error for one in made])
+        solve = engines.solve_to_tolerance(cell, light, **options)
+        responses = [solve(d) for d in task.sizes_um]
+        response = np.array([(item.t, item.r) for item in responses])
+        error = np.array([item.t_error for item in responses])
         return [SolvedNodes(np.array(task.sizes_um), response, error)]
     low, high = task.sizes_um
-    about["tolerance"] *= SOLVE_SHARE
+    options["tolerance"] *= SOLVE_SHARE
     solves = engines.solvers_at_common_discretization(
-        cell, task.lights, (low, high), **about
+        cell, task.lights, (low, high), **options
     )
     for diameter in curve.starting_diameters(low, high):
-        for solve in solves:  # one after the other they share modes
+        for solve in solves:  # lights in turn at one diameter share its modes
             solve(diameter)
     curves: list[SolvedNodes] = []
-    for solve in solves:  # later ones take diameters of those before, where these serve
-        known = np.concatenate([np.empty(0), *(one.diameter_um for one in curves)])
+    for solve in solves:
+        solved_um = np.concatenate(
+            [np.empty(0), *(earlier.diameter_um for earlier in curves)]
+        )
         tolerance = FIT_SHARE * task.tolerance
         curves.append(
             curve.sample_adaptively(
-                solve, low, high, tolerance=tolerance, cheaper_um=known
+                solve, low, high, tolerance=tolerance, cheaper_um=solved_um
             )
         )
     return curves
 
 
 def fit_curves(solved: list[SolvedNodes], *, tolerance: float) -> list[ResponseCurve]:
-    """The curves t(D) through the solves of a task of curves.
+    """Rational curves t(D) through the solves of a task of curves, one per light.
 
     Args:
         solved: of the task.
         tolerance: that the task had.
     """
     return [
-        curve.fit_response_curve(one, tolerance=FIT_SHARE * tolerance) for one in solved
+        curve.fit_response_curve(nodes, tolerance=FIT_SHARE * tolerance)
+        for nodes in solved
     ]
 
 
 def material_files(of: object) -> Iterator[Path]:
-    """Files that the materials anywhere in a record (a cell, a film, a tuple of names)
-    are read from.
+    """Files that the materials in a record are read from, nested records and tuples
+    included.
+
+    Args:
+        of: a cell, film, material name, or tuple of them.
     """
     if isinstance(of, str):
         if of not in materials.NAMES and Path(of).is_file():
@@ -112,15 +123,14 @@ def material_files(of: object) -> Iterator[Path]:
 
 
 class SweepJournal:
-    """Finished tasks as JSON lines in a file, so that interrupted work goes on where it
-    stopped.
+    """Finished tasks as JSON lines in a file, so that interrupted work can be resumed.
 
-    The first line names the work: its settings and what the files of its materials
-    hold. The journal of other work is begun afresh, a line that is damaged or cut short
-    is dropped.
+    The first line names the work: its settings and the SHA-256 of its material files.
+        The journal of other work is replaced; a damaged or truncated line is dropped.
 
     Args:
-        path: None keeps nothing. about: records of settings that the tasks follow from.
+        path: of the journal; None keeps nothing.
+        about: records of settings that the tasks follow from.
 
     Raises:
         StoreError: a file that is no journal stands there; later, that a file of a
@@ -137,7 +147,7 @@ class SweepJournal:
                 self._know(line)
 
     def _know(self, line: str) -> None:
-        """The solves of a line; a damaged one is dropped: its task is done again."""
+        """Store the solves of a journal line; a damaged line is ignored."""
         try:
             task, rows = json.loads(line)
             self._known[str(task)] = [SolvedNodes.from_json(row) for row in rows]
@@ -147,25 +157,34 @@ class SweepJournal:
     def run(
         self, tasks: list[Task], console: Console, label: str
     ) -> list[list[SolvedNodes]]:
-        """Solves of the tasks in order; those in the journal are not computed again."""
+        """Solves of the tasks in order; those in the journal are not computed again.
+
+        Args:
+            tasks: what is solved, in parallel.
+            console: where progress is shown.
+            label: names the tasks in the progress.
+
+        Raises:
+            StoreError: a file of a material was changed meanwhile.
+        """
         keys = list(map(repr, tasks))
-        left = [i for i, key in enumerate(keys) if key not in self._known]
-        if left and len(left) < len(tasks):
+        pending = [i for i, key in enumerate(keys) if key not in self._known]
+        if pending and len(pending) < len(tasks):
             console.say(
-                f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before"
+                f"{label}: {len(tasks) - len(pending)} of {len(tasks)} were done before"
             )
-        stream = executor.run_parallel(run_task, [tasks[i] for i in left])
-        for i, solved in console.track(stream, total=len(left), label=label):
-            for file, before in self._read.items():  # workers read them anew
-                if store.sha256(file) != before:
+        stream = executor.run_parallel(run_task, [tasks[i] for i in pending])
+        for i, solved in console.track(stream, total=len(pending), label=label):
+            for file, digest in self._read.items():  # workers read them anew
+                if store.sha256(file) != digest:
                     raise StoreError(f"{file} was changed or replaced: run again")
-            self._known[keys[left[i]]] = solved
+            self._known[keys[pending[i]]] = solved
             if self._path is not None:
-                row = [keys[left[i]], [one.to_json() for one in solved]]
+                row = [keys[pending[i]], [nodes.to_json() for nodes in solved]]
                 store.append_line(self._path, json.dumps(row))
         return [self._known[key] for key in keys]
 
     def finish(self) -> None:
-        """The work is complete: its journal is no longer needed."""
+        """Remove the journal of complete work."""
         if self._path is not None:
             self._path.unlink(missing_ok=True)
