@@ -175,11 +175,12 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
     return "\n".join(lines)
 
 
-def _values(found: PupilFit) -> dict[str, object]:
+def _values(pupil_fit: PupilFit) -> dict[str, object]:
+    """Numbers of a pupil fit for JSON: agreement, chi², optics, parameters, cautions."""
     scores = {
-        "agreement": found.agreement,
-        "held_out": found.held_out,
-        "spline": found.between,
+        "agreement": pupil_fit.agreement,
+        "held_out": pupil_fit.held_out,
+        "spline": pupil_fit.between,
     }
     return {
         **{
@@ -187,16 +188,18 @@ def _values(found: PupilFit) -> dict[str, object]:
             for key, score in scores.items()
             if score is not None
         },
-        "chi2_per_dof": found.chi2_per_dof,
-        "converged": found.converged,
-        "reason": found.reason,
-        "optics": {name: [value, sigma] for name, value, sigma in found.optics},
+        "chi2_per_dof": pupil_fit.chi2_per_dof,
+        "converged": pupil_fit.converged,
+        "reason": pupil_fit.reason,
+        "optics": {name: [value, sigma] for name, value, sigma in pupil_fit.optics},
         "parameters": {
             n: [float(v), float(s)]
-            for n, v, s in zip(found.names, found.value, found.sigma, strict=True)
+            for n, v, s in zip(
+                pupil_fit.names, pupil_fit.value, pupil_fit.sigma, strict=True
+            )
         },
-        "cautions": list(found.cautions),
-        "problems": list(found.problems),
+        "cautions": list(pupil_fit.cautions),
+        "problems": list(pupil_fit.problems),
     }
 
 

@@ -410,9 +410,10 @@ def frames_figure(
     """
     from matplotlib.figure import Figure
 
-    count, band_rows = len(residual_sigma), len(stacks) + 1
-    columns = min(12, count)
-    bands = -(-count // columns)
+    frame_count = len(residual_sigma)
+    band_rows = len(stacks) + 1
+    columns = min(12, frame_count)
+    bands = -(-frame_count // columns)
     aspect = residual_sigma.shape[1] / residual_sigma.shape[2]
     figure = Figure(
         figsize=(1.15 * columns + 0.4, 1.2 * aspect * band_rows * bands + 0.25 * bands)
@@ -425,7 +426,7 @@ def frames_figure(
     )
     for axis in axes.flat:
         axis.set_axis_off()
-    for frame in range(count):
+    for frame in range(frame_count):
         band, column = divmod(frame, columns)
         cells = axes[band * band_rows : (band + 1) * band_rows, column]
         medians = [float(np.median(stack[frame])) for stack in stacks]
