@@ -148,9 +148,7 @@ def measure_diameters(image: Array, about: Micrograph) -> MeasuredDiameters:
     lattice = find_lattice(first_pass, pitch)
     flat = _levelled(picture, lattice.pitch_px) if pitch is None else first_pass
     measured = _measure_on_lattice(flat, lattice, about)
-    if (
-        not measured.doubtful
-    ):  # the brightest places of a cell are its pillars, but for dark tops
+    if not measured.doubtful:
         return measured
     candidates = [
         candidate
