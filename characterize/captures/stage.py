@@ -1,5 +1,5 @@
-"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or
-.json with what else is known.
+"""Stage table (stage.csv, stage.json) and description (capture.toml, capture.json) of a
+capture folder.
 """
 
 import csv
@@ -68,7 +68,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 }
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MICRO = str.maketrans("\u00b5\u03bc", "uu")
-_SIMILARITY = 0.75  # likeness from which on another name is taken for a misspelt one
+_SIMILARITY = 0.75  # least similarity of a misspelt name
 _COLUMNS = {"file", "page", *_EXPOSURES, *_ANGLES_Y, *_POSITIONS, *_ANGLES}
 
 
@@ -105,18 +105,16 @@ class StageRows:
 def read_stage(folder: Path) -> StageRows | None:
     """The stage file of a capture folder; None where there is none.
 
-    Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in
-    turn), one of depth/z/position
-    with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``,
-    ``angle_y_deg``, ``exposure_s`` (or ``_ms``, ``_us``).
-    JSON: a list of such objects.
+    Columns: ``file``; ``page`` (from 0; without it a stack has a row for each page in
+    turn); one of depth/z/position with unit, nm to m (``depth_um``, ``z_nm``,
+    ``position_mm``); ``angle_deg``, ``angle_y_deg``; ``exposure_s`` (or ``_ms``,
+    ``_us``). JSON: a list of such objects.
 
     Raises:
-        CaptureError: unknown column, one without its unit, two of depth or of one
-            angle, no column ``file``, columns
-            not parted by commas, more values than columns, a value that is no number, a
-            page that is not whole; file
-            and row are named. A table in another format (``stage.xlsx``).
+        CaptureError: an unknown column, one without its unit, two of depth or of one
+            angle, no column ``file``, another separator than commas, more values than
+            columns, a value that is no number, a page that is not whole; file and row
+            are named. A table in another format (``stage.xlsx``).
     """
     if path := naming.find_table(folder, "stage"):
         return _parse_rows(
@@ -150,6 +148,9 @@ def read_beside(path: Path) -> dict[str, Any]:
 
 
 def _read_description(path: Path | None) -> dict[str, Any]:
+    """Checked entries of a TOML or JSON description in the standard units; empty without
+    a file.
+    """
     if path is None:
         return {}
     try:
@@ -183,8 +184,9 @@ def _read_description(path: Path | None) -> dict[str, Any]:
 
 
 def _check_entries(description: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Entries as they are, whole bits; misspelt names and impossible numbers refused,
-    notes of the user's own kept.
+    """The entries, with ``bits`` as an integer.
+
+    Misspelt names and impossible numbers are refused; unfamiliar names stay as notes.
     """
     for name, value in description.items():
         similar = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=_SIMILARITY)
@@ -285,6 +287,12 @@ def _read_json(path: Path) -> list[dict[str, Any]]:
 
 
 def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
+    """Rows of a stage table in um, rad and s; refuses wrong or ambiguous columns.
+
+    Args:
+        table: one record a row, by column names.
+        path: the stage file, for messages.
+    """
     if not table:
         raise CaptureError(f"{path}: no rows; need one a frame")
     separator = next(
@@ -353,9 +361,7 @@ def _parse_rows(table: list[dict[str, Any]], path: Path) -> StageRows:
 
 
 def _normalized_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
-    """A row by column names in small letters, without blanks about them, the micro sign
-    or a Greek letter as u.
-    """
+    """A row with column names in small letters, without blanks, micro signs as u."""
     if None in entries:
         raise CaptureError(
             f"{path}, row {row}: more values than columns ({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
@@ -425,6 +431,7 @@ def normalize_spelling(name: str) -> str:
 
 
 def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
+    """Page numbers of all rows; refuses fractions."""
     pages = _column(table, "page", path)
     for row, page in enumerate(pages, 2):
         if page != round(page):
@@ -435,6 +442,7 @@ def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
 
 
 def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
+    """(n,) exposures of all rows in the column's unit; refuses 0 and less."""
     times = _column(table, key, path)
     for row, time in enumerate(times, 2):
         if time <= 0:
@@ -447,6 +455,7 @@ def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
 def _column(
     table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0
 ) -> Array:
+    """(n,) finite numbers of a column; ``default`` everywhere where ``key`` is None."""
     if key is None:
         return np.full(len(table), default)
     values = []
