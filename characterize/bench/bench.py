@@ -35,11 +35,13 @@ _BLOCK_SAMPLES = 1_000_000  # fine samples of the frames in one computation
 
 @dataclass(frozen=True, slots=True)
 class BenchCamera:
-    """Sensor of the virtual bench.
+    """Sensor of the virtual bench; read noise in electrons, gain in electrons a count,
+    offset in counts.
 
-    pixel_um: pitch of the pixels. pixels: along a side of a frame.
-    bits: of the converter. gain_e: electrons a count. offset: counts without light.
-    read_noise_e: root-mean-square, electrons. hot_share: share of hot pixels.
+    pixel_um: pitch of the pixels. pixels: along a side of a frame. bits: of the
+    converter. gain_e: electrons a count.
+    read_noise_e: electrons, root-mean-square. offset: counts without light. hot_share:
+    share of hot pixels.
     """
 
     pixel_um: float = 3.0
@@ -80,14 +82,13 @@ class BenchCamera:
 class HiddenLens:
     """A hidden as-built lens and its captures; TOML of ``metalens capture``.
 
-    depths_um: stated source depths of the frames.
-    angles_deg: field angles along x, each at every depth.
-    peak_e: electrons in the brightest pixel.
-    parameter: true values by name, as in ``characterize.model.parameters``.
-    camera: sensor of the bench.
-    diameter_noise_nm: standard deviation of each pillar's independent error.
-    dark_frames, flat_frames: number of dark and flat frames.
-    seed: of the noise and the pillars' errors.
+    depths_um: stated source depths of the frames. angles_deg: field angles along x,
+    each taken at every depth.
+    peak_e: electrons in the brightest pixel. parameter: true values by name, as of
+    ``characterize.model.parameters``.
+    diameter_noise_nm: of every pillar by itself. dark_frames, flat_frames: how many to
+    take.
+    camera: of the bench. seed: of noise and of what is drawn.
     """
 
     depths_um: tuple[float, ...]

@@ -43,10 +43,11 @@ _DEFOCUS_WAVES = 0.5
 
 @dataclass(frozen=True, slots=True)
 class IntervalRequirement:
-    """Required 95 % interval of a parameter.
+    """An interval that the session is to give: half of the 95 % interval of a
+    parameter, in its unit.
 
-    name: name of the parameter. within: half of the interval, in the parameter's unit;
-    unstated causes are included.
+    name: of the parameter. within: half of its 95 % interval, with what the session
+    cannot tell.
     """
 
     name: str
@@ -65,20 +66,20 @@ class IntervalRequirement:
 
 @dataclass(frozen=True, slots=True)
 class BenchProtocol:
-    """Range of the bench and aim of the plan; TOML of ``metalens capture --protocol``.
+    """What the bench can do; TOML of ``metalens capture --protocol``.
 
     depths_um: (nearest, farthest) source depth; depth_count: candidates between them,
     even in 1/z.
     angles_deg: field angles along x. exposures: relative exposure times.
-    frames: largest number of frames.
-    criterion: D (determinant) or A (mean variance).
+    frames: how many may be taken. criterion: D (determinant) or A (mean variance).
     peak_e: electrons in the brightest pixel of all candidates at exposure 1.
     full_well_e, read_noise_e: of the sensor.
-    pixel_um, pixels: pitch, and side of the window about the image.
-    free, known: as in the metrology of ``metalens fit``, with the entries of
-    ``capture.toml`` as known of sigma = 0.
-    wanted: required intervals: frames beyond those that reach them are dropped, and
-    unreached ones give a warning.
+    pixel_um, pixels: of the sensor and of the window about the image.
+    free, known: as in the metrology of ``metalens fit``; what ``capture.toml`` will
+    state, with sigma = 0, too.
+    wanted: intervals (name, within): no more frames are taken than they need (of four
+    depths and angles at least), and
+    what falls short is said.
     """
 
     depths_um: tuple[float, float]

@@ -26,13 +26,13 @@ CAPTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class FieldSetting:
-    """Field angles, frequencies and source depth of the aberrations over the field.
+    """How lenses are looked at over the field.
 
-    angles_deg: field angles along x, of either sign; default: those of [axial].
-    frequencies_per_mm: of the MTF; default: 1/8, 1/4 and 1/2 of 2 NA / wavelength of
-    the first lens.
-    depth_mm: of the sources, inf for collimated light; default: the design focus of
-    each lens.
+    angles_deg: field angles along x, of either sign; left out, those of [axial].
+    frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of 2 NA /
+    wavelength of the first lens.
+    depth_mm: of the sources, inf for collimated light; left out, the focus that each
+    lens was made for.
     """
 
     angles_deg: tuple[float, ...] | None = field(

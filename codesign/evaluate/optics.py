@@ -33,20 +33,19 @@ KINDS = ("gaze", "slip", "separability")
 
 @dataclass(frozen=True, slots=True)
 class MeasurementSettings:
-    """Depths, angles and pixels at which the axial information of lenses is measured.
+    """How lenses are measured.
 
-    None takes a default of the first lens, in units of its wavelength / NA below.
-
-    depths_mm, count: range and number of depths of I(z); default: defocus of -1.75 to
-    1.75 waves at the rim.
-    angles_deg: field angles.
-    pixel_um, binnings: pixel (default 0.88) and factors that it is binned by.
+    depths_mm, count: of I(z); left out, the depths over which the first lens goes from
+    1.75 waves out of focus at the
+        rim to as many on the other side.
+    angles_deg: field angles. pixel_um, binnings: pixels; left out, pixels of 0.88
+    wavelength / NA of the first lens.
     normalisation: of Eq. 11.
-    window_um: window of the PSFs, light outside counts as lost; default 56.4 or 8 radii
-    of the blur.
-    sample_um: samples of the PSFs; default: fine enough for the finest detail.
-    radius_um: radius of the encircled energy; default 5.3.
-    tolerance: of the PSF engine.
+    window_um, sample_um: of the PSFs; light outside the window counts as lost. Left
+    out, 56.4 wavelength / NA of the
+        first lens or 8 radii of its blur, and what shows its finest detail.
+    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. tolerance: of the
+    PSF engine.
     """
 
     depths_mm: tuple[float, float] | None = None
@@ -129,13 +128,13 @@ class ResolvedSettings(MeasurementSettings):
 
 @dataclass(frozen=True, slots=True)
 class SensitivityScenes:
-    """Scenes, steps and sensor of the sensitivity of whole scenes (Table 1).
+    """What the sensitivity of whole scenes is measured on.
 
-    count, seed: number and seed of the scenes.
-    gaze_step_deg, slip_step_mm: steps from the anchor, finite as in the paper.
-    pitch_um, pixels: pitch of the sensor, and pixels of its side.
-    window_um: window of the PSFs, which are normalised to the light within it.
-    image_tolerance: relative L2 error of the image of a texture.
+    count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the
+    paper's kind of step).
+    pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the
+    light within it.
+    image_tolerance: of the image, relative L2 of a texture.
     """
 
     count: int = 24

@@ -38,17 +38,16 @@ SHARE = 0.9  # coverage of the intervals
 
 @dataclass(frozen=True, slots=True)
 class ReaderConfig:
-    """Frames, sensor and light of the reference reader.
+    """What the reference reader sees.
 
-    frames: training frames, drawn from the pool at new scales; a multiple of 32.
-    pool: rendered frames to draw from.
-    test: test frames; as many others calibrate the intervals.
-    seed: seed of scenes, noise and training.
-    pixels, pitch_um: side of the square sensor in pixels, and their pitch.
-    electrons: signal of a white object in a pixel of 9 um.
-    fwhm_nm: spectral width of the light, 0 for one wavelength.
-    depths_mm: (nearest, farthest) depth of the PSFs.
-    tolerance: relative L2 error of the images.
+    frames: that it learns from, drawn from rendered ones at new scales; a multiple of
+    32. pool: that are rendered.
+    test: that judge it; as many again calibrate its intervals. seed: of everything.
+    pixels, pitch_um: of the sensor, square. electrons: that a white object gives in a
+    pixel of 9 um.
+    fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs
+    cover.
+    tolerance: of the true image.
     """
 
     frames: int = 6400
