@@ -226,8 +226,8 @@ def bench_irradiance(lens: Lens, truth: HiddenLens, response: Sensitivity) -> Ar
 
 @dataclass(frozen=True, slots=True)
 class _Incidence:
-    """Incidence of a frame: tangents (x, y) of the source direction, shift of the window
-    from the chief ray, um, and angle of incidence.
+    """Incidence of a frame: tangents (x, y) of the source direction, shift of the
+    window from the chief ray, um, and angle of incidence.
     """
 
     source: tuple[float, float]
@@ -293,8 +293,8 @@ def _irradiance(
     incidence: _Incidence,
     depth_um: Array,
 ) -> Array:
-    """(n, y, x) light in the pixels at one wavelength: sum over every pillar, then blur,
-    then pixels.
+    """(n, y, x) light in the pixels at one wavelength: sum over every pillar, then
+    blur, then pixels.
 
     Args:
         x: (p,) true parameters at this wavelength.
@@ -392,7 +392,8 @@ def background_plane(truth: HiddenLens) -> Array:
     Args:
         truth: the hidden lens and its captures.
     """
-    x, camera = truth.vector(), truth.camera
+    x = truth.vector()
+    camera = truth.camera
     n = camera.pixels
     coordinate = (np.arange(n) - (n - 1) / 2) / (n / 2)
     plane = (

@@ -231,7 +231,8 @@ def _unstated_shifts(
     brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / brightest)
     image = model.images(x)[0]
-    saturated, ones = image >= protocol.full_well_e, np.ones_like(image)
+    saturated = image >= protocol.full_well_e
+    ones = np.ones_like(image)
     data = FitImages(image, ones > 0, saturated, ones * protocol.read_noise_e**2, ones)
     free = tuple(
         name for name in protocol.free if name not in known or known[name].sigma > 0
@@ -464,8 +465,8 @@ def choose_frames(
     names: tuple[str, ...],
     place: Array | None = None,
 ) -> list[int]:
-    """Indices of ``count`` candidates by greedy choice, then exchanges until none helps;
-    a candidate may be chosen again.
+    """Indices of ``count`` candidates by greedy choice, then exchanges until none
+    helps; a candidate may be chosen again.
 
     An optimum has hardly more places than its model has parameters, and none to test
     the model with. So the first choices go to new places until there are

@@ -79,13 +79,14 @@ def _alignment(
     for stack in whole:
         used |= int(np.bitwise_or.reduce(stack.astype(np.int64), axis=None))
     shift = (used & -used).bit_length() - 1  # -1 where all is dark
-    used_bits, word_bytes = used.bit_length(), whole[0].dtype.itemsize
+    used_bits = used.bit_length()
+    word_bytes = whole[0].dtype.itemsize
     if bits is not None and used_bits <= bits:
         return 0, bits, f"{bits} bits as stated"
     if bits is not None and not 16 - bits <= shift < used_bits <= 16:
         raise CaptureError(
-            f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, the "
-            f"capture states {bits}; correct bits, or the bit shift"
+            f"{where}: counts use {used_bits - shift} bits above the lowest {shift}, "
+            f"the capture states {bits}; correct bits, or the bit shift"
         )
     if bits is not None:
         text = f"{bits}-bit counts were shifted left by {16 - bits} bits: shifted back"
@@ -147,8 +148,8 @@ def _check_signs(stacks: Sequence[Array], where: str) -> None:
     )
     if smallest < _WRAPPED:
         raise CaptureError(
-            f"{where}: signed counts down to {smallest}: words of 16 bits without a sign "
-            "that were saved as signed, or with 32768 taken off; save them as unsigned "
+            f"{where}: signed counts down to {smallest}: words of 16 bits without a "
+            "sign that were saved as signed, or with 32768 taken off; save them as unsigned "
             "(uint16)"
         )
 

@@ -66,7 +66,8 @@ class Capture:
     fill: float = 1.0
 
     def __post_init__(self) -> None:
-        n, shape = len(self.frames), self.frames.shape[1:]
+        n = len(self.frames)
+        shape = self.frames.shape[1:]
         if self.frames.ndim != 3 or n == 0 or min(shape) < 3:
             raise CaptureError(
                 f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3"
@@ -367,7 +368,8 @@ def _listed_frames(
     """
     stacks: dict[str, Stack] = {}
     images = []
-    row_count, pages_taken = Counter(rows.files), Counter[str]()
+    row_count = Counter(rows.files)
+    pages_taken = Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
         path = files_by_name.get(stage.normalize_spelling(name), folder_path / name)
         if not path.is_file():

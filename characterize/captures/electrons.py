@@ -221,16 +221,17 @@ def full_well(counts: Array, gain: SensorNoise) -> float:
     """Counts above the dark level at which wells are full; inf where no pixel is.
 
     Unsaturated light scatters by s = sqrt(counts / gain) or more: two pixels of equal
-    light differ by less than w with probability w / (sqrt(pi) s). Full wells read equal.
-    A well is full where three or more pixels lie within w = 2 counts of the highest,
-    and are most of those within 1.5 s. The probability must be below 0.01, and they
-    must be less than a quarter of all pixels, which would be even light.
+    light differ by less than w with probability w / (sqrt(pi) s). Full wells read
+    equal. A well is full where three or more pixels lie within w = 2 counts of the
+    highest, and are most of those within 1.5 s. The probability must be below 0.01, and
+    they must be less than a quarter of all pixels, which would be even light.
 
     Args:
         counts: (n, y, x) counts above the dark level.
         gain: noise model of the sensor.
     """
-    highest, width = float(counts.max()), 2.0
+    highest = float(counts.max())
+    width = 2.0
     shot = math.sqrt(max(highest, 1e-9) / gain.gain_e)
     full, close = (
         int((counts >= highest - range_counts).sum())

@@ -172,7 +172,12 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
 
 
 def similar_name_hint(name: str, there: Collection[str]) -> str:
-    """Hint with the most similar existing name for a missing file; empty without one."""
+    """Hint with the most similar name of an existing file; empty without one.
+
+    Args:
+        name: name of the missing file.
+        there: names of the files that exist.
+    """
     similar = difflib.get_close_matches(
         name.lower(), [other.lower() for other in there], n=1
     )

@@ -40,12 +40,15 @@ def _check_blocks(path: Path) -> None:
 
     The PNG blocks are walked from the head to IEND by their lengths.
     """
-    size, offset, block = path.stat().st_size, 8, b""
+    size = path.stat().st_size
+    offset = 8
+    block = b""
     with open(path, "rb") as file:
         while size >= _HEAD_BYTES and offset + 8 <= size and block != b"IEND":
             file.seek(offset)
             head = file.read(24 if not block else 8)
-            length, name = int.from_bytes(head[:4], "big"), head[4:8]
+            length = int.from_bytes(head[:4], "big")
+            name = head[4:8]
             if not block and (
                 name != b"IHDR"
                 or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size
@@ -55,7 +58,8 @@ def _check_blocks(path: Path) -> None:
                 )
             if block and name == b"IHDR":
                 raise CaptureError(f"{path}: not a PNG file (a second head)")
-            offset, block = offset + 12 + length, name
+            offset = offset + 12 + length
+            block = name
     if block != b"IEND" or offset > size:
         raise CaptureError(
             f"{path}: truncated or not a PNG file (a block ends at byte {offset}, the file at {size})"

@@ -13,14 +13,14 @@ from metalens.core.arrays import Array
 _SMOOTH = 1.0  # counts of noise from which on rounding is a variance of 1/12 to 1e-8
 _REACH = 9.0  # sigma to the farthest count that is summed
 _LEAST_INFORMATION = 1e-6  # least information of a count on its light, counts⁻²
-_NORMAL_RANGE = 3  # largest distance from the median of a pixel that is not hot, counts
-_LEVELS = 61  # levels of a pixel that are summed
+# counts from the median of pixels that are not hot; levels of a pixel that are summed
+_NORMAL_RANGE, _LEVELS = 3, 61
 _TYPICAL = (0.15, 0.1)  # prior medians of noise and of the scatter of levels, counts
 
 
 def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
-    """(score, expected information) of a rounded count on its expected light m, counts⁻¹
-    and counts⁻².
+    """(score, expected information) of a rounded count on its expected light m,
+    counts⁻¹ and counts⁻².
 
     Score: d ln P / dm at the count. Information: sum of (dP/dm)² / P over all counts.
     From ``_SMOOTH`` counts of noise on, rounding adds a variance of 1/12.
@@ -49,7 +49,7 @@ def quantization_score(off: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _score(off: Array, noise: Array) -> tuple[Array, Array]:
-    """(d ln P / dm, ln P) of rounded counts: P = Phi((d + 1/2) / s) - Phi((d - 1/2) / s).
+    """(d ln P / dm, ln P) of rounded counts, P = Phi((d + 1/2)/s) - Phi((d - 1/2)/s).
 
     Args:
         off: count less expected light d, in counts.
@@ -135,8 +135,8 @@ class DarkStatistics:
 
 
 def _levels(x: Array, patterns: Array, values: Array) -> tuple[Array, Array]:
-    """(levels,) levels that a pixel may have, and (patterns, levels) log-likelihood plus
-    log-prior of each.
+    """(levels,) levels that a pixel may have, and (patterns, levels) log-likelihood
+    plus log-prior of each.
 
     Args:
         x: common level, ln noise, ln scatter of the levels.

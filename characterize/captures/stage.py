@@ -148,8 +148,8 @@ def read_beside(path: Path) -> dict[str, Any]:
 
 
 def _read_description(path: Path | None) -> dict[str, Any]:
-    """Checked entries of a TOML or JSON description in the standard units; empty without
-    a file.
+    """Checked entries of a TOML or JSON description in the standard units; empty
+    without a file.
     """
     if path is None:
         return {}

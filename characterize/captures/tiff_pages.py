@@ -115,10 +115,12 @@ def _read_images(path: Path, file: Any) -> Array:
     """(n, ...) images of all pages, or of ImageJ's large stacks the values after the
     head of the only page.
     """
-    count, first = count_images(file), file.pages.first
+    count = count_images(file)
+    first = file.pages.first
     if count == len(file.pages):
         return np.stack(_check_equal(_page_images(path, file), path))
-    offset, size = first.dataoffsets[0], path.stat().st_size
+    offset = first.dataoffsets[0]
+    size = path.stat().st_size
     if int(first.compression) != 1 or offset + count * first.nbytes > size:
         raise CaptureError(
             f"{path}: says {count} images, as ImageJ writes large stacks, and has room for "
@@ -176,7 +178,8 @@ def _check_pages(path: Path, file: Any) -> None:
     truncated, lossy, or need imagecodecs that is not installed.
     """
     size = path.stat().st_size
-    claimed, offsets = 0, set[int]()
+    claimed = 0
+    offsets = set[int]()
     for number, page in enumerate(file.pages):
         claimed += page.nbytes
         if page.offset in offsets:  # the library would go round for ever

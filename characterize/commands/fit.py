@@ -64,7 +64,8 @@ def run(options: Options) -> int:
 
 def _run_lens(options: Options, design: Path, target: Path) -> int:
     """Fit an as-built lens, write it with its page, print; the exit status."""
-    lens, capture = lenses.load(design), captures.load(options.capture)
+    lens = lenses.load(design)
+    capture = captures.load(options.capture)
     metrology = (
         config.load(options.metrology, MetrologySettings)
         if options.metrology
@@ -203,18 +204,16 @@ def _values(pupil_fit: PupilFit) -> dict[str, object]:
     }
 
 
-def _text(pupil_fit: PupilFit, target: Path) -> str:
+def _text(pupil: PupilFit, target: Path) -> str:
     """Text of a pupil fit for the console: agreement, first 12 parameters, notes."""
-    lines = [
-        f"{target}: pupil fitted to {len(pupil_fit.measured)} planes; {pupil_fit.reason}"
-    ]
+    lines = [f"{target}: pupil fitted to {len(pupil.measured)} planes; {pupil.reason}"]
     scores = (
-        ("all planes fitted", pupil_fit.agreement),
-        ("odd planes predicted from even", pupil_fit.held_out),
+        ("all planes fitted", pupil.agreement),
+        ("odd planes predicted from even", pupil.held_out),
     )
     for label, score in (
         *scores,
-        ("the same by a cubic spline, without physics", pupil_fit.between),
+        ("the same by a cubic spline, without physics", pupil.between),
     ):
         if score is not None:
             numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
@@ -222,7 +221,7 @@ def _text(pupil_fit: PupilFit, target: Path) -> str:
     lines += [
         f"  {name} = {value:.4g} +- {sigma:.2g}"
         for name, value, sigma in zip(
-            pupil_fit.names[:12], pupil_fit.value, pupil_fit.sigma, strict=False
+            pupil.names[:12], pupil.value, pupil.sigma, strict=False
         )
     ]
-    return "\n".join(lines + ["  note: " + words for words in pupil_fit.cautions])
+    return "\n".join(lines + ["  note: " + words for words in pupil.cautions])

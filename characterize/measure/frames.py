@@ -80,8 +80,8 @@ class CaptureQuality:
 def measure_frames(
     capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan
 ) -> CaptureQuality:
-    """Image quality of captured frames: spot widths, MTF, Strehl ratio, efficiency, best
-    depth, distortion.
+    """Image quality of captured frames: spot widths, MTF, Strehl ratio, efficiency,
+    best depth, distortion.
 
     Args:
         capture: frames in counts with their stage and camera.

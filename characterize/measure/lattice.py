@@ -123,7 +123,8 @@ def _strongest_waves(windowed: Array, pitch_px: float | None) -> tuple[Array, Ar
     """
     size = [2 * fft.next_fast_len(n) for n in windowed.shape]
     power = np.abs(fft.rfft2(windowed, size))
-    ky, kx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None]
+    ky = fft.fftfreq(size[0])[:, None]
+    kx = fft.rfftfreq(size[1])[None]
     length = np.hypot(ky, kx)
     power = np.where((length > 2.5 / min(windowed.shape)) & (length < 0.35), power, 0.0)
     peaks = (ndimage.maximum_filter(power, 5, mode="wrap") == power) & (

@@ -32,7 +32,8 @@ class EdgeMtf:
         if len(below) == 0 or below[0] == 0:
             return math.nan
         i = int(below[0])
-        high, low = self.modulation[i - 1], self.modulation[i]
+        high = self.modulation[i - 1]
+        low = self.modulation[i]
         share = (high - 0.5) / (high - low)
         return float(
             self.frequency_per_um[i - 1]
@@ -250,7 +251,8 @@ def _second_moments(
         total = weighted.sum()
         cx = float((weighted * x[None]).sum() / total)
         cy = float((weighted * y[:, None]).sum() / total)
-        dx, dy = x[None] - cx, y[:, None] - cy
+        dx = x[None] - cx
+        dy = y[:, None] - cy
         xx, yy, xy = (
             (weighted * product).sum() / total
             for product in (dx * dx, dy * dy, dx * dy)
@@ -309,7 +311,8 @@ def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:
     A line through the centroid of each row's squared derivative, fitted four times;
     later fits weight pixels by a Gaussian about the line before.
     """
-    slope, offset = 0.0, pixels.shape[1] / 2
+    slope = 0.0
+    offset = pixels.shape[1] / 2
     derivative = np.abs(ndimage.gaussian_filter1d(pixels, 1.0, axis=1, order=1))
     columns = np.arange(pixels.shape[1])
     proximity = np.ones_like(derivative)

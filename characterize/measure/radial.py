@@ -10,12 +10,12 @@ from scipy import ndimage, special
 from metalens.core.arrays import Array
 
 RAYS = 72
-# radius over blur above which a disc counts as wide: its middle is lowered by exp(-12.5)
+# radius over blur above which a disc is wide: its middle is lowered by exp(-12.5)
 _WIDE = 5.0
 # least level of a solid disc's middle over that of its rim; lower tops are dark
 _SOLID = 0.8
-_ITERATIONS = 30  # most iterations of a search
-_TOLERANCE = 1e-3  # change, pixels or square pixels, at which it stops
+# most iterations of a search, and change (pixels, square pixels) at which it stops
+_ITERATIONS, _TOLERANCE = 30, 1e-3
 _MOST_GAIN = 5.0  # largest change of the corrected with the measured radius
 
 
@@ -70,7 +70,8 @@ def edge_crossings(reach: Array, rays: Array, half: float, rim: int) -> Array:
         below = rim + np.flatnonzero(rays[rim:, j] < half)
         if len(below) and below[0] > rim:
             i = int(below[0])
-            high, low = rays[i - 1, j], rays[i, j]
+            high = rays[i - 1, j]
+            low = rays[i, j]
             crossings[j] = reach[i - 1] + (reach[1] - reach[0]) * (high - half) / (
                 high - low
             )
@@ -151,8 +152,8 @@ def is_wide_disc(
 def deblur_radius(
     reach: Array, radius: float, variance: float, smooth: float
 ) -> tuple[float, float]:
-    """(true radius of a disc whose half level lies at a radius after blur, derivative of
-    the true by the measured radius), in pixels.
+    """(true radius of a disc whose half level lies at a radius after blur, derivative
+    of the true by the measured radius), in pixels.
 
     Args:
         reach: (r,) distances from the middle, pixels.
@@ -179,8 +180,8 @@ def deblur_radius(
 
 
 def _share_of_fall(reach: Array, rays: Array, edge: Array, step: float) -> float:
-    """Mean fall of the rays from one pixel inside to one pixel outside their edges, over
-    the step from rim to gap; 0.05 to 0.99.
+    """Mean fall of the rays from one pixel inside to one pixel outside their edges,
+    over the step from rim to gap; 0.05 to 0.99.
     """
     positions = np.clip(
         (edge + np.array([[-1.0], [1.0]])) / reach[1], 0, len(reach) - 1

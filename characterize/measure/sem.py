@@ -208,7 +208,8 @@ def _measure_on_lattice(
         flat, np.stack([row, column], 1), raw_radius, sigma, lattice.pitch_px
     )
     diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
-    missing, collapsed = missing.astype(bool), collapsed.astype(bool)
+    missing = missing.astype(bool)
+    collapsed = collapsed.astype(bool)
     on_site = ~missing & (
         np.hypot(*(np.stack([row, column], 1) - places).T) < 0.2 * lattice.pitch_px
     )
@@ -396,7 +397,8 @@ def _pillar(
             means a fallen pillar.
     """
     half = int(pitch / 2)
-    row_px, column_px = int(round(row)), int(round(column))
+    row_px = int(round(row))
+    column_px = int(round(column))
     patch = flat[
         max(row_px - half, 0) : row_px + half + 1,
         max(column_px - half, 0) : column_px + half + 1,
@@ -485,7 +487,8 @@ def _fit_circle(
     smooth = radial.ray_smoothing(pitch)
     noise = math.sqrt(edge_variance * (variance_factor + level_factor))
     blur_loss = radial.drawn_in(distance, rays, fitted_px, radius, smooth)
-    corrected, systematic = radius + blur_loss, _UNSURE * blur_loss
+    corrected = radius + blur_loss
+    systematic = _UNSURE * blur_loss
     if blur is not None and not radial.is_wide_disc(radius, blur, smooth):
         (corrected, gain), plain = (
             radial.deblur_radius(distance, radius, blur, smooth),
@@ -521,7 +524,8 @@ def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
         valid = np.abs(residual) < max(0.2 * float(np.median(edge_px)), 2.0)
         if valid.sum() < _ROUND * RAYS or powers[0] <= 0:
             return False
-    level, second_harmonic = float(powers[0]), math.hypot(*powers[3:])
+    level = float(powers[0])
+    second_harmonic = math.hypot(*powers[3:])
     degrees = max(_independent_rays(level**-0.5) * valid.mean() - 5, 1.0)
     noise = float((residual[valid] * 2 * fitted[valid] ** -3).std()) * math.sqrt(
         2 / degrees

@@ -251,7 +251,8 @@ def crop_to_bead(
         frames: the whole stack in electrons.
         spec: gives the side of the window and, where stated, the bead's place.
     """
-    shape, window = frames.electrons.shape, spec.window
+    shape = frames.electrons.shape
+    window = spec.window
     center = spec.center
     if center is None:
         median_e = np.median(frames.electrons, axis=(1, 2), keepdims=True)
@@ -426,7 +427,8 @@ def _lower(spec: PupilSpec, phase_order: int, amplitude_order: int) -> PupilSpec
 
 
 def transfer_parameters(x: Array, source: PupilModel, target: PupilModel) -> Array:
-    """(p,) parameters of ``target`` that describe the same pupil as ``x`` of ``source``.
+    """(p,) parameters of ``target`` that describe the same pupil as ``x`` of
+    ``source``.
 
     Gains and backgrounds are interpolated along the axis. Orders and stage errors that
     ``source`` lacks are 0.

@@ -119,8 +119,8 @@ class PupilModel:
     """Debye integral of an isotropic emitter (Richards and Wolf 1959), evaluated by
     matrix Fourier transforms.
 
-    The pupil is exp(log-amplitude + i phase), both Zernike series. The intensity, summed
-    over the dipole components, is convolved with bead, Gaussian blur and pixel.
+    The pupil is exp(log-amplitude + i phase), both Zernike series. The intensity,
+    summed over the dipole components, is convolved with bead, Gaussian blur and pixel.
 
     Accuracy: the pupil is sampled finely enough that images of ``window`` pixels do not
     wrap around at the farthest defocus; its rim is weighted by the covered share of a
@@ -159,7 +159,8 @@ class PupilModel:
         radius = np.hypot(u, v)
         covered = np.clip((1 - radius) * self.nodes / 2 + 0.5, 0, 1)
         self.inside = covered > 0
-        self.covered, radius = covered[self.inside], np.maximum(radius[self.inside], 1)
+        self.covered = covered[self.inside]
+        radius = np.maximum(radius[self.inside], 1)
         self.u, self.v = u[self.inside] / radius, v[self.inside] / radius
         self.phase_basis = zernike.zernike_basis(self.phase_indices, self.u, self.v)
         self.amplitude_basis = zernike.zernike_basis(
@@ -253,8 +254,8 @@ class PupilModel:
         """Expected images (n, window, window) in electrons, and with ``jacobian`` their
         derivatives (p, n, window, window) by the parameters.
 
-        An image is gain * sum over dipoles of |F(A exp(i phase))|², convolved with bead,
-        blur and pixel, plus background. Its derivative by a pupil coefficient is
+        An image is gain * sum over dipoles of |F(A exp(i phase))|², convolved with
+        bead, blur and pixel, plus background. Its derivative by a pupil coefficient is
         2 Re(E* dE), in single precision. Derivatives by the optics are central
         differences.
 
@@ -380,8 +381,8 @@ class PupilModel:
         return constant * blur, constant * slope
 
     def _transform(self, pupil: Array, kernel_y: Array, kernel_x: Array) -> Array:
-        """(..., y, x) field of a (..., nodes, nodes) pupil by matrix Fourier transforms:
-        kernel_y pupil kernel_x.
+        """(..., y, x) field of a (..., nodes, nodes) pupil by matrix Fourier
+        transforms: kernel_y pupil kernel_x.
         """
         rows = pupil.reshape(-1, self.nodes) @ kernel_x
         return np.asarray(kernel_y @ rows.reshape(*pupil.shape[:-1], -1))
@@ -410,8 +411,10 @@ def dipole_components(x: Array, y: Array, *, vectorial: bool) -> Array:
     cosine = np.sqrt(1 - sine2)
     if not vectorial:
         return np.asarray(cosine**-0.5)[None]
-    sine, azimuth = np.sqrt(sine2), np.arctan2(y, x)
-    cosine_a, sine_a = np.cos(azimuth), np.sin(azimuth)
+    sine = np.sqrt(sine2)
+    azimuth = np.arctan2(y, x)
+    cosine_a = np.cos(azimuth)
+    sine_a = np.sin(azimuth)
     rows = [
         1 + (cosine - 1) * cosine_a**2,
         math.sqrt(2) * (cosine - 1) * sine_a * cosine_a,
@@ -456,7 +459,8 @@ def load_phase_mask(path: Path, u: Array, v: Array, *, turn_rad: float = 0.0) ->
             f"{path}: a mask of {phase.shape} {phase.dtype}; need a square of 8 finite "
             "numbers or more"
         )
-    cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
+    cosine = math.cos(turn_rad)
+    sine = math.sin(turn_rad)
     indices = [
         (coordinate + 1) * side / 2 - 0.5
         for coordinate in (cosine * v - sine * u, cosine * u + sine * v)

@@ -53,7 +53,7 @@ class BudgetEntry:
 
 
 def quadrature_difference(error: float, before: float) -> float:
-    """sqrt(error² - before²); 0 where ``error`` is the smaller."""
+    """Growth of an ``error`` over that ``before`` it, in quadrature; 0 where smaller."""
     return math.sqrt(max(error**2 - before**2, 0.0))
 
 
@@ -86,7 +86,8 @@ class BudgetInputs:
     """Optional inputs of the budget; each adds its links.
 
     fwhm_nm: spectral width of the light source. mask: grid and spread of PROCESS.toml.
-    library: pillar library that the proxy was fitted to. asbuilt: fit of the built lens.
+    library: pillar library that the proxy was fitted to. asbuilt: fit of the built
+    lens.
     run: finished co-design run with its network. frames: experiment that it reads.
     draws: number of draws of process and fit.
     tolerance: of the pillar solver, where no library states it.
@@ -164,14 +165,13 @@ class ImagingDevice:
         The difference of the two is small and smooth: it is computed at 5 x 5 field
         points at most, interpolated bilinearly, and added to the scalar PSFs.
         """
-        plan, optics = self.whole.plan, self.optics
+        plan = self.whole.plan
+        optics = self.optics
         if plan.window.components:
             return self.whole
         coarse_y, coarse_x = (
-            torch.linspace(
-                float(axis[0]), float(axis[-1]), min(5, len(axis)), dtype=axis.dtype
-            )
-            for axis in (plan.y_um, plan.x_um)
+            torch.linspace(float(a[0]), float(a[-1]), min(5, len(a)), dtype=a.dtype)
+            for a in (plan.y_um, plan.x_um)
         )
         scalar, vectorial = (
             node_light(
@@ -274,7 +274,8 @@ class NetworkReading:
              f"scatter of {config.fixation_deg:g} deg about the stimulus"),
             ("reader, pupil", min(pupil_error, quiet_error), NONE, net),
             ("reader, slippage", quiet_error, NONE, net),
-            ("sensor noise", self._error_rad(noisy, calibrator), NONE, "frames with noise"),
+            ("sensor noise", self._error_rad(noisy, calibrator), NONE,
+             "frames with noise"),
         ]  # fmt: skip
         for link, optics, psf, method in self._untrained(device, settings):
             calibrator = experiment.run_calibrator(source, optics, config, self.sensor)
@@ -311,8 +312,8 @@ class NetworkReading:
         return BudgetEntry(link, phase_rad, psf, gaze, method)
 
     def turn_rad(self, optics: Imager, base: Imager) -> float:
-        """Mean angle in rad between the gaze predicted from noiseless frames through two
-        imagers, by the same calibrations.
+        """Mean angle in rad between the gaze predicted from noiseless frames through
+        two imagers, by the same calibrations.
 
         Args:
             optics: imager after the change.
@@ -328,8 +329,8 @@ class NetworkReading:
         return float(np.radians(angle_deg(one, other).mean()))
 
     def _true_readings(self, config: ExperimentConfig) -> NetworkReadings:
-        """True pupil (mm) and slippage (mm) of all frames of an experiment, from labels of
-        small renderings.
+        """True pupil (mm) and slippage (mm) of all frames of an experiment, from labels
+        of small renderings.
         """
         pupil, slip = [], []
         pitch = self.scenes.camera.pitch_um * self.scenes.camera.pixels / LABELS
@@ -349,8 +350,8 @@ class NetworkReading:
         """(link, imager, PSF error, method) of each cause that training left out; every
         imager has one cause more.
         """
-        trained_optics = self.source.run.trainer.optics
-        if trained_optics.image == "uniform":
+        trained = self.source.run.trainer.optics
+        if trained.image == "uniform":
             same_spectrum = device if not settings.fwhm_nm else replace(
                 device, whole=device.one_wavelength(settings.wavelength_nm * 1e-3)
             )  # fmt: skip
@@ -359,12 +360,10 @@ class NetworkReading:
             yield "field", same_spectrum.evenly_lit(), psf, method
             method = "cos⁴ and vignetting; training had even light"
             yield "radiometry", same_spectrum.whole, 0.0, method
-        if settings.fwhm_nm and trained_optics.fwhm_nm != settings.fwhm_nm:
+        if settings.fwhm_nm and trained.fwhm_nm != settings.fwhm_nm:
             narrow = device.one_wavelength(settings.wavelength_nm * 1e-3)
             psf = image_difference(narrow, device.whole)
-            method = (
-                f"{settings.fwhm_nm:g} nm; training had {trained_optics.fwhm_nm:g} nm"
-            )
+            method = f"{settings.fwhm_nm:g} nm; training had {trained.fwhm_nm:g} nm"
             yield "spectrum", device.whole, psf, method
 
     def _trained(
@@ -467,7 +466,9 @@ class ErrorBudget:
         self.smooth: ImagingDevice | None = None
         self.reading: NetworkReading | None = None
         if given.run is None:
-            self.settings, frame, margin = settings_of(lens, given.fwhm_nm), 80, 8
+            self.settings = settings_of(lens, given.fwhm_nm)
+            frame = 80
+            margin = 8
         else:
             trainer = given.run.run.trainer
             scenes = given.run.settings.scenes
@@ -541,12 +542,12 @@ class ErrorBudget:
     def _pillars(self, state: State | None = None, *, factor: Array | None = None,
                  made: MadeLens | None = None) -> Array:  # fmt: skip
         pillar_factor = self.coupling if factor is None else factor
-        transmission = (
+        t = (
             (made or self.made)
             .pillars(state or State.of(), factor=pillar_factor)
             .numpy()
         )
-        return np.asarray(transmission[self.lens.diameters.diameter_um > 0])
+        return np.asarray(t[self.lens.diameters.diameter_um > 0])
 
     def _coupling(self, rows: NeighbourRows) -> Array:
         """(y, x) complex factor on every pillar by coupling to unequal neighbours."""
@@ -626,13 +627,14 @@ class ErrorBudget:
         yield self._entry("polarisation", self.device.both_polarisations(), method)
 
     def _solver(self) -> Iterator[BudgetEntry]:
-        """Entries of pillar solver and proxy, against a solver with a tolerance ``FINER``
-        times smaller.
+        """Entries of pillar solver and proxy, against a solver with a tolerance
+        ``FINER`` times smaller.
 
         The complex ratio at ``SOLVED`` diameters is interpolated to every pillar,
         linearly in its logarithm.
         """
-        lens, library = self.lens, self.given.library
+        lens = self.lens
+        library = self.given.library
         diameters_um = np.linspace(*supercell.drawn_diameter_range(lens), SOLVED)
         tolerance = library.sweep.bar if library else self.given.tolerance
         engine = engines.choose_engine(lens.cell)
@@ -703,10 +705,13 @@ class ErrorBudget:
         yield self._changed("mask grid", method, made=drawn)
 
     def _process(self) -> Iterator[BudgetEntry]:
-        """Entry of the process spread, rms over draws; a fit of the built lens removes it."""
+        """Entry of the process spread, rms over draws; a fit of the built lens removes
+        it.
+        """
         if self.given.mask is None:
             return
-        spread, count = self.given.mask.spread, self.given.draws
+        spread = self.given.mask.spread
+        count = self.given.draws
         lenses = [(draw.state(), 0.0) for draw in draw_lenses(spread, count, seed=5)]
         method = f"{count} draws of the process, lens not measured"
         yield self._rms("process spread", lenses, method)
@@ -850,15 +855,11 @@ def row_lengths(rows: NeighbourRows, pitch_um: float) -> list[int]:
 
 
 def turning_sine(lens: Lens) -> Array:
-    """(y, x) sum of the sines of the angles of incidence and exit of light from the
-    design source to the sensor's middle.
+    """(y, x) sum of the sines of incidence and exit of light through a ``lens``, from
+    its design source to the middle of the sensor.
     """
     diameters = lens.diameters
-    radius_um = np.hypot(diameters.x_um, diameters.y_um[:, None])
+    r = np.hypot(diameters.x_um, diameters.y_um[:, None])
     source_um = lens.source_distance_um
-    source_sine = (
-        0.0 if math.isinf(source_um) else np.sin(np.arctan(radius_um / source_um))
-    )
-    return np.asarray(
-        np.sin(np.arctan(radius_um / lens.sensor_distance_um)) + source_sine
-    )
+    source_sine = 0.0 if math.isinf(source_um) else np.sin(np.arctan(r / source_um))
+    return np.asarray(np.sin(np.arctan(r / lens.sensor_distance_um)) + source_sine)

@@ -142,14 +142,14 @@ def _caption(seen: Mapping[str, OverField]) -> str:
         else "infinity"
         for aberrations in seen.values()
     }
-    left_out = "".join(
+    notes = "".join(
         f"\n{name}: {line}."
         for name, aberrations in seen.items()
         for line in aberrations.left_out
     )
     return (
         f"Over the field along x, sources at {', '.join(sorted(depths))}, design wavelength. Foci behind (+) or before "
-        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{left_out}"
+        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{notes}"
     )
 
 

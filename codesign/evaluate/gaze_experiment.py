@@ -41,8 +41,7 @@ AXIAL, LATERAL = "axial", "lateral"
 # streams of the random generator
 LOOKS, POINTS, WORN, PEOPLE, NOISE = 20, 21, 22, 555, 1_000_003
 TURNS = 4  # corrections of an eye's direction, each leaves a twentieth of the error
-BEFORE = 100_000  # first number of the people who calibrated before
-EACH = 120  # frames of each of those people
+BEFORE, EACH = 100_000, 120  # people who calibrated before: first number, frames each
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -145,11 +144,9 @@ class RunResult:
             values: (n,) value of every frame.
             chosen: (n,) True for the frames that count; all without it.
         """
-        counted = (
-            np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        )
+        valid = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
         groups = (
-            values[counted & (self.trial.subject == s)]
+            values[valid & (self.trial.subject == s)]
             for s in np.unique(self.trial.subject)
         )
         return np.array([group.mean() if len(group) else math.nan for group in groups])
@@ -295,8 +292,8 @@ def experiment_sensors(
     """Sensor of every run at the exposure and background of the experiment.
 
     Dim light: exposure and background at which a pixel of the first run has
-    ``config.snr_db`` behind a lossless lens of its aperture. They scale with the area of
-    a run's aperture and of its base pixel.
+    ``config.snr_db`` behind a lossless lens of its aperture. They scale with the area
+    of a run's aperture and of its base pixel.
 
     Args:
         sources: runs to compare.
@@ -406,13 +403,10 @@ def run_experiment(
     yield config.subjects, results
 
 
-def _predict(source: FinishedRun, sensor_frames: SensorFrames) -> Predictions:
+def _predict(source: FinishedRun, frames: SensorFrames) -> Predictions:
     """Pupil, slippage and axis that a run's network reads from sensor frames."""
     return assess.predict_frames(
-        source.run.trainer.model.net,
-        source.architecture,
-        sensor_frames,
-        source.settings.inner,
+        source.run.trainer.model.net, source.architecture, frames, source.settings.inner
     )
 
 
@@ -447,26 +441,21 @@ def _check_sources(sources: Sequence[FinishedRun], config: ExperimentConfig) -> 
     """
     if not sources:
         raise ConfigError("no run to evaluate; give one run folder or more")
-    geometries = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
+    views = [(s.settings.scenes.pixels, s.settings.scenes.margin, s.settings.optics.sample_um,
               s.settings.optics.sensor_distance_mm) for s in sources]  # fmt: skip
-    if len(set(geometries)) > 1:
+    if len(set(views)) > 1:
         raise ConfigError(
-            f"the runs see frames of different (pixels, margin, sample_um, sensor_distance_mm): {geometries}; "
+            f"the runs see frames of different (pixels, margin, sample_um, sensor_distance_mm): {views}; "
             "compare runs of one geometry"
         )
     slips = config.slips_mm[:, 2]
     for source in sources:
         eye_mm = 1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um
-        depths_mm = source.settings.optics.depths_mm
-        if (
-            not depths_mm[0]
-            <= eye_mm + slips.min()
-            <= eye_mm + slips.max()
-            <= depths_mm[1]
-        ):
+        limits = source.settings.optics.depths_mm
+        if not limits[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= limits[1]:
             raise ConfigError(
                 f"axial_mm {config.axial_mm}: eyes {eye_mm + slips.min():g} to {eye_mm + slips.max():g} mm before the "
-                f"lens, where the run's images hold optics.depths_mm = {depths_mm}: let them slip less, or train on more"
+                f"lens, where the run's images hold optics.depths_mm = {limits}: let them slip less, or train on more"
             )
 
 
@@ -488,7 +477,8 @@ def prepare_run(
     """
     trainer = source.run.trainer
     assess.recalibrate_network(trainer, source.architecture)
-    settings, scenes = trainer.optics, source.settings.scenes
+    settings = trainer.optics
+    scenes = source.settings.scenes
     image_settings = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
     return formed.make_imager(

@@ -181,8 +181,8 @@ class AxialInformation:
 def measure_axial_information(
     lens: Lens, setting: MeasurementSettings | None = None
 ) -> AxialInformation:
-    """Axial information I(z) of Eq. 11 of the full pillar lens, at every field angle and
-    binning.
+    """Axial information I(z) of Eq. 11 of the full pillar lens, at every field angle
+    and binning.
 
     PSFs at every depth z and z + step give the derivative by z.
 
@@ -348,7 +348,8 @@ def scene_energies(
 
 
 def depths_of(views: Sequence[RenderedFrames]) -> tuple[float, float]:
-    """Depths in um of the nearest and the farthest visible surface, at least 5 and 6 mm.
+    """Depths in um of the nearest and the farthest visible surface, at least 5 and 6
+    mm.
 
     Args:
         views: rendered views of the scenes.
@@ -365,7 +366,8 @@ def scene_views(
     *,
     sensor_distance_um: float = 2000.0,
 ) -> list[RenderedFrames]:
-    """Rendered anchor, gaze and slip views of eye states, at the exposure of the anchor.
+    """Rendered anchor, gaze and slip views of eye states, at the exposure of the
+    anchor.
 
     Args:
         states: eye states of the anchor views.

@@ -29,8 +29,7 @@ Shown = tuple[bench.PeopleFrames, SensorFrames]
 # roles of the runs, in the order of the command line
 ROLES = ("proposed", "hyperbolic", "best_focus", "double_helix")
 
-PEOPLE = 16  # people of the gaze test
-EACH = 40  # frames of a person; a fifth of them calibrates
+PEOPLE, EACH = 16, 40  # people of the gaze test, frames of each; a fifth calibrates
 BEFORE = 32  # further people, on whom a network that reads an axis is calibrated
 WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
@@ -98,45 +97,26 @@ class ClaimLine:
 
     def words(self) -> tuple[str, str, str, str, str, str]:
         """Cells of a table: place, what, paper, ours, ratio, conditions."""
-        claim = self.claim
+        c = self.claim
         paper = (
             "picture"
-            if claim.picture
-            else f"{claim.value:g} {claim.unit if claim.unit != 'ratio' else ''}".strip()
+            if c.picture
+            else f"{c.value:g} {c.unit if c.unit != 'ratio' else ''}".strip()
         )
         if self.picture:
-            return claim.place, claim.what, paper, self.picture, "", claim.note
+            return c.place, c.what, paper, self.picture, "", c.note
         if self.ours is None:
-            return (
-                claim.place,
-                claim.what,
-                paper,
-                "not measured",
-                "",
-                f"measure with: {claim.how}",
-            )
-        interval = (
+            return c.place, c.what, paper, "not measured", "", f"measure with: {c.how}"
+        span = (
             f" [{self.ours.low:.3g}, {self.ours.high:.3g}]"
             if not math.isnan(self.ours.low)
             else ""
         )
-        ratio = "" if claim.picture else f"{self.ratio:.2f}"
+        ratio = "" if c.picture else f"{self.ratio:.2f}"
         conditions = "; ".join(
-            part
-            for part in (
-                self.ours.conditions,
-                f"paper: {claim.note}" if claim.note else "",
-            )
-            if part
+            w for w in (self.ours.conditions, f"paper: {c.note}" if c.note else "") if w
         )
-        return (
-            claim.place,
-            claim.what,
-            paper,
-            f"{self.ours.value:.3g}{interval}",
-            ratio,
-            conditions,
-        )
+        return c.place, c.what, paper, f"{self.ours.value:.3g}{span}", ratio, conditions
 
 
 def load_claims() -> tuple[PaperClaim, ...]:
@@ -354,7 +334,8 @@ def image_tolerance(folders: Sequence[Path]) -> float:
 def gaze_rows(
     folder: Path, *, people: int = PEOPLE, seed: int = 5
 ) -> list[dict[str, Any]]:
-    """Gaze errors of every network of a finished run on new people, least compute first.
+    """Gaze errors of every network of a finished run on new people, least compute
+    first.
 
     Each person is calibrated on a fifth of the frames. A network that reads the optic
     axis is calibrated on ``BEFORE`` further people first.
@@ -470,15 +451,15 @@ def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, A
     Raises:
         TrainingError: two runs with the same part frozen.
     """
-    folder_of: dict[str, Path] = {}
+    owner: dict[str, Path] = {}
     for folder in folders:
         parts = frozen_parts(folder)
         if len(parts) != 1:
             continue
         (part,) = parts
-        if part in folder_of:
+        if part in owner:
             raise TrainingError(
-                f"{folder_of[part]} and {folder} both have {part} frozen; give one of them"
+                f"{owner[part]} and {folder} both have {part} frozen; give one of them"
             )
-        folder_of[part] = folder
+        owner[part] = folder
         yield part, finished.rows_of(folder)

@@ -48,12 +48,10 @@ def plot_axial_information(
     count = len(setting.binnings)
     figure, panels = make_figure(1, count, size=(1.5 + 3.2 * count, 3.2), squeeze=False)
     for k, (panel, binning) in enumerate(zip(panels[0], setting.binnings, strict=True)):
-        for name, information in axial.items():
-            mean = float(information.information[0, k].mean())
-            positive = (
-                information.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
-            )
-            panel.semilogy(depths, positive, ".-", label=f"{name}: {mean:.3g}")
+        for name, info in axial.items():
+            mean = float(info.information[0, k].mean())
+            shown = info.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
+            panel.semilogy(depths, shown, ".-", label=f"{name}: {mean:.3g}")
         panel.set(
             title=f"{binning} × {binning} of {setting.pixel_um:g} µm",
             xlabel="source depth / mm",
@@ -66,8 +64,8 @@ def plot_axial_information(
 def plot_depth_slices(
     axial: Mapping[str, AxialInformation], setting: ResolvedSettings
 ) -> bytes:
-    """PNG of line spreads over depth (PSF on axis summed over y, in pixels), lenses down,
-    binnings across.
+    """PNG of line spreads over depth (PSF on axis summed over y, in pixels), lenses
+    down, binnings across.
 
     Args:
         axial: axial information by name of the lens.
@@ -81,19 +79,16 @@ def plot_depth_slices(
         sharex=True,
     )
     (low, high), half_um = setting.depths_mm, HALF * setting.window_um
-    for row_number, (row, (name, information)) in enumerate(
+    for row_number, (row, (name, info)) in enumerate(
         zip(panels, axial.items(), strict=True)
     ):
         for panel, binning in zip(row, setting.binnings, strict=True):
             pixel = setting.pixel_um * binning
             pixels = int(2 * half_um / pixel) // 2 * 2 + 1
             weights = pixel_weights(
-                information.slices.shape[1],
-                setting.sample_um,
-                pitch_um=pixel,
-                count=pixels,
+                info.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels
             )
-            light = information.slices @ weights.to(information.slices).mT
+            light = info.slices @ weights.to(info.slices).mT
             relative = (light / light.amax(1, keepdim=True).clamp_min(1e-30)).numpy()
             edge = pixels * pixel / 2
             panel.imshow(
@@ -135,7 +130,7 @@ def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
         )
         for k in range(3)
     ]
-    for row_number, (row, (name, energy)) in enumerate(
+    for number, (row, (name, energy)) in enumerate(
         zip(panels, energies.items(), strict=True)
     ):
         for panel, picture, maximum, title in zip(
@@ -150,7 +145,7 @@ def plot_scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
             )
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
-            if row_number == 0:
+            if number == 0:
                 panel.set_title(title)
         row[0].set_ylabel(name, fontsize=8)
     return figure_png(figure)
@@ -223,7 +218,8 @@ def plot_ambiguity(result: RunResult) -> bytes:
     Args:
         result: of one run.
     """
-    trial, percent = result.trial, result.centre * 100
+    trial = result.trial
+    percent = result.centre * 100
     figure, axes = make_figure(1, 3, size=(10.5, 3.2))
     for panel, kind, axis_index in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
         chosen = trial.group(kind)
@@ -239,7 +235,8 @@ def plot_ambiguity(result: RunResult) -> bytes:
         panel.invert_yaxis()
     for state in np.unique(trial.state):
         of_state = trial.state == state
-        mean, slip = percent[of_state].mean(0), trial.slip_mm[of_state][0]
+        mean = percent[of_state].mean(0)
+        slip = trial.slip_mm[of_state][0]
         low, high = np.percentile(percent[of_state], [2.5, 97.5], axis=0)
         half_range = np.abs(np.stack([low - mean, high - mean]))
         axes[2].errorbar(

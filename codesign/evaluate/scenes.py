@@ -51,7 +51,8 @@ class SceneObjective:
         visible_um = torch.cat(
             [frame.depth_um[frame.coverage > 0] for frame in self.frames]
         )
-        nearest_um, farthest_um = float(visible_um.min()), float(visible_um.max())
+        nearest_um = float(visible_um.min())
+        farthest_um = float(visible_um.max())
         self.depths_um = 1 / torch.linspace(
             1 / nearest_um, 1 / farthest_um, DEPTHS, dtype=torch.float64
         )
