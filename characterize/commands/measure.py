@@ -340,8 +340,8 @@ def _pillars_text(
     missing = int(pillars.missing.sum())
     collapsed = int(pillars.collapsed.sum())
     lines = [
-        f"{target}: {len(pillars.diameter_nm)} sites of a {pillars.lattice.kind} lattice, {missing} missing, {collapsed} collapsed; "
-        f"mean {pillars.mean_nm:.2f} nm, 3 sigma {pillars.three_sigma_nm:.2f} nm"
+        f"{target}: {len(pillars.diameter_nm)} sites of a {pillars.lattice.kind} lattice, {missing} missing, "
+        f"{collapsed} collapsed; mean {pillars.mean_nm:.2f} nm, 3 sigma {pillars.three_sigma_nm:.2f} nm"
     ]
     if pillars.oval.any():
         lines.append(
